@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,6 +48,14 @@ def walled(values: np.ndarray) -> np.ndarray:
     return out
 
 
+def refusal(kind: type[Exception], call: Callable[..., Any], *given: Any, **options: Any) -> str:
+    """Return the error of a kind, one line, that a call ends with."""
+    with pytest.raises(kind) as caught:
+        call(*given, **options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
 def count_fans(faces: np.ndarray) -> np.ndarray:
     """Return for each used vertex how many closed fans of triangles meet there: 1 in a manifold."""
     from scipy.sparse import coo_matrix
@@ -62,6 +72,24 @@ def count_fans(faces: np.ndarray) -> np.ndarray:
     _, fan = connected_components(graph, directed=False)
     _, first = np.unique(fan, return_index=True)
     return np.bincount(keys[first] // size)[np.unique(faces)]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Work in a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def in_process(monkeypatch):
+    """Read files in this process: to start others takes most of the time of many tests."""
+    from super_sdf.files import apart
+    from super_sdf.files.readers import READERS
+
+    monkeypatch.setenv("HDF5_EXTFILE_PREFIX", "")
+    monkeypatch.setattr(
+        apart, "volume_apart", lambda key, request: nullcontext(READERS[key](request))
+    )
 
 
 @pytest.fixture

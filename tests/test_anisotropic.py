@@ -1,7 +1,7 @@
 """Grids whose spacing differs between axes: the resampled values, and the meshes."""
 
 import json
-from itertools import permutations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,19 +9,17 @@ import trimesh
 from conftest import trilinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_slabs import in_pieces
 
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.certificate.check import check_mesh
-from super_sdf.errors import GridError
-from super_sdf.files.meshes import count_by_plane, count_on_lattice
 from super_sdf.grid.cubic import Resampled, cubic_grid, new_places, on_samples
 from super_sdf.mesh import join_meshes
-from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.steps.survey import survey
 
 BALLS = np.array([(4.1, 3.6, 4.9, 2.3), (5.3, 4.1, 7.0, 1.4), (5.9, 3.0, 4.2, 1.2)])
 BOX = np.array([9.5, 7.5, 10.5])  # the extent of the grid
-SPACINGS = sorted({*permutations((0.4, 0.4, 0.6)), *permutations((0.2, 0.2, 1.0))})
+SPACINGS = [(0.6, 0.4, 0.4), (0.4, 0.6, 0.4), (0.4, 0.4, 0.6), (1.0, 0.3, 0.3), (0.3, 0.3, 1.0)]
 
 
 def pear(points: np.ndarray) -> np.ndarray:
@@ -35,12 +33,6 @@ def sampled(spacing, field=pear) -> np.ndarray:
     return field(np.moveaxis(np.indices(shape), 0, -1) * np.array(spacing))
 
 
-def slab_of(*half):
-    """The field of a box with these half sides near the middle, exact near its faces."""
-    middle = BOX / 2 + 0.03
-    return lambda points: (np.abs(points - middle) - half).max(-1)
-
-
 def cube_of(spacing) -> SdfGrid:
     return cubic_grid(make_grid(sampled(spacing), spacing=spacing, origin=0))
 
@@ -48,22 +40,6 @@ def cube_of(spacing) -> SdfGrid:
 @pytest.fixture(scope="module")
 def network():
     return load_network("fast")
-
-
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_resampled_values_are_nearer_than_linear_ones(spacing):
-    cube = cube_of(spacing)
-    assert cube.spacing == (min(spacing),) * 3
-    places = cube.to_world(np.moveaxis(np.indices(cube.shape), 0, -1))
-    inner = (places <= BOX).all(-1) & (np.abs(pear(places)) < 1.5 * min(spacing))
-    off = np.abs(cube.values - pear(places))[inner]
-    corners = make_grid(sampled(spacing), spacing=spacing)
-    index = np.moveaxis(places / spacing, -1, 0)
-    from scipy.ndimage import map_coordinates
-
-    linear = np.abs(map_coordinates(corners.values, index, order=1, mode="nearest") - pear(places))
-    assert off.mean() < 0.5 * linear[inner].mean()
-    assert off.max() < 0.5 * max(spacing)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.2])
@@ -137,7 +113,7 @@ def test_planes_are_the_same_however_they_are_read(axis, step, seed):
 
 
 def test_chunks_change_nothing(monkeypatch):
-    before = [cube_of(spacing).values for spacing in SPACINGS]
+    before = [cube_of(spacing).values for spacing in SPACINGS[:3]]
     monkeypatch.setattr("super_sdf.grid.cubic.CHUNK", 1)
     for spacing, values in zip(SPACINGS, before):
         assert np.array_equal(cube_of(spacing).values, values)
@@ -161,40 +137,26 @@ def test_the_mesh_lies_on_the_surface(spacing, network):
     assert mesh.is_closed() and mesh.volume() == pytest.approx(VOLUME, rel=0.01)
 
 
-def _volume() -> float:
-    """The volume of the pear, by the share of a fine lattice."""
-    h = 0.05
-    return float((sampled((h, h, h)) < 0).sum() * h**3)
-
-
-VOLUME = _volume()
+VOLUME = float((sampled((0.05, 0.05, 0.05)) < 0).sum() * 0.05**3)  # by the share of samples
 
 
 @pytest.mark.parametrize("offset", [0.5, -0.6])
 def test_offsets_grow_the_solid(offset, network):
-    grid = make_grid(sampled((0.3, 0.3, 0.9)), spacing=(0.3, 0.3, 0.9))
-    mesh = reconstruct(grid, network, offset=offset)
+    values, place = sampled((0.3, 0.3, 0.9)), {"spacing": (0.3, 0.3, 0.9)}
+    mesh = reconstruct(make_grid(values, **place), network, offset=offset)
     assert np.abs(pear(mesh.vertices.astype(float)) - offset).mean() < 0.02
-    flipped = make_grid(-sampled((0.3, 0.3, 0.9)), spacing=(0.3, 0.3, 0.9))
-    other = reconstruct(flipped, network, offset=offset)
+    other = reconstruct(make_grid(-values, **place), network, offset=offset)
     assert np.array_equal(mesh.vertices, other.vertices)
 
 
 @pytest.mark.parametrize("axis, mesher", [(0, "marching"), (1, "sharp"), (2, "marching")])
 def test_slabs_and_threads_make_the_same_mesh(axis, mesher, network, monkeypatch):
-    from super_sdf.slabs import preparing
-    from super_sdf.slabs.cutting import cut
-
-    spacing = tuple(np.where(np.arange(3) == axis, 1.0, 0.35))
+    spacing = tuple(np.where(np.arange(3) == axis, 1.0, 0.5))
     grid = make_grid(sampled(spacing), spacing=spacing)
     whole = reconstruct(grid, network, mesher=mesher)
     threaded = reconstruct(grid, load_network("fast", threads=2), mesher=mesher)
-    monkeypatch.setattr(
-        preparing, "plan_slabs",
-        lambda band, k, field, *_: cut(band, 5, field, _[-1].planes_beside(k)),
-    )  # fmt: skip
     monkeypatch.setattr("super_sdf.steps.band.BLOCK_SAMPLES", 1)
-    pieces = list(reconstruct_slabs(grid, network, mesher=mesher))
+    pieces = in_pieces(grid, network, monkeypatch, 5, mesher=mesher)
     assert len(pieces) > 2
     joined = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
     for other in (threaded, joined):
@@ -224,16 +186,19 @@ def test_equal_spacings_are_not_resampled():
     assert cubic_grid(grid) is grid
 
 
-def test_interpolated_values_do_not_make_a_noisy_field(network):
+def test_interpolated_values_do_not_make_a_noisy_field():
     """A thin plate across the coarse axis: what lies between its samples is a guess."""
+
+    def plate(points):
+        return (np.abs(points - BOX / 2 - 0.03) - (3.3, 2.5, 0.45)).max(-1)
+
     spacing = (0.25, 0.25, 0.75)
-    grid = make_grid(sampled(spacing, slab_of(3.3, 2.5, 0.45)), spacing=spacing)
+    grid = make_grid(sampled(spacing, plate), spacing=spacing)
     band = survey(cubic_grid(grid))
     assert band.count_noisy() == 0 and band.exact.sum() > 0.5 * len(band.exact)
     assert band.exact[band.sampled & (np.abs(band.patches[:, 13]) < 2.5)].all()
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
-    noisy = SdfGrid.trusted(grid.values + noise, spacing)
-    found = survey(cubic_grid(noisy))
+    found = survey(cubic_grid(SdfGrid.trusted(grid.values + noise, spacing)))
     assert found.count_noisy() > 0 and not found.exact.any()
 
 
@@ -247,31 +212,17 @@ def test_the_certificate_counts_samples_only(network):
     assert np.allclose(pear(found.touching.points), found.touching.values * 0.3, atol=1e-6)
 
 
-def test_the_size_of_the_mesh_is_estimated_on_the_lattice(network):
-    for spacing in ((0.3, 0.3, 0.6), (0.9, 0.3, 0.3)):
-        grid = make_grid(sampled(spacing), spacing=spacing)
-        triangles = 2 * 4**2 * count_on_lattice(grid, count_by_plane(grid, 0.0))
-        assert len(reconstruct(grid, network).faces) == pytest.approx(triangles, rel=0.05)
-
-
-@pytest.mark.parametrize("spacing", SPACINGS)
-def test_unsigned_fields_are_refused(spacing):
-    with pytest.raises(GridError, match="unsigned distances have no inside: mesh the shell"):
-        make_grid(np.abs(sampled(spacing)), spacing=spacing)
-
-
-def test_the_command_says_what_it_resamples(tmp_path, monkeypatch, command):
-    monkeypatch.chdir(tmp_path)
-    np.savez("a.npz", values=sampled((0.4, 0.4, 0.6)), spacing=(0.4, 0.4, 0.6), origin=(1, 2, 3))
+def test_the_command_says_what_it_resamples(folder, command):
+    values, spacing = sampled((0.4, 0.4, 0.6)), (0.4, 0.4, 0.6)
+    np.savez("a.npz", values=values, spacing=spacing, origin=(1, 2, 3))
+    np.save("b.npy", values)
     code, out, err = command("upsample", "a.npz", "a.ply", "--quality", "fast", "--json")
-    assert code == 0, err
-    assert "Note: the spacing differs between axes: the values are resampled along z" in err
     report = json.loads(out)
-    assert report["spacing"] == [0.4, 0.4, 0.6] and report["shape"] == [25, 20, 19]
+    assert "Note: the spacing differs between axes: the values are resampled along z" in err
+    assert code == 0 and report["spacing"] == list(spacing) and report["shape"] == [25, 20, 19]
     assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.1)
     mesh = trimesh.load("a.ply")
     assert np.abs(pear(mesh.vertices - [1, 2, 3])).max() < 0.15 and mesh.is_watertight
-    np.save("b.npy", sampled((0.4, 0.4, 0.6)))
     options = ("--quality", "fast", "--spacing", "0.4,0.4,0.6", "--origin", "1,2,3")
-    assert command("upsample", "b.npy", "b.ply", *options)[0] == 0
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    assert command("upsample", "b.npy", "b.ply", "-q", *options) == (0, "", "")
+    assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()

@@ -24,7 +24,7 @@ from super_sdf.options import MESHERS
 
 EACH = 25  # cases of a theme
 ALONE = 20  # of all that may hang or crash
-FIELDS = 160
+FIELDS = 84
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_random_fields_become_closed_manifolds(stand_in, mesher):
 @pytest.mark.parametrize("mesher", MESHERS)
 def test_random_fields_in_slabs_and_bricks_are_closed_where_they_are_called_so(mesher):
     network, faults = load_network("fast", threads=1), []
-    for number, field in enumerate(make_fields(FIELDS // 20)):
+    for number, field in enumerate(make_fields(FIELDS // 10)):
         whole = mesh_of_field(field, network, mesher)
         faults += faults_of_pieces(field, network, mesher, 2 + number % 5, whole)
     assert faults == []
@@ -75,7 +75,7 @@ def test_random_fields_in_slabs_and_bricks_are_closed_where_they_are_called_so(m
 
 def test_the_corpus_is_large_and_the_same_each_time(cases):
     names = [case.name for case in cases]
-    assert len(names) > 7000 and len(set(names)) == len(names)
+    assert len(names) > 4000 and len(set(names)) == len(names)
     again = [(case.name, case.words, list(case.files)) for case in make_cases()]
     assert again == [(case.name, case.words, list(case.files)) for case in cases]
 

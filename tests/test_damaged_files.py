@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista
 import SimpleITK as sitk  # noqa: N813
+from conftest import refusal
 from test_formats import affine_of, sampled, save_itk, save_nifti, save_nrrd, save_vti, text_sdf
-from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-from vtkmodules.vtkCommonDataModel import vtkImageData
-from vtkmodules.vtkIOXML import vtkXMLImageDataReader, vtkXMLImageDataWriter
+from test_untrusted_files import count_silent
+from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from super_sdf import SdfGrid, read_grid
 from super_sdf.errors import SuperSdfError
@@ -33,12 +34,11 @@ MHA = (
     "ObjectType = Image\nNDims = 3\nBinaryData = True\nDimSize = 24 20 17\n"
     "ElementType = MET_FLOAT\nElementSpacing = 0.5 0.5 0.5\n"
 )
+PLACE = ["spacings: .5 .5 .5"]
 NRRD = "NRRD0004\ntype: float\ndimension: 3\nsizes: 24 20 17\nendian: little\n"
 
 
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 def write(name: str, *parts: str | bytes) -> str:
@@ -57,62 +57,43 @@ def nrrd_file(*lines: str, data: bytes = RAW, name: str = "a.nrrd") -> str:
     return write(name, NRRD, *(f"{line}\n" for line in lines), "\n", data)
 
 
-def refusal(name: str, **options: object) -> str:
+def said_of(name: str, **options: object) -> str:
     """Return the one line with which a file is refused."""
-    with pytest.raises(SuperSdfError) as caught:
-        read_grid(name, **options)
-    said = str(caught.value)
-    assert name in said and len(said.splitlines()) == 1 and len(said) < 400
+    said = refusal(SuperSdfError, read_grid, name, **options)
+    assert name in said and len(said) < 400
     return said
 
 
 # Flipped bits
 
 
-def save_bz2(name: str) -> None:
-    nrrd_file("encoding: bzip2", "spacings: .5 .5 .5", data=bz2.compress(RAW), name=name)
-
-
-def save_npz(name: str) -> None:
-    np.savez_compressed(name, values=VALUES, spacing=0.5, origin=AFFINE[:3, 3])
-
-
 CHECKED = {
     "a.mha": lambda name: save_itk(name, AFFINE),
-    "b.mha": lambda name: mha("CompressedData = True", data=zlib.compress(RAW), name=name),
     "a.nii.gz": lambda name: save_nifti(name, AFFINE),
     "a.nrrd": lambda name: save_nrrd(name, AFFINE),
-    "b.nrrd": save_bz2,
+    "b.nrrd": lambda name: nrrd_file("encoding: bzip2", *PLACE, data=bz2.compress(RAW), name=name),
     "a.vti": lambda name: save_vti(name, AFFINE),
-    "a.npz": save_npz,
+    "a.npz": lambda name: np.savez_compressed(name, values=VALUES, spacing=0.5),
 }
-ENDS_OF_TEXT = {
-    ".mha": b"= LOCAL\n",
-    ".nrrd": b"\n\n",
-    ".vti": b'<AppendedData encoding="base64">',
-}
+ENDS_OF_TEXT = {".mha": b"= LOCAL\n", ".nrrd": b"\n\n", ".vti": b'<AppendedData encoding="base64">'}
 
 
 @pytest.mark.parametrize("name", CHECKED)
 def test_no_flipped_bit_in_checked_data_passes(name, monkeypatch):
-    """Of 150 anywhere behind the text of a header, for which no format has a checksum."""
+    """Of 60 anywhere behind the text of a header, for which no format has a checksum."""
     monkeypatch.setattr("super_sdf.machine.memory.left_memory", lambda: None)  # it takes a while
     CHECKED[name](name)
-    whole, rng = Path(name).read_bytes(), np.random.default_rng(7)
-    end = ENDS_OF_TEXT.get(Path(name).suffix, b"")
-    first = 8 * (whole.index(end) + len(end))
-    want, other = read_grid(name), f"x{name[1:]}"
-    silent = []
-    for bit in rng.choice(np.arange(first, 8 * len(whole)), 150, replace=False):
-        damaged = bytearray(whole)
-        damaged[bit // 8] ^= 1 << bit % 8
-        Path(other).write_bytes(damaged)
-        try:
-            if not same_grid(read_grid(other), want):
-                silent.append(bit)
-        except SuperSdfError as error:
-            assert len(str(error).splitlines()) == 1
-    assert silent == []
+    whole, end = Path(name).read_bytes(), ENDS_OF_TEXT.get(Path(name).suffix, b"")
+    first = whole.index(end) + len(end)
+    place = "spacing", "origin", "direction"
+
+    def read() -> np.ndarray:
+        grid = read_grid(name)
+        return np.concatenate(
+            [grid.values.ravel(), *(np.ravel(getattr(grid, key)) for key in place)]
+        )
+
+    assert count_silent(name, [(first, len(whole) - first)], read) == 0
 
 
 def same_grid(one: SdfGrid, other: SdfGrid) -> bool:
@@ -133,10 +114,10 @@ def test_a_compressed_stream_is_whole_and_ends_where_the_file_does():
         "a.mha is damaged: 4 bytes are missing": zlib.compress(RAW[:-4]),
     }
     for said, data in cases.items():
-        assert refusal(mha("CompressedData = True", data=data)) == said
+        assert said_of(mha("CompressedData = True", data=data)) == said
     more = zlib.compress(RAW + b"1234")
-    assert "it holds more" in refusal(mha("CompressedData = True", data=more))
-    said = refusal(mha("CompressedData = True", size, data=packed[:-2]))
+    assert "it holds more" in said_of(mha("CompressedData = True", data=more))
+    said = said_of(mha("CompressedData = True", size, data=packed[:-2]))
     sizes = f"its CompressedDataSize is {len(packed):,}, but {len(packed) - 2:,} bytes follow"
     assert said == f"a.mha is damaged: {sizes}"
 
@@ -145,14 +126,14 @@ def test_raw_data_is_as_long_as_the_header_says():
     promised = "24 x 20 x 17 float32, 32,640 bytes"
     for write_file, name in ((mha, "a.mha"), (nrrd_file, "a.nrrd")):
         lines = ["encoding: raw"] if name == "a.nrrd" else []
-        short, long = (refusal(write_file(*lines, data=data)) for data in (RAW[:-4], RAW + b"abcd"))
+        short, long = (said_of(write_file(*lines, data=data)) for data in (RAW[:-4], RAW + b"abcd"))
         shape = "17 x 20 x 24 float32, 32,640 bytes"
         assert short == f"{name} is truncated: {shape} are promised, but 32,636 follow"
         assert long.startswith(f"{name} holds more than its header promises: {shape}")
     save_nifti("a.nii", AFFINE)
     whole = Path("a.nii").read_bytes()
     said = f"a.nii is truncated: its header promises {promised} from byte 352 on"
-    assert refusal(write("a.nii", whole[:-1])).startswith(said)
+    assert said_of(write("a.nii", whole[:-1])).startswith(said)
 
 
 # Headers that state too much
@@ -171,7 +152,7 @@ def test_sizes_that_no_file_has_are_refused_at_once(size, first):
     forget_peak()
     held = held_memory()
     for name in ("a.mha", "a.nrrd", "b.nrrd", "a.sdf", "b.sdf", "a.vti"):
-        refusal(name)
+        said_of(name)
     assert held_memory(peak=True) - held < 30e6
 
 
@@ -189,26 +170,27 @@ def test_sizes_that_no_file_has_are_refused_at_once(size, first):
     ],
 )
 def test_fields_of_metaimage_are_checked(line, said):
-    assert refusal(mha(line)).startswith(said)
+    assert said_of(mha(line)).startswith(said)
+
+
+def test_an_unknown_type_of_metaimage_is_refused():
     write("a.mha", MHA.replace("MET_FLOAT", "MET_STRING"), "ElementDataFile = LOCAL\n", RAW)
-    assert refusal("a.mha").startswith("a.mha: its ElementType is 'MET_STRING': give one of MET_")
+    assert said_of("a.mha").startswith("a.mha: its ElementType is 'MET_STRING': give one of MET_")
 
 
 def test_skips_of_nrrd_are_bounded():
     said = "a.nrrd: it has no 1,000,000 lines to skip (line skip)"
-    assert refusal(nrrd_file("encoding: raw", "line skip: 1000000")) == said
-    assert "truncated" in refusal(nrrd_file("encoding: raw", "byte skip: 1000000000"))
+    assert said_of(nrrd_file("encoding: raw", "line skip: 1000000")) == said
+    assert "truncated" in said_of(nrrd_file("encoding: raw", "byte skip: 1000000000"))
     said = "a.nrrd: its encoding is 'gzip', byte skip 8: save it as raw"
-    assert refusal(nrrd_file("encoding: gzip", "byte skip: 8")) == said
-    grid = read_grid(
-        nrrd_file("encoding: raw", "spacings: .5 .5 .5", "byte skip: -1", data=b"x" + RAW)
-    )
+    assert said_of(nrrd_file("encoding: gzip", "byte skip: 8")) == said
+    grid = read_grid(nrrd_file("encoding: raw", *PLACE, "byte skip: -1", data=b"x" + RAW))
     assert np.array_equal(grid.values.T.ravel(), VALUES.T.ravel())
-    lines = "encoding: raw", "spacings: .5 .5 .5", "line skip: 2"
+    lines = "encoding: raw", *PLACE, "line skip: 2"
     assert same_grid(read_grid(nrrd_file(*lines, data=b"a\nb\n" + RAW)), grid)
     text = " ".join(map(repr, VALUES.ravel("F").tolist())).encode()
-    assert same_grid(read_grid(nrrd_file("encoding: text", "spacings: .5 .5 .5", data=text)), grid)
-    assert "truncated" in refusal(nrrd_file("encoding: text", data=text[:-200]))
+    assert same_grid(read_grid(nrrd_file("encoding: text", *PLACE, data=text)), grid)
+    assert "truncated" in said_of(nrrd_file("encoding: text", data=text[:-200]))
 
 
 def test_an_extension_of_nifti_is_not_loaded():
@@ -229,39 +211,39 @@ def test_an_extension_of_nifti_is_not_loaded():
 def test_a_number_without_end_is_refused():
     text = text_sdf(AFFINE)
     write("a.sdf", text[: len(text) // 2], "1" * 3_000_000)
-    assert refusal("a.sdf").startswith("a.sdf is damaged: a value of 1,0")
+    assert said_of("a.sdf").startswith("a.sdf is damaged: a value of 1,0")
 
 
 # Bombs
 
-BOMB = 1 << 27
+BOMB = 1 << 26
 
 
 @pytest.mark.parametrize("name", ["a.mha", "a.nii.gz", "a.vti", "a.npz"])
 def test_a_bomb_is_refused_within_the_bound(name, monkeypatch):
-    """Zeros of 134 MB in some kilobytes, with 100 MB allowed: before anything is unpacked."""
+    """Zeros of 67 MB in some kilobytes, with 50 MB allowed: before anything is unpacked."""
     make_bomb(name, bytes(BOMB))
     assert Path(name).stat().st_size < BOMB / 500
     monkeypatch.setattr("super_sdf.files.unpacking._scratch_file", None)  # no room is taken
     forget_peak()
     held = held_memory()
-    said = refusal(name, max_memory=held + 10**8)
+    said = said_of(name, max_memory=held + 5 * 10**7)
     assert "like a zip bomb, and does not fit in memory" in said
-    assert held_memory(peak=True) - held < 50e6
+    assert held_memory(peak=True) - held < 30e6
 
 
 def make_bomb(name: str, zeros: bytes) -> None:
-    """Write zeros as a grid of bytes of 512 x 512 x 512."""
-    sizes = "512 512 512"
+    """Write zeros as a grid of bytes of 512 x 512 x 256."""
+    sizes = "512 512 256"
     if name == "a.mha":
         text = MHA.replace("24 20 17", sizes).replace("MET_FLOAT", "MET_UCHAR")
         write(name, text, "CompressedData = True\nElementDataFile = LOCAL\n", zlib.compress(zeros))
     elif name == "a.npz":
-        np.savez_compressed(name, values=np.frombuffer(zeros, np.uint8).reshape(512, 512, 512))
+        np.savez_compressed(name, values=np.frombuffer(zeros, np.uint8).reshape(256, 512, 512))
     elif name == "a.nii.gz":
         save_nifti("a.nii", AFFINE)
         head = bytearray(Path("a.nii").read_bytes()[:352])
-        head[42:48] = np.array([512, 512, 512], "<i2").tobytes()
+        head[42:48] = np.array([512, 512, 256], "<i2").tobytes()
         head[70:74] = np.array([2, 8], "<i2").tobytes()
         write(name, gzip.compress(bytes(head) + zeros))
     else:
@@ -273,12 +255,12 @@ def make_bomb(name: str, zeros: bytes) -> None:
         )
         text += '</Piece></ImageData><AppendedData encoding="raw">_'
         words = np.array([1, BOMB, BOMB, len(packed)], "<u8").tobytes()
-        write(name, text.format("0 511 0 511 0 511"), words, packed)
+        write(name, text.format("0 511 0 511 0 255"), words, packed)
 
 
 @pytest.mark.parametrize("name", ["a.mha", "a.nrrd"])
 def test_what_goes_on_after_the_samples_is_not_unpacked(name):
-    """A header of 33 kB before a stream of 134 MB."""
+    """A header of 33 kB before a stream of 67 MB."""
     stream = RAW + bytes(BOMB)
     if name == "a.mha":
         mha("CompressedData = True", data=zlib.compress(stream))
@@ -287,8 +269,8 @@ def test_what_goes_on_after_the_samples_is_not_unpacked(name):
     del stream
     forget_peak()
     held = held_memory()
-    assert refusal(name) == f"{name} is damaged: it holds more than its header promises"
-    assert held_memory(peak=True) - held < 50e6
+    assert said_of(name) == f"{name} is damaged: it holds more than its header promises"
+    assert held_memory(peak=True) - held < 30e6
 
 
 # Data beside a header
@@ -322,7 +304,7 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
         "below": "below is a folder: give a file",
     }.items():
         DETACHED[name](data)
-        assert refusal(name).endswith(said)
+        assert said_of(name).endswith(said)
     DETACHED[name]("below/a.raw")
     assert read_grid(name, spacing=0.5).shape == (24, 20, 17)
 
@@ -348,17 +330,15 @@ def test_lists_and_patterns_of_metaimage_are_what_itk_reads():
         "pattern.mhd": "ElementDataFile = p%03d.raw 3 19 1\n",
     }.items():
         write(name, MHA, text)
-        assert np.array_equal(
-            read_grid(name).values.T, sitk.GetArrayFromImage(sitk.ReadImage(name))
-        )
+        assert np.array_equal(sitk.GetArrayFromImage(sitk.ReadImage(name)).T, VALUES)
         assert np.array_equal(read_grid(name).values, VALUES)
     write("list.mhd", MHA, "ElementDataFile = LIST\n", names.replace("p004", "../p004"))
-    assert "names the file '../p004.raw', which is not in its folder" in refusal("list.mhd")
+    assert "names the file '../p004.raw', which is not in its folder" in said_of("list.mhd")
     write("list.mhd", MHA, "ElementDataFile = LIST\n", names[:50])
-    assert refusal("list.mhd").startswith("list.mhd")
+    assert said_of("list.mhd").startswith("list.mhd")
     write("pattern.mhd", MHA, "ElementDataFile = p%099999d.raw 3 19 1\n")
     said = "pattern.mhd: its ElementDataFile is 'p%099999d.raw 3 19 1': give NAME%03d.raw 1 17 1"
-    assert refusal("pattern.mhd") == said
+    assert said_of("pattern.mhd") == said
 
 
 # Placement and types: ITK and VTK read the same
@@ -411,32 +391,22 @@ def test_every_type_of_metaimage_is_what_itk_reads(kind, order):
     assert np.array_equal(values, sitk.GetArrayFromImage(sitk.ReadImage("a.mha")))
 
 
-def image(shape: tuple[int, int, int] = (6, 7, 8), dtype: str = "f4") -> vtkImageData:
-    """Return random samples on an extent that does not begin at 0."""
-    made = vtkImageData()
-    nx, ny, nz = shape
-    made.SetExtent(3, 2 + nx, -2, ny - 3, 1, nz)
-    values = np.random.default_rng(5).random(nx * ny * nz) * 100
-    array = numpy_to_vtk(values.astype(dtype), deep=True)
-    array.SetName("d")
-    made.GetPointData().SetScalars(array)
-    return made
-
-
 def read_vti(name: str) -> np.ndarray:
     """Return the samples of a file (z, y, x), read in three parts."""
     with open_volume(Path(name), find_format(name), "xyz", (1 << 20, None)) as volume:
         return np.concatenate([volume.read(*ends) for ends in ((0, 3), (3, 4), (4, 8))])
 
 
-@pytest.mark.parametrize("word", ["32", "64"])
-@pytest.mark.parametrize("order", ["Little", "Big"])
+@pytest.mark.parametrize("order, word", [("Little", "64"), ("Big", "32")])
 @pytest.mark.parametrize("packing", ["None", "ZLib", "LZ4", "LZMA"])
 @pytest.mark.parametrize("mode", ["Ascii", "Binary", "raw", "base64"])
 def test_every_encoding_of_vtk_is_what_vtk_reads(mode, packing, order, word):
+    image = pyvista.ImageData(dimensions=(6, 7, 8))
+    image.extent = 3, 8, -2, 4, 1, 8
+    image["d"] = np.random.default_rng(5).random(6 * 7 * 8) * 100
     writer = vtkXMLImageDataWriter()
     writer.SetFileName("a.vti")
-    writer.SetInputData(image(dtype="f8"))
+    writer.SetInputData(image)
     if mode in ("raw", "base64"):
         writer.SetDataModeToAppended()
         writer.SetEncodeAppendedData(mode == "base64")
@@ -447,11 +417,7 @@ def test_every_encoding_of_vtk_is_what_vtk_reads(mode, packing, order, word):
     getattr(writer, f"SetHeaderTypeToUInt{word}")()
     writer.SetBlockSize(1000)
     assert writer.Write()
-    reader = vtkXMLImageDataReader()
-    reader.SetFileName("a.vti")
-    reader.Update()
-    want = vtk_to_numpy(reader.GetOutput().GetPointData().GetArray("d")).reshape(8, 7, 6)
-    assert np.array_equal(read_vti("a.vti"), want)
+    assert np.array_equal(read_vti("a.vti"), pyvista.read("a.vti")["d"].reshape(8, 7, 6))
 
 
 PIECE = '<Piece Extent="{}"><PointData><DataArray type="Float32" Name="d" format="ascii">{}'
@@ -479,24 +445,21 @@ def test_pieces_may_overlap_but_leave_nothing_out():
     pieces("0 2 0 4 0 7", "1 3 0 2 0 7", "2 3 1 4 0 7")
     assert np.array_equal(read_vti("a.vti"), whole)
     said = "a.vti: {} of its 160 samples are in no piece: save it with all pieces"
-    assert refusal(pieces("0 3 0 4 0 3", "0 3 0 4 5 7")) == said.format(20)
-    assert refusal(pieces("0 2 0 4 0 7", "1 3 0 2 0 7")) == said.format(16)
-    assert refusal(pieces()) == "a.vti holds no array of points or cells"
+    assert said_of(pieces("0 3 0 4 0 3", "0 3 0 4 5 7")) == said.format(20)
+    assert said_of(pieces("0 2 0 4 0 7", "1 3 0 2 0 7")) == said.format(16)
+    assert said_of(pieces()) == "a.vti holds no array of points or cells"
     said = "a.vti is damaged: its piece (0, 4, 0, 4, 0, 7) is not in the whole extent"
-    assert refusal(pieces("0 4 0 4 0 7")) == said
+    assert said_of(pieces("0 4 0 4 0 7")) == said
 
 
 def test_xml_that_no_vtk_file_has_is_refused():
     pieces("0 3 0 4 0 7")
     text = Path("a.vti").read_text()
     write("a.vti", '<!DOCTYPE a [<!ENTITY b "c">]>', text)
-    assert refusal("a.vti") == "a.vti has a document type: VTK image data has none"
+    assert said_of("a.vti") == "a.vti has a document type: VTK image data has none"
     write("a.vti", text.replace('Name="d"', f'Name="{"d" * 3_000_000}"'))
-    assert refusal("a.vti") == "a.vti is damaged: a tag is too long"
+    assert said_of("a.vti") == "a.vti is damaged: a tag is too long"
     write("a.vti", text.replace("ascii", "appended"))
-    assert refusal("a.vti").startswith("a.vti:d is damaged: its offset is ''")
+    assert said_of("a.vti").startswith("a.vti:d is damaged: its offset is ''")
     write("a.vti", text.replace("</Piece>", "<a>" * 1000))
-    assert refusal("a.vti").startswith("a.vti is no VTK image data, truncated or damaged: ")
-
-
-# Commands
+    assert said_of("a.vti").startswith("a.vti is no VTK image data, truncated or damaged: ")

@@ -1,33 +1,31 @@
 """What the values of a grid are, and what becomes of masks, truncated and scaled fields."""
 
 import json
+import re
 import shutil
 
 import numpy as np
 import pytest
 from batches import rows
-from conftest import ball, trilinear
+from conftest import ball, refusal, trilinear
 from scipy import ndimage
+from test_slabs import in_pieces
 
 from lab.surfaces import isosurface
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.grid import planes
 from super_sdf.grid.census import Census
-from super_sdf.grid.derived import fill_in, local_slopes, mask_distances, mask_planes
+from super_sdf.grid.derived import mask_distances, mask_planes
 from super_sdf.grid.field import weigh
-from super_sdf.grid.planes import reading_bytes
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import join_meshes
 from super_sdf.network.network import network_for, shipped_models
 from super_sdf.options import FIELDS
-from super_sdf.pipeline import reconstruct_slabs
-from super_sdf.slabs import preparing
-from super_sdf.slabs.cutting import cut
 from super_sdf.steps import spline
 from super_sdf.steps.nodes import block_ijk
-from super_sdf.steps.spline import network_share, node_weights, prefilter, spline_blocks
-from super_sdf.steps.survey import WINDOW_SAMPLES, plan_reading, survey
+from super_sdf.steps.spline import network_share, spline_blocks
+from super_sdf.steps.survey import plan_reading, survey
 
 PLACE = {"spacing": 1.0, "origin": 0.0}
 
@@ -137,7 +135,7 @@ def test_distances_in_another_unit_are_exact_in_that_of_the_spacing(unit):
 
 
 def test_noise_is_told_from_slopes_that_vary():
-    for amplitude in (0.05, 0.1, 0.25, 0.4):
+    for amplitude in (0.05, 0.25, 0.4):
         for values in (box(), torus(), thin_frame(), np.indices((32, 32, 32))[0] - 15.3):
             grid = make_grid(noisy(values, amplitude), **PLACE, inside="negative")
             assert grid.field.kind in ("noisy", "exact"), amplitude
@@ -173,28 +171,15 @@ def test_all_forms_of_a_mask_give_the_same_mesh():
         np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
 
 
-def test_a_label_is_a_mask_of_its_samples():
-    labels = np.where(MASK, 3, 0)
-    labels[:2] = 2
-    grid = make_grid(labels, **PLACE, label=3)
-    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
-    assert make_grid(labels, **PLACE, label=3, inside="negative").values[16, 16, 16] < 0
-
-
-def test_labels_without_a_choice_are_refused():
+@pytest.mark.parametrize("spacing", [(1, 1, 1), (0.5, 1, 1)])
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64])
+def test_labels_without_a_choice_are_refused(dtype, spacing):
+    labels = (MASK * 2 + (box() < 0)).astype(dtype)
     for field in ("auto", "exact", "scaled"):
-        with pytest.raises(GridError) as caught:
-            make_grid(MASK * 2 + (box() < 0), **PLACE, field=field)
-        assert str(caught.value) == (
+        place = {"spacing": spacing, "origin": 0, "field": field}
+        assert refusal(GridError, make_grid, labels, **place) == (
             "no solid is chosen: they look like labels (0, 1, 2, 3): choose one with --label 1"
         )
-
-
-def test_a_label_that_no_sample_has_is_refused_with_those_there_are():
-    with pytest.raises(GridError, match=r"no sample has the label 7: the labels are 0, 1, 2$"):
-        make_grid(MASK.astype(int) + (box() < 0), **PLACE, label=7)
-    with pytest.raises(GridError, match=r"every sample has the label 7: the labels are 7$"):
-        make_grid(np.full((8, 8, 8), 7), **PLACE, label=7)
 
 
 LARGEST = 2**64 - 1
@@ -203,13 +188,8 @@ LARGEST = 2**64 - 1
 @pytest.mark.parametrize(
     ("dtype", "label", "other"),
     [
-        ("u8", LARGEST, LARGEST - 1),
-        (">u8", 2**63 + 1, 2**63),
-        ("i8", 2**53 + 1, 2**53),
-        ("i8", -(2**63), 1 - 2**63),
-        ("i1", -1, 1),
-        ("f4", 2**24, 2**24 - 1),
-        ("f8", 3.0, 2),
+        *(("u8", LARGEST, LARGEST - 1), (">u8", 2**63 + 1, 2**63), ("i8", 2**53 + 1, 2**53)),
+        *(("i8", -(2**63), 1 - 2**63), ("i1", -1, 1), ("f4", 2**24, 2**24 - 1), ("f8", 3.0, 2)),
         ("?", 1, 0),
     ],
 )
@@ -231,10 +211,10 @@ def test_labels_are_whole_numbers_of_up_to_64_bits(dtype, label, other):
     ],
 )
 def test_a_label_is_never_rounded(dtype, values, label, listed):
-    labels = np.where(MASK, *np.array(values, dtype))
-    with pytest.raises(GridError) as caught:
-        make_grid(labels, **PLACE, label=label)
-    assert str(caught.value) == f"no sample has the label {label}: the labels are {listed}"
+    said = refusal(GridError, make_grid, np.where(MASK, *np.array(values, dtype)), label=label)
+    assert said == f"no sample has the label {label}: the labels are {listed}"
+    every = refusal(GridError, make_grid, np.full((8, 8, 8), 7), label=7)
+    assert every == "every sample has the label 7: the labels are 7"
 
 
 def test_densities_have_their_surface_at_a_level():
@@ -247,9 +227,12 @@ def test_densities_have_their_surface_at_a_level():
     np.testing.assert_allclose(below.values, torus(48), atol=1e-4)
 
 
-def test_densities_of_two_values_are_a_mask():
-    grid = make_grid(np.where(MASK, 900, 100), **PLACE, level=500)
-    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
+def test_densities_without_a_ramp_are_a_mask():
+    steep = MASK * 1000.0 + np.random.default_rng(0).uniform(0, 30, MASK.shape)
+    for densities in (steep, np.where(MASK, 900, 100)):
+        grid = make_grid(densities, **PLACE, level=500)
+        assert grid.field.kind == "mask"
+        np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
 
 
 def test_densities_with_a_ramp_have_the_surface_of_their_spline():
@@ -259,24 +242,8 @@ def test_densities_with_a_ramp_have_the_surface_of_their_spline():
     assert grid.notes[1].startswith("spacing not given: taken as 1, since densities show none")
 
 
-def test_densities_without_a_ramp_are_a_mask():
-    steep = MASK * 1000.0 + np.random.default_rng(0).uniform(0, 30, MASK.shape)
-    grid = make_grid(steep, **PLACE, level=500)
-    assert grid.field.kind == "mask"
-    np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
-
-
-def test_the_shares_of_voxels_inside_are_cut_off():
-    shares = np.clip(0.5 - torus(), 0, 1)
-    grid = make_grid(shares, spacing=2.5, origin=0, level=0.5)
-    assert grid.field.kind == "truncated"
-    assert grid.notes[1].startswith("the values are divided by their slope")
-    mesh = reconstruct(grid, trilinear)
-    x, y, z = (mesh.vertices.T / 2.5 + 0.5) / 32 - 0.5
-    assert np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).mean() * 32 < 0.05
-
-
 BAD = {
+    "inside is 'out': give one of auto, negative, positive": {"inside": "out"},
     "field is 'wrong': give one of auto, exact, truncated, mask, scaled, noisy": {"field": "wrong"},
     "label is 'a': give a whole number, -2^63 to 2^64 - 1": {"label": "a"},
     "label is 1.5: give a whole number, -2^63 to 2^64 - 1": {"label": 1.5},
@@ -292,9 +259,7 @@ BAD = {
 
 @pytest.mark.parametrize("message", BAD)
 def test_wrong_options_are_refused(message):
-    with pytest.raises(OptionError) as caught:
-        make_grid(torus(), **PLACE, **BAD[message])
-    assert str(caught.value) == message
+    assert refusal(OptionError, make_grid, torus(), **PLACE, **BAD[message]) == message
 
 
 def test_a_mask_is_no_grid_without_make_grid():
@@ -354,19 +319,6 @@ def test_the_network_for_masks_is_nearer_than_marching_cubes():
     assert ours < 0.7 * cubes
 
 
-def test_what_was_cut_off_is_filled_in():
-    exact = torus().astype(np.float32)
-    near = np.abs(exact) < 2
-    filled = fill_in(np.clip(exact, -1, 1), -1.0, 1.0)
-    kept = np.abs(exact) < 0.999
-    np.testing.assert_array_equal(filled[kept], exact[kept])
-    assert np.abs(filled - exact)[near].max() < 0.5
-    assert (
-        np.abs(filled - exact)[near].mean()
-        < 0.25 * np.abs(np.clip(exact, -1, 1) - exact)[near].mean()
-    )
-
-
 @pytest.mark.parametrize("low", [-1, -10])
 def test_distances_over_their_truncation_get_their_unit_back(low):
     grid = make_grid(np.clip(box(), low, 1), spacing=1.5, origin=0)
@@ -390,25 +342,20 @@ def test_a_smooth_field_of_another_slope_is_that_of_its_spline():
     assert np.abs(value).max() < 0.02  # a twentieth of a change from sample to sample
 
 
-def test_the_spline_is_that_of_scipy():
-    rng = np.random.default_rng(0)
-    values = rng.normal(size=(30, 31, 32)).astype(np.float32)
+def test_the_spline_is_that_of_scipy_and_exact_for_planes_up_to_the_border():
+    values = np.random.default_rng(0).normal(size=(30, 31, 32)).astype(np.float32)
     ijk = np.array([[14, 15, 15], [15, 14, 16]], np.int32)
     blocks, _ = spline_blocks(values, ijk, 4, 1.0)
     for row, voxel in enumerate(ijk):
         at = (block_ijk(4) / 4 - 0.5 + voxel).T
         want = ndimage.map_coordinates(values.astype(float), at, order=3, mode="mirror")
         np.testing.assert_allclose(blocks[:, row], want, atol=2e-5)
-
-
-def test_the_spline_is_exact_for_planes_up_to_the_border():
-    values = np.indices((6, 7, 8)).astype(np.float32)[1] * 2 - 3
-    ijk = np.argwhere(np.ones(values.shape, bool)).astype(np.int32)
-    blocks, share = spline_blocks(values, ijk, 2, 1.0)
+    plane = np.indices((6, 7, 8)).astype(np.float32)[1] * 2 - 3
+    ijk = np.argwhere(np.ones(plane.shape, bool)).astype(np.int32)
+    blocks, share = spline_blocks(plane, ijk, 2, 1.0)
     want = (block_ijk(2)[:, 1, None] / 2 - 0.5 + ijk[:, 1]) * 2 - 3
     np.testing.assert_allclose(blocks[:, :-1], want, atol=1e-4)
-    assert not share.any() and prefilter(values).shape == (10, 11, 12)
-    np.testing.assert_allclose(node_weights(4).sum(1), 1, atol=1e-6)
+    assert not share.any()
 
 
 def test_the_network_adds_to_a_scaled_field_at_kinks_of_distances_only():
@@ -417,46 +364,35 @@ def test_the_network_adds_to_a_scaled_field_at_kinks_of_distances_only():
     assert not network_share(2 * box(48).astype(np.float32)).any()
 
 
-def test_local_slopes_are_those_of_the_field():
-    for slope in (0.5, 1.0, 2.0):
-        tilted = np.tensordot([0.48, 0.6, 0.64], np.indices((9, 10, 11)), 1) * slope
-        np.testing.assert_allclose(local_slopes(tilted.astype(np.float32)), slope, rtol=1e-4)
-
-
 @pytest.mark.parametrize("name", ["truth", "a smooth union"])
 def test_any_number_of_slabs_and_threads_gives_the_same_mesh(name, monkeypatch):
-    values = np.tile(KINDS[name][0], (2, 1, 1))
-    grid, network = make_grid(values, **PLACE), load_network("fast", device="cpu")
+    grid, network = make_grid(KINDS[name][0], **PLACE), load_network("fast", device="cpu")
     want = reconstruct(grid, network)
-
-    def plan(band, factor, receptive_field, resources, needed, mesher):
-        return cut(band, 4, receptive_field, mesher.planes_beside(factor))
-
-    monkeypatch.setattr(preparing, "plan_slabs", plan)
     one = load_network("fast", device="cpu", threads=1)
-    pieces = list(reconstruct_slabs(grid, one))
+    pieces = in_pieces(grid, one, monkeypatch, 4)
     mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
     assert len(pieces) > 2
     np.testing.assert_array_equal(mesh.vertices, want.vertices)
     np.testing.assert_array_equal(mesh.faces, want.faces)
 
 
-def test_the_command_takes_labels_levels_and_scales(tmp_path, command):
-    np.save(tmp_path / "labels.npy", np.where(MASK, 3, 0) + 2 * (box() < -9))
-    np.save(tmp_path / "grid.npy", 100 - 40 * ball(24, 8).values)
-    base = ["upsample", "--spacing", "1", "--force"]
-    labels, grid, out = (str(tmp_path / name) for name in ("labels.npy", "grid.npy", "out.ply"))
-    assert command(*base, labels, out, "--label", "3")[0] == 0
-    for words, shown in (("3.0", "3.0"), (str(2**64), str(2**64))):
-        code, _, err = command(*base, labels, out, "--label", words)
-        want = f"Error: --label is {shown}: give a whole number, -2^63 to 2^64 - 1"
-        assert (code, err.splitlines()[-1]) == (2, want)
-    assert command(*base, grid, out, "--level", "100", "--scale", "0.025")[0] == 0
-    code, _, err = command(*base, grid, out, "--level", "100", "--scale", "0")
-    assert (code, err.splitlines()[-1]) == (2, "Error: --scale is 0: give a number greater than 0")
-    assert (
-        command("check", out, grid, "--spacing", "1", "--level", "100", "--scale", ".025")[0] == 0
-    )
+def test_the_command_takes_labels_levels_and_scales(folder, command):
+    np.save("labels.npy", np.where(MASK, 3, 0) + 2 * (box() < -9))
+    np.save("grid.npy", 100 - 40 * ball(16, 5).values)
+    base = "upsample", "--spacing", "1", "--force", "--quality", "fast"
+    labels, level = (*base, "labels.npy", "out.ply"), (*base, "grid.npy", "out.ply", "--level", 100)
+    assert command(*labels, "--label", "3")[0] == 0
+    assert command(*level, "--scale", "0.025")[0] == 0
+    check = "check", "out.ply", "grid.npy", "--spacing", 1, "--level", 100, "--scale", 0.025
+    assert command(*check)[0] == 0
+    whole = "give a whole number, -2^63 to 2^64 - 1"
+    for run, said in (
+        ((*labels, "--label", "3.0"), f"--label is 3.0: {whole}"),
+        ((*labels, "--label", 2**64), f"--label is {2**64}: {whole}"),
+        ((*level, "--scale", "0"), "--scale is 0: give a number greater than 0"),
+    ):
+        code, _, err = command(*run)
+        assert (code, err.splitlines()[-1]) == (2, f"Error: {said}")
 
 
 def test_a_list_of_batch_takes_what_the_values_are(tmp_path, command):
@@ -480,9 +416,7 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         (depth - 1, "below", "-2.39 --inside negative"),
         (1 - depth, "above", "2.39 --inside positive"),
     ):
-        with pytest.raises(GridError) as caught:
-            make_grid(values, **PLACE, field="mask")
-        assert str(caught.value) == (
+        assert refusal(GridError, make_grid, values, **PLACE, field="mask") == (
             f"every value is {side} 0 (they go from {values.min():.6g} to {values.max():.6g}), so "
             "their signs make no mask: they look like densities: give the level of their surface, "
             f"such as --level {level}"
@@ -507,20 +441,10 @@ def test_the_spline_is_the_same_in_whatever_strips_it_is_made(monkeypatch):
         np.testing.assert_array_equal(found, expected)
 
 
-def test_making_distances_is_planned_and_refused_with_the_figure():
+def test_making_distances_is_refused_with_the_figure():
     samples = mask_planes(np.broadcast_to(np.False_, (64, 512, 512)), 1.0)
-    least, need = plan_reading(samples, 0, Resources(2, None))
-    around = 10 * 512**2  # with the planes beside them, more than a window
-    assert need == 2 * (reading_bytes(samples, 10) + around * (8 + 4) + WINDOW_SAMPLES * 20)
-    assert least == 8
-    assert plan_reading(samples, 1000, Resources(2, 1000 + 2 * need)) == (least, need)
-    fewer, less = plan_reading(samples, 1000, Resources(2, 999 + 2 * need))
-    assert fewer == 4 and less < need
-    assert plan_reading(np.zeros((9, 9, 9)), 0, Resources(2)) == (4, 11 * 9**2 * (8 + 4 + 20))
-    with pytest.raises(
-        OutOfMemoryError, match=r"^planes of 512 x 512 samples need at least \d+ MB"
-    ):
-        plan_reading(samples, 0, Resources(2, 1_000_000))
+    said = refusal(OutOfMemoryError, plan_reading, samples, 0, Resources(2, 1_000_000))
+    assert re.match(r"planes of 512 x 512 samples need at least \d+ MB", said)
 
 
 def torus_at(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
@@ -531,15 +455,10 @@ def torus_at(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     return np.hypot(np.hypot(x, y) - 6.7, z) - 2.8
 
 
-NEARLY = {
-    "slopes of .9 to 1.1": lambda d: d * (1 + 0.1 * np.sin(np.indices(d.shape).sum(0) / 4)),
-    "another unit, .91": lambda d: 0.91 * d,
-}
-
-
-@pytest.mark.parametrize("name", NEARLY)
-def test_what_is_nearly_a_distance_is_no_worse_than_marching_cubes(name):
-    values = np.asarray(NEARLY[name](torus_at(*np.indices((24,) * 3))), np.float64)
+@pytest.mark.parametrize("factor", [1 + 0.1 * np.sin(np.indices((24,) * 3).sum(0) / 4), 0.91])
+def test_what_is_nearly_a_distance_is_no_worse_than_marching_cubes(factor):
+    """Of slopes of .9 to 1.1, and in another unit."""
+    values = torus_at(*np.indices((24,) * 3)) * factor
     mesh = reconstruct(make_grid(values, **PLACE), load_network())
     plain = isosurface(values.astype(np.float32), 1.0, 0.0)
     ours, theirs = (np.abs(torus_at(*m.vertices.T)).mean() for m in (mesh, plain))
@@ -556,22 +475,19 @@ def test_samples_that_contradict_each_other_are_told_from_noise_and_exact_ones()
     assert make_grid(other, **PLACE).field.kind == "scaled"
 
 
-@pytest.mark.parametrize("filled", [0.1, 1.4])
-def test_padding_near_the_surface_makes_no_surface(filled):
-    plain = ball(24, 8.0).values
-    meshes = [
-        reconstruct(
-            make_grid(np.pad(plain, 1, constant_values=pad), spacing=1, origin=-1), trilinear
-        )
-        for pad in (filled, 5.0)
-    ]
-    assert meshes[0].is_closed()
-    np.testing.assert_allclose(meshes[0].volume(), meshes[1].volume(), rtol=1e-3)
+def test_padding_near_the_surface_makes_no_surface():
+    plain, place = ball(16, 5.0).values, {"spacing": 1, "origin": -1}
+    near, far, other = (
+        reconstruct(make_grid(np.pad(plain, 1, constant_values=pad), **place), trilinear)
+        for pad in (0.1, 5.0, 1.4)
+    )
+    assert near.is_closed()
+    for mesh in (near, other):
+        assert mesh.volume() == pytest.approx(far.volume(), rel=1e-3)
 
 
-@pytest.mark.parametrize("added", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("added", [0.01, 0.1])
 @pytest.mark.parametrize("shape", [torus, box])
-@pytest.mark.parametrize("n", [16, 24])
-def test_unsigned_distances_of_thick_solids_are_refused(shape, n, added):
+def test_unsigned_distances_that_are_never_0_are_refused(shape, added):
     with pytest.raises(GridError, match="unsigned"):
-        make_grid(np.abs(shape(n)) + added, **PLACE)
+        make_grid(np.abs(shape(16)) + added, **PLACE)

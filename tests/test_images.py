@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista
-from click.testing import CliRunner
-from conftest import trilinear
+from conftest import refusal, trilinear
 from vtkmodules.vtkCommonDataModel import vtkImageData
 
 import super_sdf.pyvista  # noqa: F401  (registers the accessor)
 from super_sdf import grid_from_image, load_network, read_grid, reconstruct
-from super_sdf.cli.main import cli
-from super_sdf.errors import GridError, NoSurfaceError, OptionError, OptionTypeError
+from super_sdf.errors import GridError, OptionError, OptionTypeError
+from super_sdf.truth.mesh_files import read_mesh
 
 ROOT = Path(__file__).parent.parent
 SIZES = 20, 22, 24
@@ -51,29 +50,11 @@ def in_cells(image: pyvista.ImageData, centre: np.ndarray) -> pyvista.ImageData:
     return image
 
 
-def refusal(call, kind: type[Exception] = GridError) -> str:
-    """Return the error, one line, that a call ends with."""
-    with pytest.raises(kind) as caught:
-        call()
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS)
-def test_a_sphere_comes_out_where_the_image_has_it(direction):
-    image, centre = sphere(direction, (3, -2, 7))
-    surface = image.super_sdf.contour(2, network=trilinear)
-    assert type(surface) is pyvista.PolyData
-    assert surface.is_all_triangles and surface.is_manifold
-    assert np.abs(np.linalg.norm(surface.points - centre, axis=1) - RADIUS).max() < 0.06
-    outward = np.einsum("ij,ij->i", surface.face_normals, surface.cell_centers().points - centre)
-    assert (outward > 0).all()
-
-
-@pytest.mark.parametrize("direction", DIRECTIONS)
-@pytest.mark.parametrize("where", ["points", "cells"])
-def test_the_surface_is_the_one_of_the_file(direction, where, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize(
+    "direction, where",
+    [*((direction, "points") for direction in DIRECTIONS), ("turned and mirrored", "cells")],
+)
+def test_the_surface_is_the_one_of_the_file(direction, where, folder):
     image, centre = sphere(direction, (3, -2, 7))
     image = in_cells(image, centre) if where == "cells" else image
     image.save("image.vti")
@@ -87,22 +68,12 @@ def test_the_surface_is_the_one_of_the_file(direction, where, tmp_path, monkeypa
     assert np.array_equal(surface.regular_faces, mesh.faces)
 
 
-@pytest.mark.parametrize(
-    "given, options",
-    [
-        ({}, []),
-        ({"factor": 2, "offset": 0.6, "scale": 1.0, "field": "exact"},
-         ["--factor", "2", "--offset", "0.6", "--scale", "1", "--field", "exact"]),
-    ],
-)  # fmt: skip
-def test_the_surface_is_the_one_of_the_command(given, options, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_surface_is_the_one_of_the_command(folder, command):
     image, _ = sphere("turned")
     image.save("image.vti")
-    result = CliRunner().invoke(cli, ["upsample", "image.vti", "mesh.ply", *options])
-    assert result.exit_code == 0, result.output
-    from super_sdf.truth.mesh_files import read_mesh
-
+    given = {"factor": 2, "offset": 0.6, "scale": 1.0, "field": "exact"}
+    words = [f"--{name}={value}" for name, value in given.items()]
+    assert command("upsample", "image.vti", "mesh.ply", *words)[0] == 0
     mesh, surface = read_mesh("mesh.ply"), image.super_sdf.contour(**given)
     assert surface.points.tobytes() == mesh.vertices.astype(surface.points.dtype).tobytes()
     assert np.array_equal(surface.regular_faces, mesh.faces)
@@ -180,10 +151,9 @@ def plain(**arrays: np.ndarray) -> vtkImageData:
 def test_image_data_of_vtk_is_taken_too():
     image, _ = sphere()
     values = np.asarray(image.point_data["distance"])
-    bare = plain(distance=values)
+    bare, several = plain(distance=values), plain(a=values, b=values)
     assert np.array_equal(grid_from_image(bare).values, image.super_sdf.grid().values)
-    several = plain(a=values, b=values)
-    assert refusal(lambda: grid_from_image(several)) == (
+    assert refusal(GridError, grid_from_image, several) == (
         "the image holds several arrays, a, b: give scalars='a', say"
     )
     assert grid_from_image(several, "b").shape == SIZES
@@ -201,27 +171,23 @@ OF_NO_SAMPLES = {
 
 @pytest.mark.parametrize("message", OF_NO_SAMPLES)
 def test_what_is_no_array_of_samples_is_refused(message):
-    assert refusal(lambda: grid_from_image(plain(**OF_NO_SAMPLES[message]))) == message
+    assert refusal(GridError, grid_from_image, plain(**OF_NO_SAMPLES[message])) == message
 
 
 def test_other_mistakes_are_one_line():
     image, _ = sphere()
-    contour = image.super_sdf.contour
-    said = refusal(lambda: grid_from_image([1]), OptionTypeError)
+    contour, thin = image.super_sdf.contour, image.extract_subset((0, 19, 0, 21, 4, 4)).super_sdf
+    said = refusal(OptionTypeError, grid_from_image, [1])
     assert said == "image is [1]: give VTK image data"
-    said = refusal(lambda: contour(scalars="b"))
+    said = refusal(GridError, contour, scalars="b")
     assert said == "the image has no array 'b': it holds distance"
-    assert refusal(lambda: contour(3), OptionError).startswith("factor is 3: ")
-    network = load_network("fast")
-    said = refusal(lambda: contour(quality="best", network=network), OptionError)
+    assert refusal(OptionError, contour, 3).startswith("factor is 3: ")
+    said = refusal(OptionError, contour, quality="best", network=load_network("fast"))
     assert said == "quality 'best' and a network are given: give only one"
-    image.spacing = (0.2, 0.2, 0.2)
-    assert refusal(contour).endswith("multiply the values, --scale 0.40123")
-    image.spacing = (0.5, 0.5, 0.5)
-    said = refusal(image.extract_subset((0, 19, 0, 21, 4, 4)).super_sdf.contour)
+    said = refusal(GridError, thin.contour)
     assert said == "values have shape (1, 22, 20): give at least 2 samples on each axis"
-    image["distance"] = np.abs(np.asarray(image["distance"])) + 3
-    assert issubclass(NoSurfaceError, GridError) and refusal(contour)
+    image.spacing = (0.2, 0.2, 0.2)
+    assert refusal(GridError, contour).endswith("multiply the values, --scale 0.40123")
 
 
 def test_an_old_pyvista_is_named(monkeypatch):

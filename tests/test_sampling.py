@@ -8,7 +8,6 @@ from solids import TORUS, cube, inverted, joined, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError, load_network, reconstruct
 from super_sdf.truth import sampling
-from super_sdf.truth.mesh_files import read_mesh
 from super_sdf.truth.sampling import (
     fitted_layout,
     grid_points,
@@ -37,7 +36,7 @@ SOLIDS = {
     "cube": (cube(), cube_distance, 1e-12),
     # Chords lie under the surface: by an eighth of edge^2 over radius, or twice that.
     "sphere": (sphere(size=64), sphere_distance, 2.5e-4),
-    "torus": (torus(192, 96), torus_distance, 2e-4),
+    "torus": (torus(128, 64), torus_distance, 4.5e-4),
 }
 
 
@@ -50,21 +49,9 @@ def test_a_sampled_solid_is_exact_everywhere(name):
     np.testing.assert_allclose(found, closed_form(points), atol=chord + 1e-6)
 
 
-@pytest.mark.parametrize("name", SOLIDS)
-def test_the_sign_is_right_at_random_points(name):
-    mesh, closed_form, chord = SOLIDS[name]
-    points = np.random.default_rng(1).uniform(-0.6, 0.6, (100_000, 3))
-    expected = closed_form(points)
-    clear = np.abs(expected) > chord  # else the mesh and the closed form may differ
-    assert clear.sum() > 99_000
-    assert (Solid(mesh).is_inside(points) == (expected < 0))[clear].all()
-
-
 def test_a_band_is_exact_in_it_and_cut_off_beyond():
-    solid, layout = Solid(torus()), unit_layout(40)
-    exact = sample_grid(solid, layout)
-    limit = 2.0 / 40
-    expected = np.clip(exact, -limit, limit)
+    solid, layout, limit = Solid(torus()), unit_layout(24), 2.0 / 24
+    expected = np.clip(sample_grid(solid, layout), -limit, limit)
     np.testing.assert_allclose(sample_grid(solid, layout, band=2), expected, atol=1e-7)
 
 
@@ -75,7 +62,7 @@ def test_big_grids_are_cut_off_and_make_the_same_mesh(monkeypatch):
     cut = sample_solid(solid, layout)
     assert not exact.notes and "clamped" in cut.notes[0]
     assert cut.values.max() == pytest.approx(4 / 24)
-    network = load_network()
+    network = load_network("fast")
     one, other = reconstruct(exact, network), reconstruct(cut, network)
     np.testing.assert_array_equal(one.faces, other.faces)
     np.testing.assert_array_equal(one.vertices, other.vertices)
@@ -125,20 +112,6 @@ def test_every_sample_of_an_open_mesh_is_asked(band):
     inside = lidless.is_inside(grid_points(layout))
     assert inside.any()
     assert ((sample_grid(lidless, layout, band=band) < 0).ravel() == inside).all()
-
-
-def test_bad_files_are_named(tmp_path):
-    with pytest.raises(SuperSdfError, match=r"none\.ply does not exist"):
-        read_mesh(tmp_path / "none.ply")
-    (tmp_path / "text.ply").write_text("no mesh")
-    with pytest.raises(SuperSdfError, match=r"text\.ply cannot be read as a mesh: "):
-        read_mesh(tmp_path / "text.ply")
-    (tmp_path / "points.obj").write_text("v 0 0 0\nv 1 0 0\n")
-    with pytest.raises(SuperSdfError, match=r"points\.obj"):
-        read_mesh(tmp_path / "points.obj")
-    flat = Mesh(cube().vertices * [1, 1, 0], cube().faces)
-    with pytest.raises(SuperSdfError, match=r"flat\.ply is flat: it encloses no volume"):
-        load_solid(saved(flat, tmp_path / "flat.ply"))
 
 
 @pytest.mark.parametrize("padding", [0.0, 2.0, 3.5])

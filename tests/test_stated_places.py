@@ -22,6 +22,7 @@ import SimpleITK as sitk  # noqa: N813
 import tifffile
 import xarray
 import zarr
+from conftest import refusal
 from numpy.typing import ArrayLike
 
 from super_sdf import SdfGrid, read_grid
@@ -36,12 +37,10 @@ STEPS = np.array([0.3, 0.4, 0.6])
 CENTRE = FIRST + np.array([3.2, 3.9, 4.4])
 
 
-pytestmark = pytest.mark.filterwarnings("ignore:Consolidated metadata")
-
-
-@pytest.fixture(autouse=True)
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+pytestmark = [
+    pytest.mark.usefixtures("folder", "in_process"),
+    pytest.mark.filterwarnings("ignore:Consolidated metadata"),
+]
 
 
 def part(points: np.ndarray) -> np.ndarray:
@@ -72,59 +71,35 @@ def check(grid: SdfGrid, steps: ArrayLike = STEPS, first: ArrayLike | None = FIR
     assert grid.origin == ((0, 0, 0) if first is None else tuple(np.float64(grid.origin)))
 
 
-def line(error: type[Exception], name: str, **options: object) -> str:
-    """Return the one line with which a file is refused."""
-    with pytest.raises(error) as caught:
-        read_grid(name, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
-
-
 # TIFF
 
 
-def imagej(name: str, steps: ArrayLike, units: dict[str, object]) -> None:
-    """Write an ImageJ stack; its resolution is that of x and y."""
-    x, y, z = steps
-    about = {"axes": "ZYX", **({} if z == 1 else {"spacing": z}), **units}
+IMAGEJ = {
+    "a depth of 1": ((0.3, 0.4, 1), (1, 1, 1), {"unit": "um"}, "um"),
+    "an escape": (STEPS, (1, 1, 1), {"unit": "\\u00B5m"}, "µm"),
+    "inches": (STEPS, (1, 1, 1), {"unit": "inch"}, "inch"),
+    "cm, mm": (STEPS, (1, 1, 10), {"unit": "cm", "zunit": "mm"}, "cm"),
+    "µm, nm": (STEPS, (1, 1, 1000), {"unit": "\\u00B5m", "zunit": "nm"}, "µm"),
+    "three": (STEPS, (1, 1000, 0.001), {"unit": "um", "yunit": "nm", "zunit": "mm"}, "um"),
+    "inches, mm": (STEPS, (1, 1, 25.4), {"unit": "inch", "zunit": "mm"}, "inch"),
+}
+
+
+@pytest.mark.parametrize("with_origin", [False, True])
+@pytest.mark.parametrize("name", IMAGEJ)
+def test_imagej_has_a_unit_for_each_axis_and_origins_in_pixels(name, with_origin):
+    """Lengths come out in that of x; a depth of 1 is not written."""
+    steps, factors, about, unit = IMAGEJ[name]
+    x, y, z = np.array(steps) * factors
+    starts = {f"{axis}origin": -at / step for axis, at, step in zip("xyz", FIRST, steps)}
+    about = {"axes": "ZYX", **about, **(starts if with_origin else {})}
+    about |= {} if z == 1 else {"spacing": z}
     options = {"imagej": True, "resolution": (1 / x, 1 / y), "metadata": about}
-    tifffile.imwrite(name, sampled((x, y, z)).T, **options)
-
-
-@pytest.mark.parametrize(
-    "unit, shown", [("um", "um"), ("micron", "micron"), ("\\u00B5m", "µm"), ("inch", "inch")]
-)
-def test_imagej_leaves_out_a_depth_of_1(unit, shown):
-    imagej("a.tif", (0.3, 0.4, 1), {"unit": unit})
-    assert "spacing" not in tifffile.TiffFile("a.tif").imagej_metadata
+    tifffile.imwrite("a.tif", sampled(steps).T, **options)
+    assert ("spacing" in tifffile.TiffFile("a.tif").imagej_metadata) == (z != 1)
     grid = read_grid("a.tif")
-    check(grid, (0.3, 0.4, 1), None)
-    assert grid.notes[0] == f"lengths are in the unit of its axes, {shown}"
-
-
-@pytest.mark.parametrize(
-    "units, factors",
-    [
-        ({"unit": "cm", "zunit": "mm"}, (1, 1, 10)),
-        ({"unit": "\\u00B5m", "zunit": "nm"}, (1, 1, 1000)),
-        ({"unit": "micron", "zunit": "um"}, (1, 1, 1)),
-        ({"unit": "um", "yunit": "nm", "zunit": "mm"}, (1, 1000, 0.001)),
-        ({"unit": "inch", "zunit": "mm"}, (1, 1, 25.4)),
-    ],
-)
-def test_imagej_has_a_unit_for_each_axis(units, factors):
-    """Lengths come out in that of x."""
-    x, y, z = STEPS * factors
-    about = {"axes": "ZYX", "spacing": z, **units}
-    options = {"imagej": True, "resolution": (1 / x, 1 / y), "metadata": about}
-    tifffile.imwrite("a.tif", sampled().T, **options)
-    check(read_grid("a.tif"), first=None)
-
-
-def test_imagej_origins_are_in_pixels():
-    starts = {f"{name}origin": -first / step for name, first, step in zip("xyz", FIRST, STEPS)}
-    imagej("a.tif", STEPS, {"unit": "mm", **starts})
-    check(read_grid("a.tif"))
+    check(grid, steps, FIRST if with_origin else None)
+    assert grid.notes[0].endswith(f", {unit}") or grid.notes[0].endswith(f"are in {unit}")
 
 
 def test_a_stack_without_calibration_states_no_spacing():
@@ -195,16 +170,17 @@ def test_units_that_cannot_be_compared_are_told():
     )
 
 
+UNITS = {
+    **{"m": 1, "Meters": 1, "mm": 1e-3, "millimetres": 1e-3, "centimeter": 0.01, "km": 1e3},
+    **{"µm": 1e-6, "\u03bcm": 1e-6, "um": 1e-6, "microns": 1e-6, "micrometer": 1e-6, "nm": 1e-9},
+    **{"Nanometre": 1e-9, "inches": 0.0254, '"': 0.0254, "Å": 1e-10, "\u212b": 1e-10},
+    **{"angstroms": 1e-10, "pm": 1e-12},
+    **dict.fromkeys(("pixel", "s", "degrees_east", "", "reference frame")),
+}
+
+
 def test_names_of_units():
-    for unit, metres in {
-        **{"m": 1, "Meters": 1, "metre": 1, "mm": 1e-3, "millimetres": 1e-3, "centimeter": 0.01},
-        **{"µm": 1e-6, "\u03bcm": 1e-6, "um": 1e-6, "microns": 1e-6, "micrometer": 1e-6},
-        **{"nm": 1e-9, "Nanometre": 1e-9, "km": 1e3, "inch": 0.0254, "inches": 0.0254, '"': 0.0254},
-        **{"Å": 1e-10, "\u212b": 1e-10, "angstroms": 1e-10, "pm": 1e-12},
-    }.items():
-        assert in_metres(unit) == pytest.approx(metres), unit
-    for unit in ("pixel", "s", "degrees_east", "", "reference frame"):
-        assert in_metres(unit) is None
+    assert {unit: in_metres(unit) for unit in UNITS} == pytest.approx(UNITS)
 
 
 # xarray, in Zarr
@@ -218,8 +194,9 @@ def placed(order: str = "xyz", down: str = "", **more: ArrayLike) -> xarray.Data
     return array.isel(dict.fromkeys(down, slice(None, None, -1))).transpose(*order)
 
 
-@pytest.mark.parametrize("version", [2, 3])
-@pytest.mark.parametrize("order, down", [("xyz", ""), ("zyx", "y"), ("yzx", "xz"), ("xyz", "xyz")])
+@pytest.mark.parametrize(
+    "version, order, down", [(2, "xyz", ""), (3, "zyx", "y"), (2, "yzx", "xz"), (3, "xyz", "xyz")]
+)
 def test_zarr_by_xarray_has_names_and_coordinates(order, down, version):
     placed(order, down).to_dataset().to_zarr("a.zarr", zarr_format=version)
     check(read_grid("a.zarr"))
@@ -229,24 +206,7 @@ def test_zarr_by_xarray_has_names_and_coordinates(order, down, version):
     check(read_grid("b.zarr", spacing=STEPS, origin=FIRST))
 
 
-def test_a_group_in_zarr_and_axes_of_length_1():
-    array = placed("xyz", "y").expand_dims(time=[3.0]).expand_dims(band=["a"], axis=-1)
-    array.to_dataset().to_zarr("a.zarr", group="deep/er", zarr_format=2)
-    check(read_grid("a.zarr"))
-
-
-def test_units_of_coordinates():
-    array = placed(z=coordinates()["z"] * 1000).transpose("z", "x", "y")
-    for name, unit in zip("xyz", ("m", "metre", "mm")):
-        array[name].attrs["units"] = unit
-    array.to_dataset().to_zarr("a.zarr", zarr_format=2)
-    grid = read_grid("a.zarr")
-    check(grid)
-    assert grid.notes[0] == ("its axes have different units (x m, y metre, z mm): lengths are in m")
-
-
-@pytest.mark.parametrize("version", [2, 3])
-@pytest.mark.parametrize("dtype, offset", [("i2", 0.0), ("u2", -40.0), ("i4", 0.5)])
+@pytest.mark.parametrize("dtype, offset, version", [("i2", 0.5, 2), ("u2", -40.0, 3)])
 def test_numbers_that_stand_for_values(dtype, offset, version):
     """As xarray packs values: whole numbers, with a scale and an offset, one of them NaN."""
     array = placed("zxy").where(placed("zxy") < 2.5)
@@ -264,20 +224,6 @@ def test_numbers_that_stand_for_values(dtype, offset, version):
     assert np.abs(grid.values - sampled()).max() < 0.0011 and np.allclose(grid.spacing, STEPS)
 
 
-def test_coordinates_that_are_no_grid_are_refused():
-    uneven = np.array(coordinates()["y"])
-    uneven[7] += 0.1
-    placed(y=uneven).to_dataset().to_zarr("a.zarr", zarr_format=2)
-    assert line(GridError, "a.zarr") == (
-        "a.zarr: coordinates of 'y' are not evenly spaced: -1.6 is followed by -1.1, a step of 0.5 "
-        "among steps of 0.4; resample the array (array.interp(y=...))"
-    )
-    placed().drop_vars("z").to_dataset().to_zarr("b.zarr", zarr_format=2)
-    assert read_grid("b.zarr", spacing=STEPS).notes[0] == (
-        "it states no spacing along z: none is taken from it (give --spacing)"
-    )
-
-
 def test_names_that_are_not_x_y_z_are_told():
     array = placed("zyx").rename(x="column", y="row", z="slice").to_dataset()
     array.to_zarr("a.zarr", zarr_format=3)
@@ -289,19 +235,6 @@ def test_names_that_are_not_x_y_z_are_told():
     grid = read_grid("b.zarr", spacing=STEPS, origin=FIRST)
     check(grid)
     assert grid.notes[0] == "its axes are named z, ?, ?: taken as z, y, x"
-
-
-@pytest.mark.parametrize("version", [2, 3])
-def test_an_attribute_says_which_axis_coordinates_are_of(version):
-    """As in climate and forecast data."""
-    names = {"x": "lon", "y": "lat", "z": "lev"}
-    array = placed("yxz", "y").rename(names)
-    for name, other in names.items():
-        array[other].attrs["axis"] = name.upper()
-    array.to_dataset().to_zarr("a.zarr", zarr_format=version)
-    grid = read_grid("a.zarr")
-    check(grid)
-    assert not [note for note in grid.notes if "named" in note]
 
 
 def test_a_direction_that_is_given_holds_for_named_axes():
@@ -332,22 +265,21 @@ def attach(
 
 @pytest.mark.parametrize("order", ["xyz", "zyx", "yxz", "zxy"])
 def test_hdf5_labels_and_scales(order):
-    axes = ["xyz".index(name) for name in order]
+    values = sampled().transpose(["xyz".index(name) for name in order])
+    millimetres = {**coordinates(), "y": coordinates()["y"] * 10}
+    falling = {**coordinates(), order[0]: coordinates()[order[0]][::-1]}
     with h5py.File("a.h5", "w") as file:
-        file["m"] = sampled().transpose(axes)
+        file["m"] = values
         for axis, name in enumerate(order):
             file["m"].dims[axis].label = name.upper()
-    check(read_grid("a.h5", spacing=STEPS, origin=FIRST))
     with h5py.File("b.h5", "w") as file:
-        file["m"] = sampled().transpose(axes)
-        millimetres = {**coordinates(), "y": coordinates()["y"] * 10}
+        file["m"] = values
         attach(file, order, millimetres, {"x": "cm", "y": "mm", "z": "cm"})
-    check(read_grid("b.h5"))
     with h5py.File("c.h5", "w") as file:
-        file["m"] = sampled().transpose(axes)[::-1]
-        falling = coordinates()
-        falling[order[0]] = falling[order[0]][::-1]
+        file["m"] = values[::-1]
         attach(file, order, falling, {})
+    check(read_grid("a.h5", spacing=STEPS, origin=FIRST))
+    check(read_grid("b.h5"))
     check(read_grid("c.h5:/m"))
 
 
@@ -362,43 +294,23 @@ def test_netcdf_names_without_coordinates_are_no_coordinates():
     check(read_grid("a.h5", spacing=STEPS, origin=FIRST))
 
 
-@pytest.mark.parametrize("order", ["zyxc", "xyzc", "tzyxc", "cyzx"])
-@pytest.mark.parametrize("resolution", [0.0, 1.0])
+@pytest.mark.parametrize(
+    "order, resolution", [("zyxc", 0.0), ("xyzc", 1.0), ("tzyxc", 1.0), ("cyzx", 0.0)]
+)
 def test_axistags_of_ilastik(order, resolution):
     """The program writes no element_size_um; where vigra knows a resolution, it is in the tags."""
     values = sampled().transpose(["xyz".index(name) for name in order if name in "xyz"])
-    values = np.expand_dims(values, [a for a, name in enumerate(order) if name in "tc"])
-    steps = dict(zip("xyz", STEPS * resolution))
-    flags = {"c": 1, "t": 8}
+    steps, flags = dict(zip("xyz", STEPS * resolution)), {"c": 1, "t": 8}
     tags = [
-        {
-            "key": key,
-            "typeFlags": flags.get(key, 2),
-            "resolution": steps.get(key, 0),
-            "description": "",
-        }
+        {"key": key, "typeFlags": flags.get(key, 2), "resolution": steps.get(key, 0)}
         for key in order
     ]
     with h5py.File("a.h5", "w") as file:
-        file["exported_data"] = values
+        others = [axis for axis, name in enumerate(order) if name in "tc"]
+        file["exported_data"] = np.expand_dims(values, others)
         file["exported_data"].attrs["axistags"] = json.dumps({"axes": tags})
     given = {} if resolution else {"spacing": STEPS}
     check(read_grid("a.h5", origin=FIRST, **given))
-
-
-def test_several_channels_are_refused_by_the_name_of_the_axis():
-    tags = {"axes": [{"key": key} for key in "zyxc"]}
-    with h5py.File("a.h5", "w") as file:
-        file["m"] = np.repeat(sampled().T[..., None], 3, axis=3)
-        file["m"].attrs["axistags"] = json.dumps(tags)
-        file["flat"] = np.zeros((4, 5))
-    assert line(GridError, "a.h5:/m") == (
-        "a.h5:/m: its axis c has 3 entries, and a grid has three axes in space: store one of them "
-        "as an array of its own"
-    )
-    assert line(GridError, "a.h5:flat") == (
-        "a.h5:flat: values have shape (4, 5): give three axes (x, y, z)"
-    )
 
 
 def test_a_size_of_elements_is_in_the_order_of_the_axes():
@@ -427,7 +339,7 @@ def write_ones(name: str, shape: tuple[int, ...]) -> None:
         made[...] = array
 
 
-@pytest.mark.parametrize("where", [(0,), (3,), (1,), (0, 4), (0, 1, 5)])
+@pytest.mark.parametrize("where", [(3,), (1,), (0, 1, 5)])
 @pytest.mark.parametrize("name", ["n.npy", "nf.npy", "n.npz", "a.h5", "a.zarr"])
 def test_axes_of_length_1_are_dropped(name, where):
     sizes = SIZES if name[0] == "n" else SIZES[::-1]
@@ -441,9 +353,9 @@ def test_more_than_three_longer_axes_are_refused():
     for name, shape in (("n.npy", (4, 6, *SIZES[1:])), ("a.h5", (17, 20, 6, 4))):
         write_ones(name, shape)
     said = "n.npy: values have shape (4, 6, 20, 17): give three axes (x, y, z)"
-    assert line(GridError, "n.npy") == said
-    assert line(FileError, "a.h5") == "a.h5 holds no 3D dataset"
-    assert "its axis 3 has 4 entries, and a grid" in line(GridError, "a.h5:m")
+    assert refusal(GridError, read_grid, "n.npy") == said
+    assert refusal(FileError, read_grid, "a.h5") == "a.h5 holds no 3D dataset"
+    assert "its axis 3 has 4 entries, and a grid" in refusal(GridError, read_grid, "a.h5:m")
 
 
 def test_metaimage_of_four_axes_keeps_its_place():
@@ -502,11 +414,14 @@ def test_layers_of_a_segmentation():
         check(read_grid(f"{name}:1"))
         layers = f"{name} holds 2 layers, 0 ('Liver 1'), 1 ('Tumour 1')"
         way_out = f": give {name}:0, say, and --label for one of several segments in it"
-        assert line(FileError, name) == layers + way_out
-        assert line(FileError, f"{name}:x") == f"{layers}, and none of them is 'x'{way_out}"
+        assert refusal(FileError, read_grid, name) == layers + way_out
+        assert (
+            refusal(FileError, read_grid, f"{name}:x")
+            == f"{layers}, and none of them is 'x'{way_out}"
+        )
     nrrd.write("a.nrrd", sampled(), header_of())
     want = "a.nrrd holds one array: give no name of another in it"
-    assert line(FileError, "a.nrrd:0") == want
+    assert refusal(FileError, read_grid, "a.nrrd:0") == want
 
 
 # NRRD
@@ -515,8 +430,10 @@ def test_layers_of_a_segmentation():
 def test_nrrd_places_without_directions():
     cells, nodes = ({"centerings": [each] * 3} for each in ("cell", "node"))
     high = FIRST + STEPS * (np.array(SIZES) - 1)
+    unnamed = {"space dimension": 3, "space directions": np.diag(STEPS), "space origin": FIRST}
     cases = {
         "origin": {"spacings": STEPS, "space": "left-posterior-superior", "space origin": FIRST},
+        "unnamed": unnamed,
         "mins": {"spacings": STEPS, "axis mins": FIRST, **nodes},
         "unstated": {"spacings": STEPS, "axis mins": FIRST - STEPS / 2},
         "both": {"axis mins": FIRST, "axis maxs": high, **nodes},
@@ -561,30 +478,17 @@ def affine() -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("order", ["<", ">"])
-@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+@pytest.mark.parametrize("order, name", [("<", "a.nii.gz"), (">", "a.nii"), (">", "a.nii.gz")])
 @pytest.mark.parametrize("version", [nibabel.Nifti1Image, nibabel.Nifti2Image])
 def test_both_versions_of_nifti_in_both_orders_of_bytes(version, name, order):
-    image = version(sampled(), affine())
     header = version.header_class(endianness=order)
-    for key in image.header:
-        header[key] = image.header[key]
-    image = version(sampled().astype(f"{order}f4"), affine(), header)
-    nibabel.save(image, name)
-    opened = gzip.open if name.endswith(".gz") else open
-    with opened(name, "rb") as file:
+    for key, value in version(sampled(), affine()).header.items():
+        header[key] = value
+    nibabel.save(version(sampled().astype(f"{order}f4"), affine(), header), name)
+    with (gzip.open if name.endswith(".gz") else open)(name, "rb") as file:
         size = int.from_bytes(file.read(4), {"<": "little", ">": "big"}[order])
     assert size == {nibabel.Nifti1Image: 348, nibabel.Nifti2Image: 540}[version]
     check(read_grid(name))
-
-
-def test_a_truncated_nifti_2_is_refused():
-    nibabel.save(nibabel.Nifti2Image(sampled(), affine()), "a.nii")
-    whole = Path("a.nii").read_bytes()
-    Path("a.nii").write_bytes(whole[:-1])
-    assert line(FileError, "a.nii").startswith("a.nii is truncated: its header promises 24 x 20 x")
-    Path("a.nii").write_bytes(whole[:400])
-    assert line(FileError, "a.nii").startswith("a.nii cannot be read as NIfTI: ")
 
 
 def test_nifti_without_a_place_is_not_mirrored():
@@ -604,7 +508,7 @@ def test_nifti_without_a_place_is_not_mirrored():
     check(read_grid("a.nii", origin=FIRST))
 
 
-@pytest.mark.parametrize("codes", [(1, 1), (2, 1), (4, 1), (1, 2)])
+@pytest.mark.parametrize("codes", [(1, 1), (4, 1), (1, 2)])
 def test_sform_and_qform_that_disagree_are_told(codes):
     image = nibabel.Nifti1Image(sampled(), affine())
     image.set_sform(affine(), codes[0])
@@ -637,17 +541,12 @@ def test_the_unit_of_nifti_is_told(unit, named):
 # MetaImage
 
 
-def metaimage(packed: bool = True) -> bytes:
-    """Return the bytes of a file by ITK."""
-    image = sitk.GetImageFromArray(sampled().T)
-    image.SetSpacing(STEPS.tolist())
-    image.SetOrigin(FIRST.tolist())
-    sitk.WriteImage(image, "itk.mha", packed)
-    return Path("itk.mha").read_bytes()
-
-
 def test_what_a_metaimage_may_leave_out_or_call_otherwise():
-    whole = metaimage(packed=False)
+    itk = sitk.GetImageFromArray(sampled().T)
+    itk.SetSpacing(STEPS.tolist())
+    itk.SetOrigin(FIRST.tolist())
+    sitk.WriteImage(itk, "itk.mha")
+    whole = Path("itk.mha").read_bytes()
     for name in (b"Offset", b"Origin", b"Position"):
         Path("a.mha").write_bytes(whole.replace(b"Offset", name))
         check(read_grid("a.mha"))
@@ -662,7 +561,7 @@ def test_what_a_metaimage_may_leave_out_or_call_otherwise():
     Path("d.mha").write_bytes(whole.replace(b"DimSize", b"DistanceUnits = um\nDimSize"))
     assert read_grid("d.mha").notes[0] == "lengths are in the unit that it states, um"
     Path("e.mha").write_bytes(whole.replace(b"Offset", b"Offsat"))
-    assert line(FileError, "e.mha") == (
+    assert refusal(FileError, read_grid, "e.mha") == (
         "e.mha: its header is damaged: the line 'Offsat = 10 -4 30' is no Offset"
     )
 
@@ -670,34 +569,34 @@ def test_what_a_metaimage_may_leave_out_or_call_otherwise():
 # VTK image data
 
 
-def image_of_both(names: dict[str, Callable[[np.ndarray], np.ndarray]]) -> pyvista.ImageData:
+def image_of_both(**arrays: Callable[[np.ndarray], np.ndarray]) -> pyvista.ImageData:
     """Return image data whose cells have the part at their centres, and points with arrays."""
-    image = pyvista.ImageData(
-        dimensions=tuple(n + 1 for n in SIZES), spacing=STEPS, origin=FIRST - STEPS / 2
-    )
+    cells = np.add(SIZES, 1)
+    image = pyvista.ImageData(dimensions=cells, spacing=STEPS, origin=FIRST - STEPS / 2)
     image.cell_data["field"] = part(image.cell_centers().points).astype(np.float32)
-    for name, values in names.items():
+    for name, values in arrays.items():
         image.point_data[name] = values(image.points)
     return image
 
 
 def test_arrays_of_cells_beside_those_of_points():
-    image = image_of_both({"temperature": lambda points: points[:, 0]})
+    image = image_of_both(temperature=lambda points: points[:, 0])
     image.save("a.vti")
     check(read_grid("a.vti:field"))
     said = "a.vti holds several arrays, temperature, field: give a.vti:temperature, say"
-    assert line(FileError, "a.vti") == said
+    assert refusal(FileError, read_grid, "a.vti") == said
     said = "a.vti has no array of points or cells 'no': it holds temperature, field"
-    assert line(FileError, "a.vti:no") == said
-    image_of_both({"field": part}).save("b.vti")
+    assert refusal(FileError, read_grid, "a.vti:no") == said
+    image_of_both(field=part).save("b.vti")
     check(read_grid("b.vti:CellData/field"))
-    assert "it holds field, CellData/field" in line(FileError, "b.vti:no")
+    assert "it holds field, CellData/field" in refusal(FileError, read_grid, "b.vti:no")
     assert read_grid("b.vti:field").shape == tuple(n + 1 for n in SIZES)
 
 
 def test_vectors_and_marks_are_read_only_by_name():
-    image = image_of_both({"normal": lambda points: points})
+    image = image_of_both(normal=lambda points: points)
     image.cell_data["vtkGhostType"] = np.zeros(image.n_cells, np.uint8)
     image.save("a.vti")
     check(read_grid("a.vti"))
-    assert line(GridError, "a.vti:normal") == "a.vti:normal is no array of one number per sample"
+    said = refusal(GridError, read_grid, "a.vti:normal")
+    assert said == "a.vti:normal is no array of one number per sample"

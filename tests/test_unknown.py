@@ -1,25 +1,19 @@
 """Unknown far samples, NaN or infinite: their side, their cut-off, and what is refused."""
 
+import os
 import warnings
 
 import numpy as np
 import pytest
 import trimesh
-from conftest import trilinear
+from conftest import refusal, trilinear
 from scipy import ndimage
 from skimage.measure import marching_cubes
-from test_field_kinds import PLACE, box, thin_frame, torus
+from test_field_kinds import PLACE, box, thin_frame
 from test_slabs import in_pieces
 from trimesh import grouping
 
-from super_sdf import (
-    SdfGrid,
-    extract_mesh,
-    load_network,
-    make_grid,
-    reconstruct,
-    upsample,
-)
+from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.errors import GridError
 from super_sdf.grid.census import Census
 from super_sdf.mesh import join_meshes
@@ -35,7 +29,7 @@ def truncated(cut: float = 2.0) -> np.ndarray:
 
 def test_the_sides_of_regions_are_those_of_scipys_components():
     random = np.random.default_rng(0)
-    for _ in range(30):
+    for _ in range(12):
         values = random.normal(size=(6, 7, 8))
         values[random.random(values.shape) < random.uniform(0.2, 0.9)] = np.nan
         unknown, regions = np.isnan(values), Census(values).unknown
@@ -97,9 +91,7 @@ def test_an_unknown_region_between_inside_and_outside_cannot_be_closed():
         "96 of the unknown samples are in regions that touch both sides of the surface: it is open "
         "there"
     )
-    with pytest.raises(GridError) as caught:
-        reconstruct(grid, trilinear, cap=True)
-    assert str(caught.value) == (
+    assert refusal(GridError, reconstruct, grid, trilinear, cap=True) == (
         "96 samples are unknown, values[14, 0, 20] the first, in regions that touch samples on "
         "both sides of the surface, so whether they are inside is unknown; end the surface there "
         "(--open), or replace each by a distance of the right sign (the cut-off value of its side)"
@@ -157,23 +149,21 @@ def test_slabs_and_threads_change_nothing_where_a_surface_ends(options, monkeypa
         extract_mesh(field, cap=True)
 
 
-def test_what_needs_the_whole_surface_is_refused(tmp_path, command, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_what_needs_the_whole_surface_is_refused(folder, command):
     np.save("seen.npy", half_seen())
-    said = "Error: samples beside the surface are unknown, so it is open there: "
     run = ["upsample", "seen.npy", "out.ply", "--spacing", 1, "--factor", 2, "--quality", "fast"]
-    refused = [
-        ((), "so whether they are inside is unknown; end the surface there (--open)"),
-        (("--open", "--save-field", "f.npz"), f"{said}write the mesh alone, without its field"),
-    ]
-    for options, message in refused:
+    whole = "so whether they are inside is unknown; end the surface there (--open)"
+    field = (
+        "Error: samples beside the surface are unknown, so it is open there: write the mesh alone, "
+        "without its field"
+    )
+    for options, message in (((), whole), (("--open", "--save-field", "f.npz"), field)):
         code, _, err = command(*run, *options)
         assert code == 1 and message in err and err.count("\n") == 1
-        assert [path.name for path in tmp_path.iterdir()] == ["seen.npy"]
+        assert os.listdir() == ["seen.npy"]
     code, _, err = command(*run, "--open")
-    assert code == 0
+    assert code == 0 and not trimesh.load("out.ply").is_watertight
     assert "Warning: the surface ends where samples are unknown, and is open there\n" in err
-    assert not trimesh.load("out.ply").is_watertight
 
 
 def test_unequal_spacings_of_distances_that_end_need_the_spline():
@@ -190,11 +180,9 @@ def test_unequal_spacings_of_distances_that_end_need_the_spline():
 def test_an_infinite_sample_beside_the_surface_is_refused():
     values = truncated()
     values[values < 0] = -np.inf
-    with pytest.raises(GridError) as caught:
-        make_grid(values, **PLACE)
     beside = (values < 0) & ndimage.binary_dilation(values > 0, FACES)
     first = ", ".join(map(str, np.argwhere(beside)[0]))
-    assert str(caught.value) == (
+    assert refusal(GridError, make_grid, values, **PLACE) == (
         f"values[{first}] is -inf, and a sample beside it has the other sign, as at "
         f"{beside.sum():,} infinite samples: where the surface passes between them is unknown; "
         "replace each by a distance of the right sign (the cut-off value of its side), or by NaN "
@@ -227,10 +215,7 @@ def test_a_band_over_its_truncation_is_the_same_with_nan_elsewhere(unit):
         assert grid.field.kind == "truncated" and any(n.startswith(said) for n in grid.notes)
 
 
-NEVER = [0, 1, -1, -1000, 100, 255, 1e10, -32768]
-
-
-@pytest.mark.parametrize("value", NEVER)
+@pytest.mark.parametrize("value", [0, 1, -1000, 255, 1e10])
 def test_a_value_where_nothing_was_seen_is_told_by_its_jumps(value):
     distances = np.linalg.norm(np.indices((28,) * 3).T - 13.3, axis=-1) - 8.2
     far = np.abs(distances) >= 3.2
@@ -243,14 +228,13 @@ def test_a_value_where_nothing_was_seen_is_told_by_its_jumps(value):
     assert mesh.volume() == pytest.approx(same.volume(), rel=1e-3)
 
 
-@pytest.mark.parametrize("cut", [0.2, 0.5, 1, 3])
-@pytest.mark.parametrize("make", [box, torus, thin_frame])
+@pytest.mark.parametrize("cut", [0.2, 1, 3])
+@pytest.mark.parametrize("make", [box, thin_frame])
 def test_values_that_are_cut_off_were_seen(cut, make):
-    for low in (-cut, -2 * cut):
-        for noise in (0, 0.05):
-            random = np.random.default_rng(0).normal(size=(32,) * 3)
-            grid = make_grid(np.clip(make() + noise * random, low, cut), **PLACE)
-            assert not any("exactly" in note for note in grid.notes)
+    random = np.random.default_rng(0).normal(size=(32,) * 3)
+    for low, noise in ((-cut, 0), (-2 * cut, 0.05)):
+        grid = make_grid(np.clip(make() + noise * random, low, cut), **PLACE)
+        assert not any("exactly" in note for note in grid.notes)
 
 
 def test_zeros_on_the_surface_were_seen():
@@ -280,9 +264,7 @@ def fused(cut: float) -> tuple[np.ndarray, np.ndarray]:
     return np.divide(total, count, out=np.ones_like(total), where=count > 0), count
 
 
-@pytest.mark.parametrize(
-    "unseen, scale", [(-1, 1), (np.nan, 3), (0, 32767), (1, 3), (-1000, 1), (-1, 32767)]
-)
+@pytest.mark.parametrize("unseen, scale", [(-1, 1), (np.nan, 3), (0, 32767), (-1000, 1)])
 def test_fused_depth_images_are_meshed_by_their_spline(unseen, scale):
     values, count = fused(3.0)
     values = np.where(count > 0, values, unseen) * scale

@@ -1,7 +1,6 @@
 """OpenVDB files: those in ``data`` were written by OpenVDB 10.0.1, others here, byte by byte."""
 
 import re
-import shutil
 import struct
 import uuid
 import zlib
@@ -9,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import refusal
 
 from super_sdf import read_grid
 from super_sdf.errors import FileError, GridError
@@ -17,6 +17,9 @@ from super_sdf.files.grids import open_volume
 from super_sdf.files.readers.vdb import ACTIVE_MASK, ZIP
 
 DATA = Path(__file__).parent / "data"
+
+
+pytestmark = pytest.mark.usefixtures("in_process")
 
 
 def voxels(path):
@@ -32,20 +35,31 @@ def distance(values, origin, spacing, balls):
     return np.min([np.linalg.norm(places - centre, axis=-1) - r for centre, r in balls], axis=0)
 
 
-@pytest.mark.parametrize(("name", "error"), [("far-balls", 2e-4), ("far-balls-half", 1e-3)])
-def test_balls_in_two_nodes_of_the_root_and_in_many_of_the_next(name, error):
-    """Of radius 6 at (4096, 0, 0) and 5 at (4406, 40, 130), voxels of 0.5, 310 voxels apart."""
+FAR = [((2048, 0, 0), 3.0), ((2203, 20, 65), 2.5)]
+WRITTEN = {
+    "far-balls-half": (FAR, -1.5, 1.5, 1e-3),  # 310 voxels apart: in two nodes of the root
+    "two-balls": ([((15.5, -11.5, 41.5), 4.2), ((21.5, -11, 42.5), 2.1)], -1.5, 1.5, 1e-5),
+    "narrow-inside": ([((27.5,) * 3, 20.0)], -1, 3, 1e-5),  # inactive tiles inside
+    "dense": ([((9.5,) * 3, 6.0)], -99, 99, 1e-5),  # by copyFromArray, background 0
+    "picogk": ([((1.5, 2.0, 2.5), 3.0)], -1.5, 1.5, 1e-5),
+}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_balls_that_openvdb_wrote_are_at_their_place(name):
+    balls, low, high, error = WRITTEN[name]
     values, *place = voxels(DATA / f"{name}.vdb")
-    exact = distance(values, *place, [((2048, 0, 0), 3.0), ((2203, 20, 65), 2.5)])
-    assert len(values) > 310 and place[1] == 0.5
-    assert np.abs(values - exact.clip(-1.5, 1.5)).max() < error
+    assert np.abs(values - distance(values, *place, balls).clip(low, high)).max() < error
+    assert len(values) > 310 or "far" not in name
 
 
-def test_a_band_that_is_narrower_inside():
-    """A ball of radius 20 voxels about 27.5, from -1 to 3; inside are inactive tiles of -1."""
-    values, *place = voxels(DATA / "narrow-inside.vdb")
-    exact = distance(values, *place, [((27.5,) * 3, 20.0)])
-    np.testing.assert_allclose(values, exact.clip(-1, 3), atol=1e-5)
+def test_turned_axes_and_the_unit_of_picogk():
+    """A ball of radius 1.5 at (10, 9, 7): i along y, j along -z, k along x."""
+    grid = read_grid(DATA / "turned-ball.vdb")
+    exact = distance(grid.values, np.array(grid.origin), 0.5, [((10, 9, 7), 1.5)])
+    assert np.abs(grid.values - exact.clip(-1.5, 1.5)).max() < 1e-5
+    notes = read_grid(DATA / "picogk.vdb").notes
+    assert "voxels of 0.5 mm, as PicoGK states: the mesh is in millimetres" in notes
 
 
 def test_a_level_set_that_was_cut_keeps_its_inside():
@@ -63,23 +77,6 @@ def test_a_density_keeps_its_tiles_and_is_meshed_at_a_level():
     solid[2:-2, 2:-2, 2:-2] = True
     np.testing.assert_array_equal(grid.values < 0, solid)
     assert grid.shape == (44, 36, 28)
-
-
-def test_where_the_background_is_0_inactive_voxels_are_unknown():
-    """A dense array of the distance to a ball of radius 6 about 9.5, as copyFromArray keeps it."""
-    values, *place = voxels(DATA / "dense.vdb")
-    exact = distance(values, *place, [((9.5,) * 3, 6.0)])
-    np.testing.assert_allclose(values, exact, atol=1e-5)
-    assert values.shape == (20, 20, 20)
-
-
-def test_the_voxels_of_picogk_have_their_size_and_place():
-    """A ball of radius 6 voxels at index (3, 4, 5); its metadata says 0.0005 m, so 0.5 mm."""
-    values, *place = voxels(DATA / "picogk.vdb")
-    exact = distance(values, *place, [((1.5, 2.0, 2.5), 3.0)])
-    np.testing.assert_allclose(values, exact.clip(-1.5, 1.5), atol=1e-5)
-    grid = read_grid(DATA / "picogk.vdb")
-    assert "voxels of 0.5 mm, as PicoGK states: the mesh is in millimetres" in grid.notes
 
 
 def text(words: str) -> bytes:
@@ -163,37 +160,34 @@ def test_values_that_are_not_packed(tmp_path):
     np.testing.assert_array_equal(voxels(tmp_path / "a.vdb")[0][2:-2, 2:-2, 2:-2].ravel(), values)
 
 
-def refusal(path: Path, content: bytes, kind: type[Exception] = FileError) -> str:
+def said_of(path: Path, content: bytes, kind: type[Exception] = FileError) -> str:
     """Return why a file of this content is refused."""
     path.write_bytes(content)
-    with pytest.raises(kind) as caught:
-        read_grid(path)
-    return str(caught.value)
+    return refusal(kind, read_grid, path)
 
 
 def test_damaged_leaves_and_lengths(tmp_path):
     """The file states more voxels than it holds, a string of 4 GB, or no voxel at all."""
     path, hundred = tmp_path / "a.vdb", mask(*range(100), size=512)
     leaf = bytes([0]) + np.ones(100, "<f4").tobytes()
-    said = refusal(path, one_leaf(leaf, hundred, flags=ACTIVE_MASK, count=188574))
+    said = said_of(path, one_leaf(leaf, hundred, flags=ACTIVE_MASK, count=188574))
     assert said == f"{path} is damaged: it has 100 active voxels and states 188,574"
     whole = one_leaf(leaf, hundred, flags=ACTIVE_MASK)
     damaged = whole.replace(text("surface"), struct.pack("<I", 2**32 - 1) + b"surface")
-    assert "4,294,967,295 bytes are to follow byte 69 of " in refusal(path, damaged)
-    said = refusal(path, one_leaf(b"\0", mask(size=512), flags=ACTIVE_MASK), GridError)
+    assert "4,294,967,295 bytes are to follow byte 69 of " in said_of(path, damaged)
+    said = said_of(path, one_leaf(b"\0", mask(size=512), flags=ACTIVE_MASK), GridError)
     assert said == f"{path} has no active voxel: it holds no surface"
 
 
 def test_a_file_that_ends_early_or_is_another_one(tmp_path):
-    whole, path = (DATA / "far-balls.vdb").read_bytes(), tmp_path / "a.vdb"
+    whole, path = (DATA / "two-balls.vdb").read_bytes(), tmp_path / "a.vdb"
     for size in (4, 60, 700, len(whole) // 2, len(whole) - 1):
-        said = refusal(path, whole[:size])
+        said = said_of(path, whole[:size])
         assert re.match(r".*a\.vdb is (truncated or damaged|no \.vdb file): ", said)
-    said = refusal(path, whole[:8] + struct.pack("<I", 220) + whole[12:])
+    said = said_of(path, whole[:8] + struct.pack("<I", 220) + whole[12:])
     assert "has version 220 of the format: save it with OpenVDB 3" in said
 
 
-def test_a_grid_is_named_where_there_are_several(tmp_path):
-    shutil.copy(DATA / "picogk.vdb", tmp_path / "a.vdb")
-    with pytest.raises(FileError, match="has no grid of floating-point values 'b': it holds surf"):
-        read_grid(tmp_path / "a.vdb:b")
+def test_a_grid_is_named_where_there_are_several():
+    said = refusal(FileError, read_grid, DATA / "picogk.vdb:b")
+    assert "has no grid of floating-point values 'b': it holds surf" in said

@@ -92,6 +92,11 @@ def ball(shape: tuple[int, ...] = (12, 12, 12), radius: float = 0.3) -> np.ndarr
     return (away - radius * min(shape)).astype(np.float32)
 
 
+def words(*lines: str) -> list[str]:
+    """Return the words of some lines."""
+    return " ".join(lines).split()
+
+
 def npy(array: Any, **options: Any) -> bytes:
     """Return an array as the bytes of an .npy file."""
     file = io.BytesIO()

@@ -14,12 +14,12 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 
-from . import archives, fields, grids, ledgers, manifests, meshes, models, options, scales, special
+from . import archives, fields, grids, manifests, meshes, models, options, special
 from .case import Case
 from .judge import try_case
 from .running import Child
 
-THEMES = (grids, archives, fields, scales, options, manifests, ledgers, models, meshes, special)
+THEMES = (grids, archives, fields, options, manifests, models, meshes, special)
 ALONE = (models, meshes, special)  # all of them may hang or crash
 
 

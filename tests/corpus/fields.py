@@ -13,7 +13,6 @@ Field = Callable[[np.random.Generator, tuple[int, ...]], np.ndarray]
 
 
 def _spotted(value: float, share: float) -> Field:
-
     def make(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
         values = ball(shape)
         values[rng.random(shape) < share] = value
@@ -33,10 +32,8 @@ KINDS: dict[str, Field] = {
     **random_fields.KINDS,
     "constant": lambda rng, shape: np.full(shape, rng.choice([0.0, -0.0, 1.0, -1.0, 1e-30])),
     "positive": lambda rng, shape: np.abs(ball(shape)) + 0.1,
-    "negative": lambda rng, shape: -np.abs(ball(shape)) - 0.1,
     "unsigned": lambda rng, shape: np.abs(ball(shape)),
     "not-below-0": lambda rng, shape: np.maximum(ball(shape), 0),
-    "not-above-0": lambda rng, shape: np.minimum(ball(shape), 0),
     "uneven": lambda rng, shape: np.clip(ball(shape), -rng.choice([0.1, 0.5, 1]), 1),
     "occupancy": lambda rng, shape: np.where(ball(shape) < 0, -1.0, 1.0),
     "plane": _plane,
@@ -47,17 +44,13 @@ KINDS: dict[str, Field] = {
     "nan": _spotted(np.nan, 0.01),
     "inf": _spotted(np.inf, 0.01),
     "minus-inf": _spotted(-np.inf, 0.3),
-    "zeros": _spotted(0.0, 0.1),
     "minus-zeros": _spotted(-0.0, 0.3),
     "far": _spotted(1e4, 0.2),
     "one-sample": lambda rng, shape: np.where(
         np.indices(shape).sum(0) == sum(shape) // 2, -0.3, 1.0
     ),
-    "inside-out": lambda rng, shape: -ball(shape),
     "cut": lambda rng, shape: ball(shape, 0.8),
     "squared": lambda rng, shape: ball(shape) * np.abs(ball(shape)),
-    "steep": lambda rng, shape: ball(shape) * 7,
-    "checker": lambda rng, shape: np.where(np.indices(shape).sum(0) % 2, 0.5, -0.5),
     "gyroid": lambda rng, shape: np.sin(np.indices(shape)).sum(0) * 0.6,
     "anisotropic": lambda rng, shape: (
         np.linalg.norm((np.indices(shape).T - 5.3) * [1, 1, 3], axis=3).T - 3

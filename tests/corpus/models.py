@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from onnx_files import DOUBLE, FLOAT, INT32, declared, entry, metadata, node
+from onnx_files import DOUBLE, FLOAT, declared, entry, metadata, node
 from onnx_files import INPUTS as CONTRACT
 
 from .case import Case, ball, mutate, npy, rng_of
@@ -78,46 +78,35 @@ def odd_nets() -> dict[str, Net]:
     for operator in ("Sqrt", "Log", "Reciprocal", "Exp", "Neg", "Floor", "Sign", "Acos", "Nothing"):
         nodes = (*NODES[:-1], (operator, ("sum",), "values"))
         nets[f"ends-with-{operator}"] = Net(nodes)
-    for number in range(4):
+    for number, (name, kind, *shape) in enumerate(INPUTS):
         others = [value for k, value in enumerate(INPUTS) if k != number]
-        name, kind, *shape = INPUTS[number]
-        wrong = DOUBLE if kind == FLOAT else INT64
-        changed = {
-            "missing": others,
-            "renamed": [*others, (f"{name}s", kind, *shape)],
-            "other-type": [*others, (name, wrong, *shape)],
-            "flat": [*others, (name, kind, "N")],
-            "deep": [*others, (name, kind, "V", 27, 1, 1)],
-            "fixed": [*others, (name, kind, 1, *shape[1:])],
-            "narrow": [*others, (name, kind, "V", 26)],
-            "negative": [*others, (name, kind, MINUS - 1, 27)],
-            "twice": [*INPUTS, INPUTS[number]],
+        declared_as = {
+            "renamed": (f"{name}s", kind, *shape),
+            "other-type": (name, DOUBLE if kind == FLOAT else INT64, *shape),
+            "flat": (name, kind, "N"),
+            "deep": (name, kind, "V", 27, 1, 1),
+            "fixed": (name, kind, 1, *shape[1:]),
+            "negative": (name, kind, MINUS - 1, 27),
         }
+        changed = {what: [*others, each] for what, each in declared_as.items()}
+        changed |= {"missing": others, "twice": [*INPUTS, INPUTS[number]]}
         nets |= {f"{name}-{what}": Net(inputs=inputs) for what, inputs in changed.items()}
     outputs = {
         "none": (),
         "renamed": (("result", FLOAT, "D", "Q"),),
         "double": (("values", DOUBLE, "D", "Q"),),
-        "integer": (("values", INT32, "D", "Q"),),
         "two": (*OUTPUTS, ("sum", FLOAT, "D", "Q")),
         "flat": (("values", FLOAT, "D"),),
         "fixed": (("values", FLOAT, 1, 1),),
     }
     nets |= {f"output-{what}": Net(outputs=values) for what, values in outputs.items()}
-    for name, (operator, *inputs) in {
-        "one-column": ("Identity", "column"),
-        "one-row": ("Identity", "row"),
-        "too-many": ("Identity", "chosen"),
-        "turned": ("Transpose", "sum"),
-        "scalar": ("ReduceSum", "sum"),
-        "shape": ("Shape", "sum"),
-        "itself": ("Add", "values", "sum"),
-        "unknown": ("Identity", "nobody"),
-        "nothing": ("Identity",),
-    }.items():
+    gives = "Identity column,Identity row,Identity chosen,Transpose sum,ReduceSum sum,Shape sum"
+    for each in [*gives.split(","), "Add values sum", "Identity nobody", "Identity"]:
+        operator, *inputs = each.split()
+        name = each.replace(" ", "-")
         nets[f"gives-{name}"] = Net((*NODES[:-1], (operator, tuple(inputs), "values")))
-    nets |= {f"opset-{n}": Net(opset=n) for n in (0, 1, 6, 9999, -1, 2**63)}
-    nets |= {f"ir-{n}": Net(ir_version=n) for n in (0, 1, 99, -1)}
+    nets |= {f"opset-{n}": Net(opset=n) for n in (0, 1, 9999, -1, 2**63)}
+    nets |= {f"ir-{n}": Net(ir_version=n) for n in (0, 99, -1)}
     return nets | {"empty": Net(()), "domain": Net(domain="some.where"), "bare": Net(metadata={})}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from .case import Case, ball, batch, npy, sample, upsample
+from .case import Case, ball, batch, npy, sample, upsample, words
 from .meshes import CUBE
 
 LINES = [
@@ -19,41 +19,35 @@ LINES = [
 ]
 GRID = {"in.npy": npy(ball())}
 NUMBERS = [
-    *("", " ", "x", "nan", "NaN", "inf", "-inf", "1e999", "-1", "0", "-0", "1e-400", "5e-324"),
-    *("1e308", "1" + "0" * 400, "-1" + "0" * 400, "1_0", "1,5", "1,1,1", "1,1", ",,", "1,,1"),
-    *(
-        "1,1,1,1",
-        "1 1 1",
-        "0x10",
-        "1.",
-        ".5",
-        "+1",
-        "\uff11",
-        "٣",
-        "1e",
-        "--1",
-        "1\n",
-        "½",
-        "1,nan,1",
-    ),
-    *("1,2,3", "true", "4", "2", "3", "5", "7", "32", "64", "-4", "16", "2.0", "2147483648"),
-    *("1,nan,1", "9223372036854775808", "99999999999999"),
+    *words("x nan inf -inf 1e999 -1 0 -0 1e-400 5e-324 1e308 1_0 1,5 1,1,1 ,, 1,,1 1,1,1,1 0x10"),
+    *words("1. +1 1e --1 1,nan,1 true 4 3 64 -4 2.0 2147483648 9223372036854775808 99999999999999"),
+    *("", " ", "1" + "0" * 400, "-1" + "0" * 400, "1 1 1", "\uff11", "٣", "½", "1\n"),
 ]
 WORDS = [
-    *("", " ", "x", "AUTO", "neg", "é", "a\nb", "\udcff", "-", "--", "n" * 5000, "0", "None"),
+    "",
+    " ",
+    "x",
+    "AUTO",
+    "é",
+    "a\nb",
+    "\udcff",
+    "-",
+    "--",
+    "n" * 5000,
+    "0",
+    "None",
     "\x1b[31m",
 ]
 SIZES = [
-    *("", "0", "-1", "1", "1K", "1k", "1M", "100M", "1G", "1T", "1e9", "1e400", "nan", "inf"),
-    *("G", "1GB", "1 G", ".5G", "-1G", "1" + "0" * 400, "1" + "0" * 400 + "G", "\uff15M", "²"),
-    *("1_000M", "0x1", "1e-9G", "\n"),
+    *words("0 -1 1 1K 1k 1M 100M 1T 1e9 1e400 nan inf G 1GB .5G -1G 1_000M 0x1 1e-9G"),
+    *("", "1 G", "1" + "0" * 400, "1" + "0" * 400 + "G", "\uff15M", "²", "\n"),
 ]
 TARGETS = [
-    *("", ".", "..", "/", "out", "out.", ".ply", "out.PLY", "out.xyz", "out.npy", "none/out.ply"),
-    *("out.ply/", "in.npy", "in.npy/out.ply", "n" * 251 + ".ply", "n" * 300 + ".ply"),
-    *("n" * 245 + ".ply", "~/no/out.ply", "d/" * 2100 + "out.ply", "a\nb.ply", "\udcff.ply"),
-    *("-out.ply", "é.ply", "*.ply", " .ply", "out.ply.gz", "folder.ply", "there.ply"),
-    *("folder.ply/x.ply", "n" * 250 + ".stl", "n" * 240 + ".obj", "CON.stl", "a:b.ply"),
+    *words(". .. / out out. .ply out.PLY out.xyz out.npy none/out.ply out.ply/ in.npy"),
+    *words("in.npy/out.ply ~/no/out.ply -out.ply é.ply *.ply folder.ply there.ply a:b.ply"),
+    "folder.ply/x.ply",
+    *("", " .ply", "a\nb.ply", "\udcff.ply", "d/" * 2100 + "out.ply", "n" * 300 + ".ply"),
+    *("n" * 251 + ".ply", "n" * 250 + ".stl", "n" * 240 + ".obj"),
 ]
 ALIKE = "--factor --spacing --origin --offset --threads --simplify --triangles"
 NUMBER_OPTIONS = {"upsample": ALIKE, "batch": ALIKE, "sample": "-n --spacing --padding --band"}
@@ -116,6 +110,6 @@ def _lines() -> Iterator[Case]:
         ["sample", "n" * 300 + ".ply", "out.npz", "-n", "8"],
         *map(str.split, LINES),
     ]
-    for number, words in enumerate(lines):
+    for number, line in enumerate(lines):
         made = ("out.*", "out", "out/*", "o", "o/*")
-        yield Case(f"options/line-{number}", tuple(words), {**GRID, **CUBE}, made, alone=True)
+        yield Case(f"options/line-{number}", tuple(line), {**GRID, **CUBE}, made, alone=True)

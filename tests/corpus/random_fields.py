@@ -139,13 +139,7 @@ def in_bricks(field: RandomField, network: Network, mesher: str, parts: int) -> 
     seen = look_at_band(grid, 0.0)
     bricks = (
         pipeline.reconstruct_planes(
-            grid,
-            network,
-            field.factor,
-            planes,
-            whole=seen.summary,
-            cap=field.cap,
-            mesher=mesher,
+            grid, network, field.factor, planes, whole=seen.summary, cap=field.cap, mesher=mesher
         )
         for planes in equal_parts(np.append(0, np.cumsum(seen.decoded)), parts)
     )

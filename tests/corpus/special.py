@@ -25,11 +25,6 @@ def _closed(path: Path) -> None:
     path.chmod(0)
 
 
-def _closed_folder(path: Path) -> None:
-    path.mkdir()
-    path.chmod(0)
-
-
 def _circle(path: Path) -> None:
     path.mkdir()
     (path / "in.npy").write_bytes(npy(ball()))
@@ -37,38 +32,31 @@ def _circle(path: Path) -> None:
     (path / "up").symlink_to("..")
 
 
-def _long_line(path: Path) -> None:
-    path.write_bytes(b"x" * 30_000_000)
-
-
 def _link(to: str) -> Callable[[Path], None]:
     return lambda path: path.symlink_to(to)
 
 
+DEVICES: dict[str, Content] = {
+    name.rpartition("/")[2]: _link(name)
+    for name in (
+        *("/dev/zero", "/dev/null", "/dev/full", "/dev/urandom", "/dev/tty", "/dev/stdin"),
+        *("/proc/self/mem", "/proc/self/status", "/proc/self/environ"),
+    )
+}
 KINDS: dict[str, Content] = {
+    **DEVICES,
     "fifo": os.mkfifo,
     "socket": _socket,
-    "zero": _link("/dev/zero"),
-    "null": _link("/dev/null"),
-    "full": _link("/dev/full"),
-    "random": _link("/dev/urandom"),
-    "tty": _link("/dev/tty"),
-    "stdin": _link("/dev/stdin"),
     "loop": lambda path: path.symlink_to(path.name),
     "dangling": _link("nowhere"),
     "link-to-folder": _link("."),
     "folder": lambda path: path.mkdir(),
     "closed": _closed,
-    "closed-folder": _closed_folder,
+    "closed-folder": lambda path: path.mkdir(0),
     "circle": _circle,
-    "memory": _link("/proc/self/mem"),
-    "pages": _link("/proc/self/pagemap"),
-    "status": _link("/proc/self/status"),
-    "environ": _link("/proc/self/environ"),
     "empty": b"",
-    "long-line": _long_line,
+    "long-line": lambda path: path.write_bytes(b"x" * 30_000_000),
 }
-DEVICES = {"null", "full", "zero", "random", "tty", "stdin", "memory", "pages", "status", "environ"}
 GRID = {"good.npy": npy(ball()), "good.npz": npz(values=ball())}
 
 
