@@ -11,6 +11,7 @@ every triangle shows.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,10 +32,11 @@ PARTS_TARGET = Path("docs/images/sharp.png")
 SEED = 0
 METHODS = {"marching cubes of the grid": "mc", "--mesher marching": "ours",
            "--mesher sharp": "ours-sharp"}  # fmt: skip
-PIXELS, LARGE_PIXELS = 340, 620
+PIXELS, LARGE_PIXELS = 340, 440
 COLOURS = 96  # of the palette: a third of the bytes, and no difference to be seen
 MARGIN = 1.06
 RED = 200, 30, 30
+Picture = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -71,59 +73,63 @@ def frames_of(
     return whole, Frame(axes, upright @ middle, half)
 
 
-def mark(image: NDArray[np.uint8], whole: Frame, close: Frame) -> None:
-    """Outline in the picture of the whole part what the close-up shows."""
-    scale = PIXELS / 2 / whole.half
+def mark(image: Picture, whole: Frame, close: Frame) -> None:
+    """Outline in the picture of the whole mesh what the close-up shows."""
+    pixels = len(image)
+    scale = pixels / 2 / whole.half
     right, up = (close.centre - whole.centre)[:2] * scale
     half = close.half * scale
-    low = np.round([PIXELS / 2 - up - half, PIXELS / 2 + right - half]).astype(int)
+    low = np.round([pixels / 2 - up - half, pixels / 2 + right - half]).astype(int)
     high = np.round(low + 2 * half).astype(int)
-    (top, left), (bottom, end) = low.clip(0, PIXELS - 2), high.clip(2, PIXELS)
+    (top, left), (bottom, end) = low.clip(0, pixels - 2), high.clip(2, pixels)
     for rows in (slice(top, top + 2), slice(bottom - 2, bottom)):
         image[rows, left:end] = RED
     for columns in (slice(left, left + 2), slice(end - 2, end)):
         image[top:bottom, columns] = RED
 
 
-def row_of(folder: Path, place: Place) -> list[NDArray[np.uint8]]:
-    """Return the pictures of a row: the whole part, sharp, and the place in three meshes."""
+def row_of(meshes: Sequence[Mesh], frames: tuple[Frame, Frame], pixels: int) -> list[Picture]:
+    """Return the pictures of a row: the last mesh, whole, and the close-up of each."""
+    whole, close = frames
+    overview = draw_panel(Panel(meshes[-1]), whole, pixels)
+    mark(overview, whole, close)
+    return [overview, *(draw_panel(Panel(mesh), close, pixels) for mesh in meshes)]
+
+
+def row_of_part(folder: Path, place: Place) -> list[Picture]:
+    """Return the pictures of a part at 32^3, turned, by each of ``METHODS``."""
     case = Case(Shape.read(folder / f"{place.part}.ply", SEED), Setting(32))
     network = load_network()
     meshes = [make_surface(method, case, network).mesh for method in METHODS.values()]
-    turn = turn_of(place.part, SEED)
-    whole, close = frames_of(place, meshes[-1], turn, np.array(place.middle), place.half)
-    overview = draw_panel(Panel(meshes[-1]), whole, PIXELS)
-    mark(overview, whole, close)
-    return [overview, *(draw_panel(Panel(mesh), close, PIXELS) for mesh in meshes)]
+    turn, middle = turn_of(place.part, SEED), np.array(place.middle)
+    return row_of(meshes, frames_of(place, meshes[-1], turn, middle, place.half), PIXELS)
 
 
 def draw_parts(folder: Path, target: Path) -> None:
-    """Draw the rows of three parts, as one PNG file with a palette."""
-    images = [image for place in PLACES for image in row_of(folder, place)]
+    """Draw the rows of three parts."""
+    images = [image for place in PLACES for image in row_of_part(folder, place)]
     titles = [title for place in PLACES for title in (place.part, *METHODS)]
-    page = Page(PIXELS, images, titles, columns=1 + len(METHODS))
-    write_picture(page.figure, target)
-    Image.open(target).convert("RGB").quantize(COLOURS).save(target, optimize=True)
+    save(Page(PIXELS, images, titles, columns=1 + len(METHODS)), target)
 
 
 def draw_example(source: Path, target: Path) -> None:
-    """Draw coarse marching cubes and super-sdf of a grid, whole and close up."""
+    """Draw a grid's mesh by super-sdf, and a place of it in coarse marching cubes, too."""
     grid = read_grid(source)
     coarse = isosurface(np.array(grid.values, np.float32), grid.voxel_size, 0.0)
-    columns = {
-        "marching cubes of the grid": coarse.transformed(np.eye(3), np.array(grid.origin)),
-        "super-sdf": reconstruct(grid),
-    }
-    last = columns["super-sdf"]
-    low, high = last.vertices.min(0), last.vertices.max(0)
+    meshes = [coarse.transformed(np.eye(3), np.array(grid.origin)), reconstruct(grid)]
+    low, high = meshes[-1].vertices.min(0), meshes[-1].vertices.max(0)
     middle = (low + high) / 2 + (high - low) * EXAMPLE_PLACE.middle
     half = EXAMPLE_PLACE.half * float((high - low).max()) / 2
-    frames = frames_of(EXAMPLE_PLACE, last, np.eye(3), middle, half)
-    meshes = columns.values()
-    images = [draw_panel(Panel(mesh), frame, LARGE_PIXELS) for frame in frames for mesh in meshes]
-    titles = [f"{name}, {len(mesh.faces):,} triangles" for name, mesh in columns.items()]
-    page = Page(LARGE_PIXELS, images, [*titles, "", ""], columns=2)
+    frames = frames_of(EXAMPLE_PLACE, meshes[-1], np.eye(3), middle, half)
+    counts = [f"{len(mesh.faces):,} triangles" for mesh in meshes]
+    titles = ["super-sdf", f"marching cubes of the grid, {counts[0]}", f"super-sdf, {counts[1]}"]
+    save(Page(LARGE_PIXELS, row_of(meshes, frames, LARGE_PIXELS), titles, columns=3), target)
+
+
+def save(page: Page, target: Path) -> None:
+    """Write a page as a PNG file with a palette."""
     write_picture(page.figure, target)
+    Image.open(target).convert("RGB").quantize(COLOURS).save(target, optimize=True)
 
 
 def main() -> None:
