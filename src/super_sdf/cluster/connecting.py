@@ -157,7 +157,13 @@ def _local_cluster(count: int, killed_at: int) -> Iterator[SpecCluster]:
         _start_quiet_tracker()
         with ending_signals_blocked():
             workers = dict.fromkeys(range(count), worker)
-            cluster = SpecCluster(workers, scheduler, silence_logs=silence_logs)
+            try:
+                cluster = SpecCluster(workers, scheduler, silence_logs=silence_logs)
+            except Exception as error:  # of many kinds; a worker was killed as it started, say
+                raise ClusterError(
+                    f"the local workers do not start ({' '.join(str(error).split())}): run it "
+                    "again, with fewer --jobs if memory is short"
+                ) from error
         try:
             yield cluster
         finally:
