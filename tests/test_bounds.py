@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import ball, trilinear
+from conftest import ball
 
-from super_sdf import SdfGrid, pipeline, reconstruct
+from super_sdf import SdfGrid, pipeline
 from super_sdf.steps.band import HALF_BAND, neighbour_table
 from super_sdf.steps.bounds import (
     bounded_values,
@@ -34,27 +34,19 @@ def around(voxel_ijk, trusted):
     return flat.take(start[:, None] + steps)
 
 
-def clipped(limit):
-    """Return the ball with distances cut off, in spacings."""
-    return SdfGrid.trusted(np.clip(ball().values, -limit, limit), (1.0,) * 3)
-
-
 @pytest.mark.parametrize(("factor", "limit"), [(4, 100), (4, 1.7), (8, 3.0)])
-def test_true_distances_are_within_the_bounds_wherever_others_are_cut_off(factor, limit):
-    band, voxel_ijk, exact = blocks_of(clipped(limit), factor)
-    moved = bounded_values(exact, factor, around(voxel_ijk, band.trusted))
-    np.testing.assert_allclose(moved, exact, atol=2e-5)
-
-
-@pytest.mark.parametrize("factor", [4, 8])
-def test_no_value_moves_away_from_the_truth_and_many_move_nearer(factor):
-    band, voxel_ijk, exact = blocks_of(ball(), factor)
+def test_no_value_moves_away_from_the_truth_and_many_move_nearer(factor, limit):
+    """Wherever others are cut off; those that are the truth stay."""
+    cut = SdfGrid.trusted(np.clip(ball().values, -limit, limit), (1.0,) * 3)
+    band, voxel_ijk, exact = blocks_of(cut, factor)
+    samples = around(voxel_ijk, band.trusted)
+    np.testing.assert_allclose(bounded_values(exact, factor, samples), exact, atol=2e-5)
     wrong = exact + np.random.default_rng(0).normal(0, 0.3, exact.shape).astype(np.float32)
-    moved = bounded_values(wrong, factor, around(voxel_ijk, band.trusted))
-    before, after = np.abs(wrong - exact), np.abs(moved - exact)
+    before, after = np.abs(wrong - exact), np.abs(bounded_values(wrong, factor, samples) - exact)
     assert (after <= before + 2e-5).all()
-    assert (after < before - 1e-3).mean() > 0.5
-    assert after.mean() < 0.5 * before.mean()
+    if limit == 100:
+        assert (after < before - 1e-3).mean() > 0.5
+        assert after.mean() < 0.5 * before.mean()
 
 
 def test_the_bound_of_one_sample_is_its_distance_less_that_to_the_node():
@@ -114,13 +106,3 @@ def test_where_no_sample_beyond_the_band_is_trusted_nothing_moves(factor, limit)
     trusted = replace(band.trusted, limits=(-limit, limit))
     keep_within_bounds(blocks, None, factor, voxel_ijk, trusted)
     np.testing.assert_array_equal(blocks, kept)
-
-
-def test_the_bounds_improve_an_interpolated_ball(monkeypatch):
-    def error(mesh):
-        return np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS).mean()
-
-    monkeypatch.setattr(pipeline, "fit_to_spheres", lambda *_: None)
-    bounded = error(reconstruct(ball(), trilinear))
-    monkeypatch.setattr(pipeline, "keep_within_bounds", lambda *_: None)
-    assert bounded < 0.7 * error(reconstruct(ball(), trilinear))

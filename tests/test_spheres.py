@@ -31,19 +31,15 @@ def blocks_of(grid, factor=4):
     return touched, share_parts(row_of[table[voxels]]), position
 
 
-def distance_to_ball(nodes, radius=6.0):
+def distance_to_ball(nodes):
     """Return blocks of distances to the ball in half voxels, with the column of zeros."""
-    exact = np.linalg.norm(nodes - 2 * CENTRE_OF_BALL, axis=2) - 2 * radius
-    return with_zeros(exact.astype(np.float32))
+    exact = np.linalg.norm(nodes - 2 * CENTRE_OF_BALL, axis=2) - 12
+    return np.pad(exact.astype(np.float32), ((0, 0), (0, 1)))
 
 
-def with_zeros(blocks):
-    return np.pad(blocks, ((0, 0), (0, 1)))
-
-
-def fitted(blocks, parts, touched, factor=4):
+def fitted(blocks, parts, touched):
     moved = blocks.copy()
-    fit_to_spheres(moved, parts, factor, *touched)
+    fit_to_spheres(moved, parts, 4, *touched)
     return moved
 
 
@@ -88,35 +84,29 @@ def test_samples_beyond_the_band_that_were_cut_off_have_no_spheres(limit):
 
 
 @pytest.mark.parametrize("bias", [-0.2, 0.1])
-def test_a_constant_error_is_corrected(bias):
-    samples, parts, position = blocks_of(ball())
+def test_a_constant_error_is_corrected_and_exact_samples_are_kept(bias):
+    (spheres, index), parts, position = blocks_of(ball())
     exact = distance_to_ball(position)
     biased = exact + np.float32(bias)
     biased[:, -1] = 0
-    off = np.abs(fitted(biased, parts, samples) - exact)[np.abs(exact) < 0.3]
+    moved = fitted(biased, parts, (spheres, index))
+    off = np.abs(moved - exact)[np.abs(exact) < 0.3]
     assert off.max() < 0.4 * abs(bias)
     assert off.mean() < 0.2 * abs(bias)
-
-
-def test_exact_samples_are_kept():
-    (spheres, index), parts, position = blocks_of(ball())
-    moved = fitted(distance_to_ball(position + 0.05), parts, (spheres, index))
     rows = index.find(spheres.centre)
     np.testing.assert_array_equal(moved[62, rows[rows >= 0]], spheres.distance[rows >= 0])
     assert (rows >= 0).sum() == moved.shape[1] - 1
 
 
-def test_noisy_samples_move_nothing():
+def test_noisy_samples_move_nothing_and_bad_or_truncated_ones_are_not_exact():
     grid = ball()
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
     samples, parts, position = blocks_of(SdfGrid.trusted(grid.values + noise, grid.spacing))
     assert not len(samples[0])
     blocks = distance_to_ball(position)
     np.testing.assert_array_equal(fitted(blocks, parts, samples), blocks)
-
-
-def test_one_bad_sample_excludes_only_its_neighbours():
-    grid = ball()
+    band = survey(SdfGrid.trusted(np.clip(grid.values, -0.25, 0.25), grid.spacing))
+    np.testing.assert_array_equal(band.exact, np.abs(band.patches[:, 13]) < 0.5)
     grid.values[3, 9, 9] += 3  # near the surface
     band = survey(grid)
     assert 0 < (~band.lipschitz).sum() <= 27
@@ -124,20 +114,22 @@ def test_one_bad_sample_excludes_only_its_neighbours():
     np.testing.assert_array_equal(band.exact, near & band.lipschitz)
 
 
-def test_truncated_samples_are_not_exact():
-    grid = ball()
-    band = survey(SdfGrid.trusted(np.clip(grid.values, -0.25, 0.25), grid.spacing))
-    np.testing.assert_array_equal(band.exact, np.abs(band.patches[:, 13]) < 0.5)
-    assert band.exact.any()
+@pytest.mark.parametrize(
+    "step, other, least",
+    [("fit_to_spheres", "", 0.35), ("keep_within_bounds", "fit_to_spheres", 0.7)],
+)
+def test_a_step_improves_an_interpolated_ball(monkeypatch, step, other, least):
+    """The bounds without the fit, after which little is left."""
 
-
-def test_the_fit_improves_an_interpolated_ball(monkeypatch):
-    def error(mesh):
+    def error():
+        mesh = reconstruct(ball(), trilinear)
         return np.abs(np.linalg.norm(mesh.vertices - CENTRE_OF_BALL, axis=1) - 6).mean()
 
-    with_fit = error(reconstruct(ball(), trilinear))
-    monkeypatch.setattr(pipeline, "fit_to_spheres", lambda *_: None)
-    assert with_fit < 0.35 * error(reconstruct(ball(), trilinear))
+    if other:
+        monkeypatch.setattr(pipeline, other, lambda *_: None)
+    improved = error()
+    monkeypatch.setattr(pipeline, step, lambda *_: None)
+    assert improved < least * error()
 
 
 def test_a_wall_between_the_samples_is_found():
