@@ -1,7 +1,5 @@
 """The table of gaps: halves, baselines from another report, and what does not count."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import asdict
@@ -21,66 +19,48 @@ MESHES = [Path(f"shape-{n}.ply") for n in range(3)]
 def row(shape, method, f1, **others):
     """A measurement at 32^3 unless ``others`` say otherwise; NC and distance are made from F1."""
     key = {"shape": shape, "mesh": "", "turned": None, **asdict(Setting(32)), "method": method}
-    key |= {"digest": "", "protocol": PROTOCOL}
-    figures = {"f1": f1, "nc": f1 / 2, "p2s_back": 1 - f1, "error": None}
-    changed = {name: value for name, value in others.items() if name in key}
-    return {"key": key | changed, **figures, **others}
+    key |= {"digest": "", "protocol": PROTOCOL} | others
+    return {"key": key, "f1": f1, "nc": f1 / 2, "p2s_back": 1 - f1, "error": None}
 
 
-def write_report(folder, rows):
-    """Write a report's measurements; return its folder."""
+def report(folder, figures, shapes=MESHES, more=()):
+    """Write a report of methods with their F1; return its folder."""
     folder.mkdir()
-    (folder / ROWS).write_text("".join(json.dumps(one) + "\n" for one in rows))
+    rows = [row(path.stem, method, f1) for path in shapes for method, f1 in figures.items()]
+    (folder / ROWS).write_text("".join(json.dumps(one) + "\n" for one in (*more, *rows)))
     return folder
 
 
 @pytest.fixture
 def baselines(tmp_path):
     """A report in which ours closes half of the gap, besides rows that must not count."""
-    shapes = [path.stem for path in MESHES]
-    figures = {"ours": 0.6, "bspline": 0.4, "bound": 0.8}
-    rows = [row(name, method, f1) for name in shapes for method, f1 in figures.items()]
-    noisy = [row(name, "ours", 0.1, noise=0.5) for name in shapes]
-    return write_report(
-        tmp_path / "base", [row(shapes[0], "ours", 0.0, digest="old"), *rows, *noisy]
-    )
+    more = [row("shape-0", "ours", 0.0, digest="old"), row("shape-1", "ours", 0.1, noise=0.5)]
+    return report(tmp_path / "base", {"ours": 0.6, "bspline": 0.4, "bound": 0.8}, more=more)
 
 
-def test_the_gap_is_that_of_the_means_for_all_shapes_and_each_half(baselines):
+def test_the_gap_is_that_of_the_means_in_the_first_report_with_a_measurement(baselines, tmp_path):
     rows = list(gaps.gap_rows(MESHES, [baselines]))
-    assert [cells[:3] for cells in rows] == [
-        ["32^3", "all", "3"],
-        ["32^3", "choose", "1"],
-        ["32^3", "final", "2"],
-    ]
+    halves = [["32^3", "all", "3"], ["32^3", "choose", "1"], ["32^3", "final", "2"]]
+    assert [cells[:3] for cells in rows] == halves
     assert rows[0][3:] == ["0.6000", "50.0 %", "0.3000", "50.0 %", "4,000.0000", "50.0 %"]
-
-
-def test_the_first_report_with_a_measurement_counts(baselines, tmp_path):
-    better = [row(path.stem, "ours", 0.7) for path in MESHES]
-    best = write_report(tmp_path / "best", better)
+    best = report(tmp_path / "best", {"ours": 0.7})
     assert next(gaps.gap_rows(MESHES, [best, baselines]))[3:5] == ["0.7000", "75.0 %"]
     assert next(gaps.gap_rows(MESHES, [baselines, best]))[3:5] == ["0.6000", "50.0 %"]
+    two = report(tmp_path / "two", {"bound": 0.8}, MESHES[:2])
+    rest = report(tmp_path / "rest", {"ours": 0.5, "bspline": 0.5})
+    assert next(gaps.gap_rows(MESHES, [two, rest]))[2] == "2"  # that all three have
 
 
-def test_only_shapes_that_all_three_have_count(baselines, tmp_path):
-    two = write_report(tmp_path / "two", [row(path.stem, "bound", 0.8) for path in MESHES[:2]])
-    ours = [row(path.stem, m, 0.5) for path in MESHES for m in ("ours", "bspline")]
-    assert next(gaps.gap_rows(MESHES, [two, write_report(tmp_path / "rest", ours)]))[2] == "2"
-
-
-def test_a_mistyped_report_is_refused_not_left_out(baselines, tmp_path):
+def test_a_report_that_is_mistyped_or_lacks_the_baselines_is_refused(
+    baselines, tmp_path, monkeypatch, capsys
+):
     said = f"{tmp_path / 'bset'} has no results.jsonl: give the --out of python -m lab evaluate"
     with pytest.raises(FileError, match=f"^{re.escape(said)}$"):
         list(gaps.gap_rows(MESHES, [tmp_path / "bset", baselines]))
-
-
-def test_a_report_without_the_baselines_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(gaps, "find_meshes", lambda paths: MESHES)
-    report = write_report(tmp_path / "best", [row("shape-0", "ours", 0.7)])
-    monkeypatch.setattr("sys.argv", ["gaps", "FOLDER", str(report)])
+    best = report(tmp_path / "best", {"ours": 0.7})
+    monkeypatch.setattr("sys.argv", ["gaps", "FOLDER", str(best)])
     with pytest.raises(SystemExit) as ended:
         gaps.main()
-    assert ended.value.code == 2
     said = "no report has ours, bspline and bound at 32, 64 or 128: measure them first\n"
-    assert capsys.readouterr().err.endswith(said)
+    assert ended.value.code == 2 and capsys.readouterr().err.endswith(said)
