@@ -58,25 +58,17 @@ def test_the_page_is_kept_where_it_is_asked_for(command, opened):
     assert not os.listdir("temporary")
 
 
-def test_without_a_browser_that_is_said(command, opened, monkeypatch):
-    monkeypatch.setattr("webbrowser.open", lambda address: False)
-    code, _, err = command("view", "b.ply")
-    assert code == 0
-    assert re.fullmatch(
-        r"file://\S+/view.html\nNote: no browser can be started here: open that address in yours\n",
-        err,
-    )
-
-
-def test_errors_of_view_are_one_line_and_leave_nothing(command, opened, monkeypatch):
+def test_without_a_browser_that_is_said_and_errors_leave_nothing(command, opened, monkeypatch):
     assert command("view", "no.ply") == (1, "", "Error: no.ply does not exist\n")
     Path("bad.ply").write_text("ply")
     code, _, err = command("view", "bad.ply")
     assert code == 1 and err.startswith("Error: bad.ply cannot be read as a mesh: ")
-    monkeypatch.setattr(
-        "super_sdf.machine.extras.find_spec", lambda name: None if name == "pyfqmr" else 1
-    )
-    assert command("view", "a.npy") == (
-        1, "", "Error: view needs pyfqmr: pip install -e '.[report]' in a clone of super-sdf\n"
-    )  # fmt: skip
-    assert not opened and not os.listdir("temporary")
+    assert not os.listdir("temporary")
+    monkeypatch.setattr("webbrowser.open", lambda address: False)
+    code, _, err = command("view", "b.ply")
+    note = "Note: no browser can be started here: open that address in yours"
+    assert code == 0 and re.fullmatch(rf"file://\S+/view.html\n{note}\n", err)
+    found = {"pyfqmr": None}
+    monkeypatch.setattr("super_sdf.machine.extras.find_spec", lambda name: found.get(name, 1))
+    said = "view needs pyfqmr: pip install -e '.[report]' in a clone of super-sdf"
+    assert command("view", "a.npy") == (1, "", f"Error: {said}\n") and not opened
