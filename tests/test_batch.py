@@ -237,17 +237,7 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(run_batch):
     assert [entry["out"] for entry in plan["refused"]] == ["a.ply"] and plan["unread"] == []
 
 
-def test_fail_fast_begins_nothing_after_a_failure(run_batch):
-    Path("list.jsonl").write_text('{"in": "in/bad.npy"}\n{"in": "in/a.npy"}')
-    np.save("in/bad.npy", np.ones((30, 30, 30)))  # the largest goes first
-    for _ in range(2):
-        code, _, err = run_batch("list.jsonl", "--fail-fast")
-        assert code == 1
-        assert err.endswith("\n0 done, 1 failed, 1 not begun; 0 meshes closed, 0 open\n")
-    assert len(rows()) == 1
-
-
-def test_json_is_the_summary(run_batch):
+def test_json_is_the_summary_and_fail_fast_begins_nothing_after_a_failure(run_batch):
     code, out, err = run_batch("in", "--json", "--quiet", "--open")
     facts = json.loads(out)
     assert code == 1 and err == f"Failed: in/bad.npy: {CONSTANT}\n"
@@ -257,6 +247,13 @@ def test_json_is_the_summary(run_batch):
         "failures": [{"in": os.path.abspath("in/bad.npy"), "out": "bad.ply", "reason": CONSTANT}],
         "report": str(Path("out/report.jsonl")),
     }
+    Path("list.jsonl").write_text('{"in": "in/bad.npy"}\n{"in": "in/a.npy"}')
+    np.save("in/bad.npy", np.ones((30, 30, 30)))  # the largest goes first
+    for _ in range(2):
+        code, _, err = run_batch("list.jsonl", "--fail-fast", out="new")
+        assert code == 1
+        assert err.endswith("\n0 done, 1 failed, 1 not begun; 0 meshes closed, 0 open\n")
+    assert len(rows("new")) == 1
 
 
 def test_what_was_noisy_is_said_once_and_of_many_failures_twenty(run_batch, command):

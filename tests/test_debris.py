@@ -75,10 +75,14 @@ def test_pieces_of_less_than_a_voxel_are_dropped_wherever_they_are(sign, size, a
     assert count_between(dropped, (0, SIZE)) == len(dropped)
 
 
-def test_a_sample_of_0_is_no_piece_of_its_own():
+def test_a_sample_of_0_is_no_piece_and_nodes_across_a_face_are_one_where_it_says_so():
     for value, count in ((0.0, 1), (-1e-3, 1), (-0.01, 0)):
         _, dropped, lone = drop(field_with(MIDDLE, value=value))
         assert (len(dropped), len(lone)) == (count, 1 - count)
+    one, other = MIDDLE + 1, np.add(MIDDLE, (2, 2, 1))
+    longer = [np.add(other, (n, 0, 0)) for n in range(K)]
+    for value, count in ((-2.0, 0), (-0.5, 2)):  # deep: one piece of more than a voxel
+        assert len(drop(field_with(one, *longer, value=value))[1]) == count
 
 
 def test_a_piece_stays_if_only_it_touches_a_sphere():
@@ -92,14 +96,6 @@ def test_a_piece_stays_if_only_it_touches_a_sphere():
     lattice[:, : MIDDLE[1] - 1] = -1  # a wall that the sphere touches, too
     _, dropped, _ = drop(lattice, [(3, 3, 3)], [distance])
     assert len(dropped) == 1
-
-
-def test_nodes_across_a_face_belong_together_where_the_face_says_so():
-    one, other = MIDDLE + 1, np.add(MIDDLE, (2, 2, 1))
-    longer = [np.add(other, (n, 0, 0)) for n in range(K)]
-    deep, shallow = field_with(one, *longer, value=-2.0), field_with(one, *longer, value=-0.5)
-    assert len(drop(deep)[1]) == 0  # one piece of more than a voxel
-    assert len(drop(shallow)[1]) == 2
 
 
 STRAIGHT = np.stack(np.meshgrid(*[np.arange(24) - 11.5] * 3, indexing="ij"), -1)

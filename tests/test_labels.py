@@ -27,11 +27,6 @@ def network():
     return load_network("fast", threads=1)
 
 
-def places(shape, spacing=(1, 1, 1)):
-    """Return the positions of the samples of a grid."""
-    return np.moveaxis(np.indices(shape), 0, -1) * np.array(spacing, float)
-
-
 def ball(centre, radius):
     """Return the distance to a ball as a function of points."""
     return lambda p: np.linalg.norm(p - np.array(centre), axis=-1) - radius
@@ -39,13 +34,12 @@ def ball(centre, radius):
 
 def beyond(normal, distance):
     """Return the distance to a half-space as a function of points."""
-    unit = np.array(normal) / np.linalg.norm(normal)
-    return lambda p: p @ unit - distance
+    return lambda p: p @ (np.array(normal) / np.linalg.norm(normal)) - distance
 
 
 def painted(shape, spacing, solids):
     """Return the labels of solids, the first on top, and the distance to what is seen of each."""
-    at, labels, seen = places(shape, spacing), np.zeros(shape, np.int16), []
+    at, labels, seen = np.indices(shape).transpose(1, 2, 3, 0) * spacing, np.zeros(shape, int), []
     for nth, solid in enumerate(solids):
         labels[(solid(at) <= 0) & (labels == 0)] = nth + 1
         above = solids[:nth]
@@ -122,7 +116,8 @@ def test_slabs_make_the_same_meshes(name, network, monkeypatch):
 
 
 def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
-    labels = np.where(ball((7.3, 8.1, 7.7), 4.2)(places((16, 17, 15))) < 0, 5, 0)
+    labels = np.where(ball((7.3, 8.1, 7.7), 4.2)(np.argwhere(np.ones((16, 17, 15)))) < 0, 5, 0)
+    labels = labels.reshape(16, 17, 15)
     alone = reconstruct(make_grid(labels, label=5, spacing=0.5, origin=3), network)
     mesh = reconstruct_labels(labels, network=network, spacing=0.5, origin=3)[5]
     assert mesh.vertices.dtype == alone.vertices.dtype
@@ -134,10 +129,9 @@ def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
 
 def test_every_sample_lies_in_the_mesh_of_its_label(network):
     labels = IMAGES["nested"]
-    for label, mesh in reconstruct_labels(labels, network=network, spacing=1).items():
-        turns = igl.winding_number(
-            mesh.vertices, mesh.faces, np.argwhere(labels >= -3).astype(float)
-        )
+    at = np.indices(labels.shape).reshape(3, -1).T.astype(float)
+    for label, mesh in reconstruct_labels(labels, network=network, spacing=1, factor=2).items():
+        turns = igl.winding_number(mesh.vertices, mesh.faces, at)
         np.testing.assert_allclose(turns, (labels == label).ravel(), atol=1e-3)
 
 

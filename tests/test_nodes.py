@@ -62,17 +62,6 @@ def test_nodes_have_a_number_for_each_position_and_are_plain_means_of_all_blocks
     assert not blocks[:, -1].any()
 
 
-def test_pinned_nodes_take_the_sign_of_the_skipped_voxel():
-    parts = share_parts(np.where(np.arange(27) == 13, 0, -1)[None].astype(np.int32))
-    blocks = np.ones((27, 1), np.float32)
-    patches = np.ones((1, 27), np.float32)
-    patches[0, 22] = -1  # the neighbour at +x is inside, that at -x outside; no others in the grid
-    ijk, voxels = np.array([[1, 0, 0]], np.int32), np.zeros(1, np.int32)
-    skipped = signs_of_skipped(parts, ijk, patches, voxels, (3, 1, 1))
-    assert pin_to_skipped(blocks, parts, 2, skipped).tolist() == [9]
-    np.testing.assert_array_equal(blocks[:, 0] < 0, block_ijk(2)[:, 0] == 2)
-
-
 def test_a_pinned_node_of_two_voxels_is_pinned_in_both_and_counted_once():
     voxels = np.array([[1, 1, 1], [1, 1, 2]], np.int32)
     parts = share_parts(neighbour_table(voxels, (3, 3, 4)))

@@ -103,8 +103,7 @@ def test_an_exception_in_the_callback_ends_the_run_and_the_next_is_right(polled,
 class EndlessSession:
     """A session that runs until ``terminate`` is set, as onnxruntime does between operators."""
 
-    def __init__(self, at_begin=lambda: None):
-        self.at_begin, self.ended = at_begin, False
+    ended = False
 
     def io_binding(self):
         return SimpleNamespace(bind_cpu_input=lambda *a: None, bind_output=lambda *a: None)
@@ -119,31 +118,12 @@ class EndlessSession:
         return SimpleNamespace(intra_op_num_threads=1)
 
     def run_with_iobinding(self, binding, options):
-        self.at_begin()
+        os.kill(os.getpid(), signal.SIGINT)
         while not options.terminate:
             time.sleep(0.01)
         time.sleep(0.1)  # as long as an operator takes
         self.ended = True
         raise RuntimeError("Exiting due to terminate flag being set to true.")
-
-
-FEEDS = {"patches": np.zeros((1, 27)), "voxels": np.zeros(1), "offsets": np.zeros((1, 3))}
-
-
-@pytest.fixture
-def hearing():
-    """Hear SIGINT, which a shell has processes in the background ignore."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.usefixtures("hearing")
-def test_an_interrupt_stops_a_run_in_the_middle():
-    session = EndlessSession(lambda: os.kill(os.getpid(), signal.SIGINT))
-    with pytest.raises(KeyboardInterrupt):
-        onnx.run_on_cpu(session, FEEDS)
-    assert session.ended
 
 
 class DeafSession(EndlessSession):
@@ -158,13 +138,21 @@ class DeafSession(EndlessSession):
         self.released.wait()
 
 
-@pytest.mark.usefixtures("hearing")
-def test_a_second_interrupt_does_not_wait_for_a_run():
-    session = DeafSession()
-    with pytest.raises(KeyboardInterrupt):
-        onnx.run_on_cpu(session, FEEDS)
-    assert session.thread.is_alive() and session.thread.daemon  # so this process can end
-    session.released.set()
+@pytest.mark.parametrize("kind", [EndlessSession, DeafSession])
+def test_an_interrupt_stops_a_run_in_the_middle_and_a_second_one_does_not_wait(kind):
+    # a shell has processes in the background ignore SIGINT
+    before, session = signal.signal(signal.SIGINT, signal.default_int_handler), kind()
+    feeds = {"patches": np.zeros((1, 27)), "voxels": np.zeros(1), "offsets": np.zeros((1, 3))}
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            onnx.run_on_cpu(session, feeds)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if kind is EndlessSession:
+        assert session.ended
+    else:
+        assert session.thread.is_alive() and session.thread.daemon  # so this process can end
+        session.released.set()
 
 
 def test_the_pace_is_measured_in_a_part_only_if_progress_is_reported(polled, monkeypatch):
