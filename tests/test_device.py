@@ -10,8 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import ball
-from test_network import network_inputs
 
 from super_sdf import load_network
 from super_sdf.errors import DeviceError, ModelError
@@ -19,8 +17,7 @@ from super_sdf.network import device
 from super_sdf.network.contract import INPUTS, one_voxel
 from super_sdf.network.device import CPU, CUDA, CUDA_OPTIONS
 from super_sdf.network.network import shipped_models
-from super_sdf.network.onnx import CHUNK_INPUT, CUDA_CHUNK, ort, run_bound
-from super_sdf.steps.nodes import block_offsets
+from super_sdf.network.onnx import CHUNK_INPUT, CUDA_CHUNK, ort
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
 ASKED = "cuda was asked for, but "
@@ -104,14 +101,6 @@ def cuda_session(cuda_build, monkeypatch):
     monkeypatch.setattr(ort, "InferenceSession", opened)
     monkeypatch.setattr(ort.OrtValue, "ortvalue_from_numpy", uploaded)
     return fake
-
-
-def test_bound_runs_give_the_values_of_plain_ones():
-    patches, table, rows = network_inputs(ball())
-    feeds = dict(zip(INPUTS, (patches, table, rows[::2].copy(), block_offsets(4))))
-    session = load_network("fast", device="cpu").session
-    plain = session.run(None, feeds)[0]
-    np.testing.assert_allclose(run_bound(session, feeds, "cpu"), plain, atol=1e-5)
 
 
 @pytest.mark.parametrize("requested", ["auto", "cuda"])

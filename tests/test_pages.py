@@ -9,7 +9,7 @@ from io import BytesIO
 import numpy as np
 import pytest
 import trimesh
-from conftest import ball, trilinear
+from conftest import ball
 from pages import blocks, wedge
 from PIL import Image
 from skimage.measure import marching_cubes
@@ -24,7 +24,6 @@ from super_sdf.pages.items import (
     Item,
     certificate_facts,
     entry_of,
-    entry_of_report,
     item_of,
     read_head,
     read_meshes,
@@ -191,21 +190,3 @@ def test_the_policy_allows_these_scripts_and_nothing_else(beside):
     assert rules["style-src"].split() == hashes("style")
     assert rules["default-src"] == "'none'" and rules["img-src"] == "data:"
     assert not re.search(r'(src|href)="(?!data:,)', page)
-
-
-def test_the_entry_of_a_report_says_counts_times_notes_and_the_certificate():
-    grid = SdfGrid(wedge(), (1.0, 1.0, 1.0))
-    certificate = check_mesh(reconstruct(grid, trilinear, 2), grid).report()
-    report = {
-        **{"input": "a.npy", "output": "a.ply", "shape": [24, 24, 24], "triangles": 12345},
-        **{"closed": True, "bounds": [[0, 0, 0], [1, 2.5, 3]], "inferred": ["x"], "notes": ["y"]},
-        **{"warnings": ["z"], "check": certificate, "seconds": {"read": 0.5, "network": 1.25}},
-    }
-    entry = entry_of_report("a.ply", report, None)
-    assert entry["line"] == "12,345 triangles, closed, from 24 x 24 x 24 samples"
-    assert entry["notes"] == ["x", "y"] and entry["warnings"] == ["z"] and entry["seconds"] == 1.75
-    assert entry["stages"] == [["read", "0.50 s"], ["network", "1.25 s"]]
-    assert entry["residual"] == certificate["residual"]["mean"] and entry["faults"] == []
-    assert ["bounds", "(0, 0, 0) to (1, 2.5, 3)"] in entry["facts"]
-    assert ["surface", "closed, oriented, manifold"] in entry["certificate"]
-    assert entry["remarks"] == ["not drawn: run the command again for its picture and its meshes"]

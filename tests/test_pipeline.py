@@ -11,6 +11,7 @@ from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
 from super_sdf.errors import GridError
 from super_sdf.mesh import CLEARANCE
 from super_sdf.steps import survey
+from super_sdf.steps.band import find_band
 from super_sdf.steps.nodes import block_ijk
 
 
@@ -135,6 +136,12 @@ def test_threads_give_the_same_mesh(network):
         together = list(pool.map(lambda grid: reconstruct(grid, network).vertices, grids))
     for one, other in zip(alone, together):
         np.testing.assert_array_equal(one, other)
+
+
+def test_both_voxels_of_a_jump_over_the_band_are_in_it():
+    values = np.full((6, 4, 4), 9.0, np.float32)
+    values[3:] = -9.0
+    assert set(find_band(values)[:, 0]) == {2, 3}
 
 
 def test_two_samples_an_axis_are_enough(network):

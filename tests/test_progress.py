@@ -81,6 +81,7 @@ def test_polled_runs_give_the_same_bits_and_bound_ones_are_polled_and_stopped(po
     session, feeds = fast.session, dict(zip(network.INPUTS, inputs))
     bound = onnx.run_bound(session, feeds, "cpu", poll=lambda: polls.append(1))
     np.testing.assert_array_equal(bound, onnx.run_bound(session, feeds, "cpu"))
+    np.testing.assert_allclose(bound, session.run(None, feeds)[0], atol=1e-5)
     assert polls
     with pytest.raises(ZeroDivisionError):
         onnx.run_bound(session, feeds, "cpu", poll=lambda: 1 / 0)
@@ -134,6 +135,7 @@ class DeafSession(EndlessSession):
         for is_wanted in (lambda: True, lambda: options.terminate):
             while not is_wanted():
                 time.sleep(0.01)
+            time.sleep(0.1)  # no user is faster: the first one waits by then
             os.kill(os.getpid(), signal.SIGINT)
         self.released.wait()
 

@@ -1,6 +1,7 @@
 """``--report``: what is checked before, what is written, resumed and interrupted batches."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -40,10 +41,16 @@ def test_the_page_of_a_conversion_holds_all_of_it(command, folder):
     assert found["facts"]["title"] == "a.ply" and entry["status"] == "ok"
     assert entry["meshes"] == "page" and entry["thumbnail"].startswith("data:image/png;base64,")
     assert entry["notes"] == ["origin not given: sample (0, 0, 0) is at 0, 0, 0"]
-    assert [label for label, _ in found["facts"]["summary"]] == [
-        "result", "time", "mean residual", "largest residual", "faults"
-    ]  # fmt: skip
-    assert {"read", "network", "isosurface"} <= {stage for stage, _ in entry["stages"]}
+    labels = [label for label, _ in found["facts"]["summary"]]
+    assert labels == ["result", "time", "mean residual", "largest residual", "faults"]
+    stages = dict(entry["stages"])
+    assert {"read", "network", "isosurface"} <= set(stages) and stages["read"].endswith(" s")
+    triangles = found["meshes-0"][0]["triangles"]
+    assert entry["line"] == f"{triangles:,} triangles, closed, from 24 x 24 x 24 samples"
+    assert entry["seconds"] > 0 and entry["faults"] == [] and 0 < entry["residual"] < 0.1
+    assert ["surface", "closed, oriented, manifold"] in entry["certificate"]
+    bounds = dict(entry["facts"])["bounds"]
+    assert re.fullmatch(r"\(3\.0\d*, 6\.\d+, 8\.\d+\) to \(19\.\d+, 17\.\d+, 14\.\d+\)", bounds)
     ours, coarse = found["meshes-0"]
     assert ours["residuals"] and coarse["residuals"] and ours["triangles"] > coarse["triangles"]
 

@@ -143,16 +143,6 @@ def test_the_deviation_is_that_of_shifted_squares():
     assert found == pytest.approx((0.5, 0.125, 0, 0), abs=2e-3)
 
 
-def test_kept_triangles_are_kept_and_joined_again():
-    mesh = torus()
-    kept = mesh.vertices[mesh.faces].mean(1)[:, 0] > 0.1
-    found = collapse_within(mesh, kept, 0.01)
-    assert found.is_closed() and (count_fans(found.faces) == 1).all()
-    before, after = ({tuple(c.ravel()) for c in m.vertices[m.faces]} for m in (mesh, found))
-    assert {tuple(c.ravel()) for c in mesh.vertices[mesh.faces[kept]]} <= after < before | after
-    assert len(found.faces) < len(mesh.faces)
-
-
 @pytest.mark.parametrize("rounds", [1, 8])
 def test_a_library_that_tears_the_mesh_is_found_out(rounds, monkeypatch):
     """The place is kept; if that does not help either, the mesh stays as it is, with a warning."""
