@@ -183,7 +183,7 @@ WRONG = {
     "in.npy --label 1.5": "--label is 1.5: give a whole number, -2^63 to 2^64 - 1",
     "in.npy --scale 0": "--scale is 0: give a number greater than 0",
     "in.npy --simplify -1": "--simplify is -1: give a number greater than 0",
-    "in.npy --factor 5": "--factor is 5: give an even number from 2 to 16 (an odd one has no "
+    "in.npy --factor 18": "--factor is 18: give an even number from 2 to 16 (an odd one has no "
     "node on the samples)",
     "in.npy --factor four": "Invalid value for '--factor': 'four' is not a valid integer.",
     "in.npy --spacing 1,2": "Invalid value for '--spacing': '1,2': give one number, or three "

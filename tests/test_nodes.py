@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from super_sdf.errors import OptionError
-from super_sdf.options import check_factor
 from super_sdf.steps.band import neighbour_table
 from super_sdf.steps.field import FineField
 from super_sdf.steps.nodes import (
@@ -30,12 +28,6 @@ def test_offsets_are_equation_5_on_the_lattice(factor):
     np.testing.assert_array_equal(offsets[len(offsets) // 2], 0)
     steps = (offsets + 1) * factor / 2
     np.testing.assert_array_equal(steps, np.round(steps))
-
-
-@pytest.mark.parametrize("factor", [-2, 3, 18])
-def test_odd_and_absurd_factors_are_refused(factor):
-    with pytest.raises(OptionError, match=f"^factor is {factor}: give an even number from 2 to 16"):
-        check_factor(factor)
 
 
 @pytest.mark.parametrize(("factor", "threads"), [(2, 3), (4, 1)])

@@ -78,19 +78,6 @@ def test_the_name_of_the_processor(describe, monkeypatch):
     assert system.described() == {} and not system.lacks_avx2()
 
 
-def test_the_small_ball_is_one():
-    """The network gives its distances, and each voxel's neighbours have the patches beside it."""
-    patches, table, voxels, offsets = small_ball()
-    assert patches.shape == table.shape == (624, 27) and len(voxels) == 624
-    there = table >= 0
-    middle = patches[:, 13]
-    np.testing.assert_array_equal(middle[table[there]], patches[there])
-    assert (np.abs(patches[~there]) >= 3).all() and (np.abs(middle) < 3).all()
-    values = load_network("fast")(patches, table, voxels, offsets)
-    centre = np.flatnonzero((offsets == 0).all(1))
-    np.testing.assert_allclose(values[:, centre[0]], middle, atol=0.1)
-
-
 def test_the_fingerprint_is_that_of_the_chosen_network_and_of_nothing_else(monkeypatch):
     found = fingerprint_of("fast", "auto", "cpu")
     assert found == fingerprint_of("fast", "int8", "cpu")
