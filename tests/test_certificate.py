@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from batches import rows
 from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
@@ -265,6 +266,16 @@ def test_the_offset_is_that_of_the_mesh(here, command):
     assert command(*words)[0] == 1
 
 
+def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
+    monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
+    before = sorted(os.listdir())
+    line = "needs igl: pip install -e '.[report]' in a clone of super-sdf"
+    assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}\n")
+    for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
+        assert command(*words, "--check")[::2] == (1, f"Error: --check {line}\n")
+    assert sorted(os.listdir()) == before
+
+
 def test_the_coloured_mesh_is_a_mesh_with_residuals_whole_or_not_there(here, command, monkeypatch):
     assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "-q") == (0, "", "")
     mesh = trimesh.load("c.ply", process=False)
@@ -309,23 +320,12 @@ def test_errors_are_one_line_and_leave_nothing(here, command, words, code, messa
     assert sorted(os.listdir()) == before
 
 
-def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
-    monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
-    line = "needs igl: pip install -e '.[report]' in a clone of super-sdf\n"
-    assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}")
-    for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
-        code, _, err = command(*words, "--check")
-        assert (code, err) == (1, f"Error: --check {line}")
-    assert not Path("new.ply").exists() and not Path("new").exists()
-
-
 def test_upsample_checks_what_it_wrote(here, command):
-    code, out, err = command("upsample", "ball.npz", "new.ply", "--check", "--json")
-    assert code == 0
-    report = json.loads(out)["check"]
-    assert report["residual"]["mean"] < 0.02 and report["surface"]["closed"]
-    assert err.splitlines()[-1].startswith("Check: residual 0.00")
-    assert err.splitlines()[-1].endswith("; no faults")
+    words = ("upsample", "ball.npz", "new.ply", "--factor", 2, "--check", "--json")
+    code, out, err = command(*words)
+    report, last = json.loads(out)["check"], err.splitlines()[-1]
+    assert code == 0 and report["residual"]["mean"] < 0.02 and report["surface"]["closed"]
+    assert last.startswith("Check: residual 0.00") and last.endswith("; no faults")
 
 
 def test_batch_records_certificates_and_makes_those_that_are_missing(here, run_batch):
@@ -333,9 +333,8 @@ def test_batch_records_certificates_and_makes_those_that_are_missing(here, run_b
     np.savez("in/a.npz", values=ball(16, 5.0).values, spacing=1.0)
     assert run_batch("in")[0] == 0
     code, _, err = run_batch("in", "--check")
-    row = json.loads(Path("out/report.jsonl").read_text().splitlines()[-1])
-    assert code == 0 and row["check"]["residual"]["largest"] < 0.2
-    assert row["check"]["surface"]["closed"]
+    check = rows()[-1]["check"]
+    assert code == 0 and check["residual"]["largest"] < 0.2 and check["surface"]["closed"]
     assert "1 done, 0 failed" in err and "Check: mean residual 0.0" in err
     for flags in (("--check",), ()):  # now it is there
         assert "nothing to do: 1 done before" in run_batch("in", *flags)[2]

@@ -295,27 +295,15 @@ def test_a_worker_that_comes_later_is_checked_and_used_or_named(monkeypatch):
             assert warnings == ([f"worker {second} is odd; it is not used"] if fault else [])
 
 
-def expected(**changes):
-    """Return what is here, changed: of the network, the folder, and a file in it."""
-    path = Path("in/a.npy").resolve()
-    needs = Needs("fast", modules=changes.pop("modules", ()), folder=Path.cwd())
-    models, sizes = needs.digests_of_models(), {path: path.stat().st_size}
-    return Expected(needs, models, sizes, None, True)._replace(**changes)
-
-
 FAULTS = {
     "": {},
     "does not see the network x.onnx: put it where all machines see it": {"models": {"x.onnx": ""}},
-    "has another file of the network base.onnx: copy the one from here": {
-        "models": {"base.onnx": "0"}
-    },
+    "has another file of the network base.onnx: copy the": {"models": {"base.onnx": "0"}},
     "lacks nowhere: install there what is installed here": {"modules": ("nowhere",)},
     "does not see /no/file: put the inputs where all machines see them by this path": {
         "sizes": {Path("/no/file"): 1}
     },
-    "sees another /dev/null: its folder has to be the same on all machines": {
-        "sizes": {Path("/dev/null"): 7}
-    },
+    "sees another /dev/null: its folder has to be the same": {"sizes": {Path("/dev/null"): 7}},
     "does not see the output folder /: write to a folder that all machines share under ": {
         "probe": (Path("/no file"), "text")
     },
@@ -324,32 +312,28 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_a_worker_lacks_is_said(fault):
-    found = checking.what_is_lacking(expected(**FAULTS[fault]))
+    path, changes = Path("in/a.npy").resolve(), dict(FAULTS[fault])
+    needs = Needs("fast", modules=changes.pop("modules", ()), folder=Path.cwd())
+    here = Expected(needs, needs.digests_of_models(), {path: path.stat().st_size}, None, True)
+    found = checking.what_is_lacking(here._replace(**changes))
     assert found.startswith(fault) and bool(found) == bool(fault)
 
 
 def test_workers_without_the_package_or_with_other_sources_or_versions_are_named():
     missing = ModuleNotFoundError("No module named 'super_sdf'")
-    judged = {
-        "": checking.judge_version(__version__),
-        f"does not have super-sdf: install version {__version__} of it there": (
-            checking.judge_version(missing)
-        ),
-        f"cannot import super-sdf (SyntaxError: no): install {__version__} there": (
-            checking.judge_version(SyntaxError("no"))
-        ),
-        f"has other sources of super-sdf {__version__} than are here: install the same state "
-        "there and restart it": checking.judge_sources("0"),
-    }
-    assert all(want == found for want, found in judged.items())
+    want = f"does not have super-sdf: install version {__version__} of it there"
+    assert checking.judge_version(missing) == want and checking.judge_version(__version__) == ""
+    want = f"cannot import super-sdf (SyntaxError: no): install {__version__} there"
+    assert checking.judge_version(SyntaxError("no")) == want
+    want = f"has other sources of super-sdf {__version__} than are here: install the same state "
+    assert checking.judge_sources("0") == f"{want}there and restart it"
     assert checking.judge_sources(checking.digest_of_sources()) == ""
     here = checking.versions()
     own = checking.Report("", "host", here)
     other = own._replace(versions={**here, "numpy": "numpy 1.26.0"})
-    assert checking.warnings_of({"tcp://a": other, "tcp://b": own, "tcp://c": other}) == [
-        f"worker tcp://a and 1 other have numpy 1.26.0, and here is {here['numpy']}: results may "
-        "differ in their last bits"
-    ]
+    want = f"worker tcp://a and 1 other have numpy 1.26.0, and here is {here['numpy']}: results may"
+    warnings = checking.warnings_of({"tcp://a": other, "tcp://b": own, "tcp://c": other})
+    assert warnings == [f"{want} differ in their last bits"]
 
 
 OTHER_PROCESSOR = """

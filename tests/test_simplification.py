@@ -30,6 +30,14 @@ QUICK = ("--quality", "fast", "--factor", 2)
 UNREACHED = (
     "{} triangles cannot be reached while the mesh stays a manifold of the same topology: it has "
 )
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.savez("ball.npz", values=ball(20, 6.0).values / 2, spacing=0.5)
+
+
 TURN = trimesh.transformations.rotation_matrix(0.7, (1, 2, 3))[:3, :3]
 
 
@@ -201,20 +209,22 @@ def test_wrong_arguments_are_said(message):
         simplify_mesh("cube", error=1)
 
 
-def test_what_does_not_fit_in_memory_is_refused(monkeypatch):
-    monkeypatch.setattr(simplify, "held_memory", lambda: 10**8)
-    with pytest.raises(OutOfMemoryError) as error:
+def test_what_does_not_fit_in_memory_is_refused_and_nothing_is_written(here, command, monkeypatch):
+    with monkeypatch.context() as patch, pytest.raises(OutOfMemoryError) as error:
+        patch.setattr(simplify, "held_memory", lambda: 10**8)
         simplify_mesh(torus(), error=1e-3, max_memory=10**8)
     assert str(error.value) == (
         "simplifying 9,216 triangles needs 113 MB of memory, since the whole mesh must be held; "
         "100 MB may be used; use a smaller factor, allow more (--max-memory), or do not simplify"
     )
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    np.savez("ball.npz", values=ball(20, 6.0).values / 2, spacing=0.5)
+    monkeypatch.setattr(simplify, "BYTES_PER_TRIANGLE", 10**9)
+    words = ("upsample", "ball.npz", "a.ply", "--simplify", 0.02, *QUICK)
+    code, _, err = command(*words)
+    assert code == 1 and err.startswith("Error: simplifying at least ")
+    monkeypatch.setattr("super_sdf.convert.CERTAIN_SHARE", 0)  # the estimate was far too low
+    code, _, err = command(*words)
+    assert code == 1 and "simplifying " in err and "at least" not in err
+    assert os.listdir() == ["ball.npz"]
 
 
 def test_the_command_simplifies_and_says_how_far_off(here, command):
@@ -248,8 +258,7 @@ def test_the_file_is_the_same_for_any_threads_and_slabs_and_in_the_library(here,
         convert("ball.npz", f"{name}.ply", network, options)
     mesh = reconstruct(read_grid("ball.npz"), network, factor=2)
     write_ply([simplify_mesh(mesh, error=0.02 * 0.5).mesh], Path("library.ply"))
-    files = [Path(f"{name}.ply").read_bytes() for name in ("two", "all", "few", "library")]
-    assert len(set(files)) == 1
+    assert len({path.read_bytes() for path in Path().glob("*.ply")}) == 1
 
 
 def two_balls():
@@ -302,38 +311,22 @@ def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
     assert sorted(os.listdir()) == ["ball.npz", "list.jsonl"]
 
 
-def test_too_little_memory_is_said_and_nothing_is_written(here, command, monkeypatch):
-    from super_sdf import convert as module
-
-    monkeypatch.setattr(simplify, "BYTES_PER_TRIANGLE", 10**9)
-    code, _, err = command("upsample", "ball.npz", "a.ply", "--simplify", 0.02, *QUICK)
-    assert code == 1 and err.startswith("Error: simplifying at least ")
-    monkeypatch.setattr(module, "CERTAIN_SHARE", 0)  # the estimate was far too low
-    code, _, err = command("upsample", "ball.npz", "a.ply", "--simplify", 0.02, *QUICK)
-    assert code == 1 and "simplifying " in err and "at least" not in err
-    assert [path.name for path in Path().iterdir()] == ["ball.npz"]
-
-
 def test_a_batch_records_it_and_makes_again_what_has_other_options(here, run_batch):
     Path("in").mkdir()
     np.savez("in/a.npz", values=ball(16, 5.0).values, spacing=1.0)
     assert run_batch("in")[0] == 0 and "simplified" not in rows()[-1]
     code, _, err = run_batch("in", "--simplify", 0.02)
-    row = rows()[-1]
-    found = row["simplified"]
-    assert code == 0 and row["triangles"] == found["triangles"] < found["triangles_before"]
-    assert "1 done, 0 failed" in err
+    found = rows()[-1]["simplified"]
+    assert code == 0 and rows()[-1]["triangles"] == found["triangles"] < found["triangles_before"]
     assert f"Simplified: from {found['triangles_before']:,} to {found['triangles']:,} tri" in err
+    assert "1 done, 0 failed" in err
     assert "largest distance 0.0" in err and "of a.ply; see the report" in err
     assert "nothing to do: 1 done before" in run_batch("in", "--simplify", 0.02)[2]
     assert "1 done, 0 failed" in run_batch("in", "--triangles", 8)[2]
     assert rows()[-1]["triangles"] == 8
-
-
-def test_a_batch_says_what_was_not_simplified_as_asked(here, run_batch):
-    Path("list.jsonl").write_text('{"in": "two.npz", "triangles": 6}')
     np.savez("two.npz", values=two_balls(), spacing=1.0)
-    code, _, err = run_batch("list.jsonl", "--simplify", 0.02)
-    assert code == 0 and rows()[-1]["simplified"]["triangles"] > 6
-    assert "Warning: 1 were not simplified as asked: see out/report.jsonl" in err
+    Path("list.jsonl").write_text('{"in": "two.npz", "triangles": 6}')
+    code, _, err = run_batch("list.jsonl", "--simplify", 0.02, out="new")
+    assert code == 0 and rows("new")[-1]["simplified"]["triangles"] > 6
+    assert "Warning: 1 were not simplified as asked: see new/report.jsonl" in err
     assert "contradictory" not in err
