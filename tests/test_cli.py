@@ -88,17 +88,6 @@ def test_noise_is_told(here, command):
     assert " % of the band the values differ by more than distances can: they are taken" in err
 
 
-def test_a_network_without_int8_is_refused_if_that_is_asked_for(here, command):
-    shutil.copy(shipped_models()["fast"], "own.onnx")
-    words = ("upsample", "in.npy", "out.ply", "--model", "own.onnx", "--json")
-    code, _, err = command(*words, "--precision", "int8")
-    assert code == 2 and "own.onnx has no int8 variant, own-int8.onnx: write one with" in err
-    code, out, _ = command(*words)
-    assert code == 0 and json.loads(out)["precision"] == "float32"
-    code, out, _ = command("upsample", "in.npy", "other.ply", "--device", "cpu", "--json")
-    assert code == 0 and json.loads(out)["precision"] == "int8"
-
-
 def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
     from super_sdf.network.network import Network
 
