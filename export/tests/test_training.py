@@ -222,11 +222,11 @@ def put_to_sleep(net, units=3):
 
 
 def test_targets_are_the_distance_at_the_query_points(samples):
-    prepared = prepare(samples[0])
-    middle = np.abs(samples[0].offsets).max(1) < 0.3
-    sampled = prepared.patches[prepared.voxels, CENTRE][:, None]
-    apart = np.abs(prepared.targets[:, middle] - sampled)
-    assert middle.any() and apart.max() <= 0.3 * 3**0.5 + 2e-3  # 1-Lipschitz, float16
+    """They differ from the sample by no more than they are away from it."""
+    for prepared in map(prepare, samples):
+        sampled = prepared.patches[prepared.voxels, CENTRE][:, None]
+        away = np.linalg.norm(prepared.offsets, axis=1)
+        assert (np.abs(prepared.targets - sampled) <= away + 4e-3).all()  # float16
 
 
 def test_dormant_units_start_again_without_a_change_and_forget_what_moved_them(samples):
