@@ -20,6 +20,7 @@ from super_sdf.batch.plan import Batch
 from super_sdf.cli.batch_report import describe_progress, duration
 from super_sdf.convert import convert
 from super_sdf.files.regular import files_of
+from super_sdf.network.network import shipped_models
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 
@@ -34,21 +35,15 @@ def test_folders_are_mirrored_failures_named_and_meshes_those_of_single_runs(run
     )
     made = {"a.ply": "a.npy", "deep/b.ply": "deep/b.npz", "deep/er/c.d.ply": "deep/er/c.d.npy"}
     assert files().keys() == made.keys() | {"report.jsonl"}
+    code, _, _ = command("batch", "in", "--out", "two", *LONE[2:], "--threads", 1, "--jobs", 2)
+    assert code == 1 and files("two").keys() == files().keys()
     for mesh, grid in made.items():
         command("upsample", f"in/{grid}", "single.ply", *LONE[2:], "--force")
-        assert Path("single.ply").read_bytes() == Path("out", mesh).read_bytes()
+        single = Path("single.ply").read_bytes()
+        assert single == Path("out", mesh).read_bytes() == Path("two", mesh).read_bytes()
 
 
-def test_several_processes_make_the_same(run_batch, command):
-    options = (*LONE[2:], "--threads", 1)
-    run_batch("in", "--threads", 1)
-    code, _, _ = command("batch", "in", "--out", "two", *options, "--jobs", 2)
-    assert code == 1 and files("two").keys() == files().keys()
-    for name in files().keys() - {"report.jsonl"}:
-        assert Path("two", name).read_bytes() == Path("out", name).read_bytes()
-
-
-def test_the_report_holds_a_row_a_file(run_batch):
+def test_the_report_holds_a_row_a_file_and_a_rerun_does_nothing(run_batch):
     run_batch("in")
     by_name = {row["out"]: row for row in rows()}
     assert len(rows()) == len(by_name) == 4
@@ -60,10 +55,6 @@ def test_the_report_holds_a_row_a_file(run_batch):
     assert by_name["deep/er/c.d.ply"]["closed"] and by_name["deep/er/c.d.ply"]["capped"]
     bad = by_name["bad.ply"]
     assert (bad["status"], bad["reason"], bad["retry"]) == ("failed", CONSTANT, False)
-
-
-def test_a_rerun_does_nothing_and_says_so(run_batch):
-    run_batch("in")
     before, report = files(), rows()
     code, _, err = run_batch("in")
     assert (code, files(), rows()) == (1, before, report)
@@ -76,26 +67,27 @@ def test_a_rerun_does_nothing_and_says_so(run_batch):
     assert run_batch("in") == (0, "", want)
 
 
-def redone(run_batch, *arguments):
-    """Return the outputs that another run makes."""
-    before = len(rows())
-    run_batch("in", *arguments)
-    return [row["out"] for row in rows()[before:]]
-
-
 def test_what_has_changed_is_done_again(run_batch, monkeypatch):
+    def redone(*arguments):
+        """Return the outputs that another run makes."""
+        before = len(rows())
+        run_batch("in", *arguments)
+        return [row["out"] for row in rows()[before:]]
+
     run_batch("in")
     np.save("in/a.npy", ball(12, 3.2).values)
-    assert redone(run_batch) == ["a.ply"]
+    assert redone() == ["a.ply"]
     os.utime("in/a.npy")
     Path("in/a.npy").rename("in/moved.npy")
     Path("in/moved.npy").rename("in/a.npy")
-    assert redone(run_batch) == []
+    assert redone() == []
     Path("out/deep/b.ply").unlink()
-    assert redone(run_batch) == ["deep/b.ply"]
-    assert redone(run_batch, "--retry") == ["bad.ply"]
-    assert len(redone(run_batch, "--offset", 0.5)) == 4
-    assert redone(run_batch, "--offset", 0.5, "--threads", 1) == []
+    assert redone() == ["deep/b.ply"]
+    assert redone("--retry") == ["bad.ply"]
+    assert len(redone("--offset", 0.5)) == 4
+    assert redone("--offset", 0.5, "--threads", 1) == []
+    assert run_batch("in/a.npy", "--offset", 100)[0] == 1  # a failure between
+    assert redone("--offset", 0.5) == ["a.ply"] and rows()[-1]["status"] == "ok"
     assert "4 to do" in run_batch("in", "--offset", 0.5, "--force", "--dry-run")[2]
     monkeypatch.setattr("super_sdf.batch.plan.__version__", "next")
     assert "4 to do" in run_batch("in", "--offset", 0.5, "--dry-run")[2]
@@ -115,12 +107,6 @@ def test_a_mesh_that_was_changed_is_replaced_by_force_only(run_batch):
     assert "1 to do" in run_batch("in/a.npy", "--dry-run", "--force")[2]
     assert run_batch("in/a.npy", "--force")[0] == 0 and Path("out/a.ply").read_bytes() == made
     assert "nothing to do: 1 done before" in run_batch("in/a.npy")[2]
-
-
-def test_a_mesh_of_other_options_is_replaced_also_after_a_failure_between(run_batch):
-    run_batch("in/a.npy")
-    assert run_batch("in/a.npy", "--offset", 100)[0] == 1
-    assert run_batch("in/a.npy", "--offset", 0.5)[0] == 0
 
 
 def test_each_label_has_a_mesh_of_its_own(run_batch):
@@ -172,7 +158,7 @@ def test_the_fingerprint_of_a_header_covers_its_data(name):
         assert is_unchanged(Path(name), known)
 
 
-def test_the_fingerprint_of_a_network_covers_weights_beside_it():
+def test_the_fingerprint_of_a_network_covers_weights_beside_it_and_is_an_option(run_batch):
     """Their names are those of entries "location" of its tensors; see onnx.proto."""
     names = ["weights.bin", "more weights.bin"]
     found = [entry(1, "location") + entry(2, name) for name in (*names, "not there.bin")]
@@ -180,6 +166,10 @@ def test_the_fingerprint_of_a_network_covers_weights_beside_it():
     for name in names:
         Path(name).write_text("x")
     assert files_of("own.onnx") == [Path("own.onnx"), *sorted(map(Path, names))]
+    shutil.copy(shipped_models()["fast"], "own.onnx")
+    run_batch("in/deep", "--model", "own.onnx")
+    shutil.copy(shipped_models()["base"], "own.onnx")
+    assert "2 to do" in run_batch("in/deep", "--model", "own.onnx", "--dry-run")[2]
 
 
 def test_an_input_is_never_written_over(run_batch):
@@ -189,15 +179,6 @@ def test_an_input_is_never_written_over(run_batch):
     code, _, err = run_batch("in", "--force")
     want = "Failed: in/a.npy: out/a.ply is the same file as in/deep/b.npz: remove that link\n"
     assert code == 1 and want in err and Path("in/deep/b.npz").read_bytes() == before
-
-
-def test_another_network_file_is_another_option(run_batch):
-    from super_sdf.network.network import shipped_models
-
-    shutil.copy(shipped_models()["fast"], "own.onnx")
-    run_batch("in/deep", "--model", "own.onnx")
-    shutil.copy(shipped_models()["base"], "own.onnx")
-    assert "2 to do" in run_batch("in/deep", "--model", "own.onnx", "--dry-run")[2]
 
 
 @pytest.mark.parametrize(
@@ -223,55 +204,32 @@ def test_what_was_not_the_inputs_fault_stops_nothing_and_is_tried_again(
     assert run_batch("in/a.npy") == (0, "", "1 done, 0 failed; 1 meshes closed, 0 open\n")
 
 
-def test_two_inputs_for_one_output_are_refused(run_batch, command):
+def test_two_inputs_for_one_output_are_refused_and_one_named_twice_is_one(run_batch):
     shutil.copy("in/deep/b.npz", "in/a.npz")
     want = (
         "Error: in/a.npy and in/a.npz would both become a.ply: rename one, or give 'out' in a "
         ".jsonl manifest\n"
     )
-    assert run_batch("in") == (2, "", want)
-    assert not Path("out").exists()
-    assert (
-        run_batch("in/a.npy", "in/a.npy", Path("in/a.npy").absolute())[0] == 0
-    )  # one and the same
+    assert run_batch("in") == (2, "", want) and not Path("out").exists()
+    assert run_batch("in/a.npy", "in/a.npy", Path("in/a.npy").absolute())[0] == 0
 
 
 def test_a_dry_run_says_what_would_be_done_and_writes_nothing(run_batch):
-    want = f"to do: in/a.npy -> {Path('out/a.ply')}\n"
     code, out, err = run_batch("in", "--dry-run")
-    assert code == 0 and want in out and out.count("\n") == 4
-    assert err == "4 to do, 0 done before, 0 failed before, 0 refused\n"
+    assert code == 0 and f"to do: in/a.npy -> {Path('out/a.ply')}\n" in out
+    assert err == "4 to do, 0 done before, 0 failed before, 0 refused\n" and out.count("\n") == 4
     assert not Path("out").exists()
-    run_batch("in")
-    Path("out/a.stl").write_text("mine")
-    before = files()
-    _, out, err = run_batch("in", "in/a.npy", "--dry-run")
-    assert f"done before: in/a.npy -> {Path('out/a.ply')}\n" in out
-    assert f"failed before: in/bad.npy: {CONSTANT}\n" in out
-    assert err == "0 to do, 3 done before, 1 failed before, 0 refused\n"
-    _, out, err = run_batch("in/a.npy", "--dry-run", "--format", "stl")
-    assert out.startswith("refused: in/a.npy: ") and err.endswith(" 1 refused\n")
-    assert files() == before
-
-
-def test_fail_fast_begins_nothing_after_a_failure(run_batch):
-    Path("list.jsonl").write_text('{"in": "in/bad.npy"}\n{"in": "in/a.npy"}')
-    np.save("in/bad.npy", np.ones((30, 30, 30)))  # the largest goes first
-    for _ in range(2):
-        code, _, err = run_batch("list.jsonl", "--fail-fast")
-        assert code == 1
-        assert err.endswith("\n0 done, 1 failed, 1 not begun; 0 meshes closed, 0 open\n")
-    assert len(rows()) == 1
-
-
-def test_a_dry_run_in_json_is_the_plan(run_batch):
     Path("in/list.txt").write_text("bad.npy\ndeep/b.npz\ndeep/er/c.d.npy")
     run_batch("in/list.txt")
     Path("out/a.ply").write_text("mine")
     np.save("in/new.npy", ball(12, 3.0).values)
+    before, counts = files(), "1 to do, 2 done before, 1 failed before, 1 refused\n"
+    _, out, err = run_batch("in", "in/new.npy", "--dry-run")
+    assert f"done before: in/deep/b.npz -> {Path('out/deep/b.ply')}\n" in out and err == counts
+    assert f"failed before: in/bad.npy: {CONSTANT}\n" in out and "refused: in/a.npy: " in out
     code, out, err = run_batch("in", "--dry-run", "--json")
     plan = json.loads(out)
-    assert code == 0 and err == "1 to do, 2 done before, 1 failed before, 1 refused\n"
+    assert code == 0 and err == counts and files() == before
     assert plan["to_do"] == [{"in": os.path.abspath("in/new.npy"), "out": "new.ply"}]
     assert plan["failed_before"] == [
         {"in": os.path.abspath("in/bad.npy"), "out": "bad.ply", "reason": CONSTANT}
@@ -279,7 +237,7 @@ def test_a_dry_run_in_json_is_the_plan(run_batch):
     assert [entry["out"] for entry in plan["refused"]] == ["a.ply"] and plan["unread"] == []
 
 
-def test_json_is_the_summary(run_batch):
+def test_json_is_the_summary_and_fail_fast_begins_nothing_after_a_failure(run_batch):
     code, out, err = run_batch("in", "--json", "--quiet", "--open")
     facts = json.loads(out)
     assert code == 1 and err == f"Failed: in/bad.npy: {CONSTANT}\n"
@@ -289,24 +247,28 @@ def test_json_is_the_summary(run_batch):
         "failures": [{"in": os.path.abspath("in/bad.npy"), "out": "bad.ply", "reason": CONSTANT}],
         "report": str(Path("out/report.jsonl")),
     }
+    Path("list.jsonl").write_text('{"in": "in/bad.npy"}\n{"in": "in/a.npy"}')
+    np.save("in/bad.npy", np.ones((30, 30, 30)))  # the largest goes first
+    for _ in range(2):
+        code, _, err = run_batch("list.jsonl", "--fail-fast", out="new")
+        assert code == 1
+        assert err.endswith("\n0 done, 1 failed, 1 not begun; 0 meshes closed, 0 open\n")
+    assert len(rows("new")) == 1
 
 
-def test_that_something_was_inferred_or_noisy_is_said_once(command):
+def test_what_was_noisy_is_said_once_and_of_many_failures_twenty(run_batch, command):
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, (12, 12, 12))
     np.save("in/noisy.npy", ball(12, 4.0).values + noise)
-    _, _, err = command("batch", "in", "--out", "out", *PLAIN[:4], *FAST)
-    report = Path("out/report.jsonl")
+    words = ("batch", "in", "--out", "out", *PLAIN[:4], *FAST)
+    report, (_, _, err) = Path("out/report.jsonl"), command(*words)
     assert f"Note: spacing, origin or sign of 4 was inferred: see {report}\n" in err
     assert f"Warning: 1 are from noisy or contradictory values: see {report}\n" in err
-    assert "Note" not in command("batch", "in", "--out", "out", *PLAIN[:4], *FAST)[2]
-
-
-def test_of_many_failures_twenty_are_shown(run_batch):
+    assert "Note" not in command(*words)[2]
     for i in range(23):
         shutil.copy("in/bad.npy", f"in/bad{i}.npy")
-    _, _, err = run_batch("in/bad*.npy")
+    _, _, err = run_batch("in/bad*.npy", out="more")
     assert err.count("Failed: ") == 20
-    assert f"and 4 more, see {Path('out/report.jsonl')}\n" in err
+    assert f"and 4 more, see {Path('more/report.jsonl')}\n" in err
 
 
 def test_options_are_checked_before_the_work(run_batch, command):

@@ -21,14 +21,17 @@ from super_sdf.options import BATCH_LISTS
 pytestmark = pytest.mark.usefixtures("grid_folder")
 
 
-def test_patterns_keep_the_folders_below_their_fixed_part(run_batch):
-    assert run_batch("in/**/*.np?", "--cap", "--dry-run")[2].startswith("4 to do")
-    run_batch("in/de*/**/*.npy")
+def test_patterns_keep_the_folders_below_their_fixed_part_and_links_in_a_circle_end(run_batch):
+    for name in "abc":
+        Path("in", name).symlink_to(Path("in").absolute())
+        Path("in/deep", name).symlink_to("..")
+    for words in ("in/**/*.np?", "in"):
+        assert run_batch(words, "--cap", "--dry-run")[2].startswith("4 to do")
+    assert run_batch("in/a/*.npy", "--dry-run")[2].startswith("2 to do")  # named: followed
+    run_batch("in/de*/er/*.npy")
     assert files().keys() == {"deep/er/c.d.ply", "report.jsonl"}
     Path("in/x[1].npy").write_bytes(Path("in/a.npy").read_bytes())
-    assert (
-        run_batch("in/x[1].npy", out="other")[0] == 0
-    )  # a file of that name goes before a pattern
+    assert run_batch("in/x[1].npy", out="other")[0] == 0  # before a pattern goes such a file
 
 
 def test_a_list_names_files_from_where_it_lies(run_batch):
@@ -36,13 +39,17 @@ def test_a_list_names_files_from_where_it_lies(run_batch):
     code, _, err = run_batch("in/list.txt")
     assert code == 1 and files().keys() == {"deep/b.ply", "a.ply", "report.jsonl"}
     assert f"Failed: {Path('in/none.npy')} does not exist\n" in err
-    assert (
-        run_batch("in/list.txt")[2]
-        .splitlines()[-1]
-        .startswith("nothing to do: 2 done before, 1 fail")
-    )
+    last = run_batch("in/list.txt")[2].splitlines()[-1]
+    assert last.startswith("nothing to do: 2 done before, 1 fail")
     np.save("in/none.npy", ball(12, 3.0).values)
     assert run_batch("in/list.txt")[0] == 0
+
+
+def test_byte_order_marks_and_line_ends_of_windows_change_nothing(run_batch):
+    Path("in/list.txt").write_bytes(b"\xef\xbb\xbfa.npy\r\ndeep/b.npz\r\n")
+    Path("list.jsonl").write_bytes(b'\xef\xbb\xbf{"in": "in/a.npy", "out": "c.ply"}\r\n\r\n')
+    assert run_batch("in/list.txt", "list.jsonl")[0] == 0
+    assert files().keys() == {"a.ply", "deep/b.ply", "c.ply", "report.jsonl"}
 
 
 def test_a_list_of_objects_has_options_of_its_own(run_batch, command):
@@ -57,45 +64,41 @@ def test_a_list_of_objects_has_options_of_its_own(run_batch, command):
     assert Path("single.stl").read_bytes() == Path("out/x/y.stl").read_bytes()
 
 
-LISTS = {
+WHOLE_LISTS = {
+    "": "list.jsonl names no file: give a path a line",
     "{": "list.jsonl, line 1 is no JSON: Expecting property name enclosed in double quotes: "
     "line 1 column 2 (char 1)",
     "[1]": 'list.jsonl, line 1 is [1]: give an object, {"in": "a.npy"}',
-    "": "list.jsonl names no file: give a path a line",
+    "[" * 100_000: 'list.jsonl, line 1 is nested too deeply: give an object, {"in": "a.npy"}',
+    '"' + "x" * 10**7 + '"': f'list.jsonl, line 1 is "{"x" * 119}...{"x" * 119}": give an object, '
+    '{"in": "a.npy"}',
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
-    '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
-    + ", ".join(BATCH_LISTS),
-    '{"in": "a.npy", "simplify": 1, "triangles": 9}': "list.jsonl, line 1: simplify 1.0 and "
-    "triangles 9: give only one of them",
-    '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: 'factor' is 3: give an even number from "
-    "2 to 16 (an odd one has no node on the samples)",
-    '{"in": "a.npy", "cap": 1}': "list.jsonl, line 1: 'cap' is 1: give True or False, "
-    "in JSON true or false",
-    '{"in": "a.npy", "out": "a.xyz"}': "list.jsonl, line 1: 'out' is 'a.xyz': give a file, one of "
-    + ", ".join(MESH_SUFFIXES),
     '{"in": "."}': "list.jsonl, line 1: 'in' is '.': give the path of a grid",
     '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': no file can have this "
     "name",
     '{"in": "a\\ud800.npy"}': "list.jsonl, line 1: 'in' is 'a\\ud800.npy': no file can have this "
     "name",
-    '{"in": "a.npy", "offset": 1' + 400 * "0" + "}": "list.jsonl, line 1: 'offset' is 1"
-    + 56 * "0"
-    + "...: give a finite number, in world units",
-    '{"in": "a.npy", "factor": 1' + 5000 * "0" + "}": "list.jsonl, line 1 is no JSON: Exceeds the "
-    "limit (4300 digits) for integer string conversion: value has 5001 digits; use "
-    "sys.set_int_max_str_digits() to increase the limit",
-    '{"in": "a.npy", "offset": NaN}': "list.jsonl, line 1: NaN is no number: give a finite one",
-    '{"in": "a.npy", "in": "b.npy"}': "list.jsonl, line 1: 'in' is there twice: give it once",
-    100_000 * "[": 'list.jsonl, line 1 is nested too deeply: give an object, {"in": "a.npy"}',
-    f'"{10_000_000 * "x"}"': 'list.jsonl, line 1 is "'
-    + 119 * "x"
-    + "..."
-    + 119 * "x"
-    + '": give an object, {"in": "a.npy"}',
     '{"in": "a.npy", "out": "report.jsonl/x.ply"}': "a.npy would become report.jsonl/x.ply, but "
     "the first of these names is the batch's own: rename it",
-    '{"in": "a.npy", "out": "a/../../b.ply"}': "list.jsonl, line 1: 'out' is 'a/../../b.ply': give "
-    "a path within the output folder",
+    '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: 'factor' is 3: give an even number from "
+    "2 to 16 (an odd one has no node on the samples)",
+    '{"in": "a.npy", "factor": 1' + "0" * 5000 + "}": "list.jsonl, line 1 is no JSON: Exceeds the "
+    "limit (4300 digits) for integer string conversion: value has 5001 digits; use "
+    "sys.set_int_max_str_digits() to increase the limit",
+}
+OPTIONS = {
+    '"Factor": 2': "'Factor' is unknown: give in, out, " + ", ".join(BATCH_LISTS),
+    '"simplify": 1, "triangles": 9': "simplify 1.0 and triangles 9: give only one of them",
+    '"cap": 1': "'cap' is 1: give True or False, in JSON true or false",
+    '"out": "a.xyz"': "'out' is 'a.xyz': give a file, one of " + ", ".join(MESH_SUFFIXES),
+    '"out": "a/../../b.ply"': "'out' is 'a/../../b.ply': give a path within the output folder",
+    '"offset": 1' + "0" * 400: f"'offset' is 1{'0' * 56}...: give a finite number, in world units",
+    '"offset": NaN': "NaN is no number: give a finite one",
+    '"in": "b.npy"': "'in' is there twice: give it once",
+}
+LISTS = WHOLE_LISTS | {
+    f'{{"in": "a.npy", {text}}}': f"list.jsonl, line 1: {message}"
+    for text, message in OPTIONS.items()
 }
 
 
@@ -120,13 +123,6 @@ def test_arguments_that_name_no_grid_are_refused(run_batch, argument):
     Path("empty").mkdir()
     Path("odd.raw").write_text("")
     assert run_batch("in", argument) == (2, "", f"Error: {ARGUMENTS[argument]}\n")
-
-
-def test_byte_order_marks_and_line_ends_of_windows_change_nothing(run_batch):
-    Path("in/list.txt").write_bytes(b"\xef\xbb\xbfa.npy\r\ndeep/b.npz\r\n")
-    Path("list.jsonl").write_bytes(b'\xef\xbb\xbf{"in": "in/a.npy", "out": "c.ply"}\r\n\r\n')
-    assert run_batch("in/list.txt", "list.jsonl")[0] == 0
-    assert files().keys() == {"a.ply", "deep/b.ply", "c.ply", "report.jsonl"}
 
 
 def test_a_name_too_long_fails_by_its_name(run_batch):
@@ -163,15 +159,6 @@ def test_what_is_no_regular_file_fails_by_its_name(run_batch):
     grids = ", ".join(GRID_SUFFIXES)
     want = f"Error: list.txt is neither a grid ({grids}) nor a manifest (.txt, .jsonl)\n"
     assert run_batch("list.txt") == (2, "", want)
-
-
-def test_links_in_a_circle_end(run_batch):
-    for name in "abc":
-        Path("in", name).symlink_to(Path("in").absolute())
-        Path("in/deep", name).symlink_to("..")
-    assert run_batch("in/**/*.np?", "--dry-run")[2].startswith("4 to do")
-    assert run_batch("in", "--dry-run")[2].startswith("4 to do")
-    assert run_batch("in/a/*.npy", "--dry-run")[2].startswith("2 to do")  # named: followed
 
 
 def test_patterns_find_what_the_shell_would(run_batch):

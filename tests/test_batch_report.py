@@ -26,7 +26,9 @@ def test_a_torn_line_is_cut_off(run_batch, torn):
     assert len(rows()) == 4 and rows()[-1]["out"] == json.loads(lines[-1])["out"]
 
 
-def test_a_file_of_another_origin_is_not_replaced(run_batch):
+def test_a_file_of_another_origin_is_not_replaced_nor_one_that_appears_meanwhile(
+    run_batch, monkeypatch
+):
     Path("out").mkdir()
     Path("out/a.ply").write_text("mine")
     reason = f"{Path('out/a.ply')} exists and was not made by a batch: remove it or use --force"
@@ -36,12 +38,21 @@ def test_a_file_of_another_origin_is_not_replaced(run_batch):
         assert Path("out/a.ply").read_text() == "mine" and len(rows()) == 1
     assert run_batch("in/a.npy", "--force")[0] == 0
     assert trimesh.load("out/a.ply").is_watertight
+    right = batch_job.convert
+
+    def interfere(source, target, *rest, **options):
+        target.write_text("mine")
+        return right(source, target, *rest, **options)
+
+    monkeypatch.setattr(batch_job, "convert", interfere)
+    for _ in range(2):
+        assert run_batch("in/a.npy", out="new")[0] == 1
+        assert Path("new/a.ply").read_text() == "mine"
 
 
-FOREIGN = [b"a,b\n1,2", b'{"in": "a.npy"}', b'{"in": "a.npy"}\n{"in": "b', b"[]\n", b"\0\0\0\n"]
-
-
-@pytest.mark.parametrize("text", FOREIGN)
+@pytest.mark.parametrize(
+    "text", [b"a,b\n1,2", b'{"in": "a.npy"}', b'{"in": "a.npy"}\n{"in": "b', b"[]\n", b"\0\0\0\n"]
+)
 def test_a_report_of_others_is_left_alone(run_batch, text):
     Path("out").mkdir()
     Path("out/report.jsonl").write_bytes(text)
@@ -49,8 +60,8 @@ def test_a_report_of_others_is_left_alone(run_batch, text):
         f"Error: {Path('out/report.jsonl')} is not a batch's report: move it, or give another "
         "folder for the meshes\n"
     )
-    for options in ((), ("--force",), ("--dry-run",)):
-        assert run_batch("in", *options) == (1, "", want)
+    for option in ((), ("--force",), ("--dry-run",)):
+        assert run_batch("in", *option) == (1, "", want)
     assert Path("out/report.jsonl").read_bytes() == text and list(Path("out").glob("*.ply")) == []
 
 
@@ -70,43 +81,21 @@ def test_pipes_and_folders_of_the_batchs_names_are_refused(run_batch, name, make
     assert code == 1 and err.startswith(f"Error: {Path('out', name)} is ") and err.count("\n") == 1
 
 
-DAMAGED = {
-    "in": 1,
-    "out": ["a.ply"],
-    "status": None,
-    "reason": {},
-    "retry": "no",
-    "options": 0,
-    "content": "x",
-    "output": {"sha256": 1},
-    "closed": None,
-}
-
-
-def test_rows_with_wrong_types_are_passed_over(run_batch):
+def test_rows_with_wrong_types_and_lines_of_others_are_passed_over(run_batch):
     run_batch("in/a.npy")
     (row,) = rows()
-    damaged = [{**row, key: value} for key, value in DAMAGED.items()]
+    wrong = {
+        **{"in": 1, "out": ["a.ply"], "status": None, "reason": {}, "retry": "no", "options": 0},
+        **{"content": "x", "output": {"sha256": 1}, "closed": None},
+    }
+    damaged = [{**row, key: value} for key, value in wrong.items()]
     assert is_row(row) and not any(map(is_row, damaged))
-    with Path("out/report.jsonl").open("a") as report:
-        report.writelines(json.dumps(each) + "\n" for each in damaged)
-    assert run_batch("in/a.npy", "--dry-run")[2].startswith("0 to do, 1 done before")
-
-
-def test_lines_of_others_in_the_report_are_passed_over(run_batch):
-    run_batch("in")
+    lines = [b"nonsense", b"[1]", 100_000 * b"[", b'{"reason": 1' + 5000 * b"0" + b"}"]
     report = Path("out/report.jsonl")
-    deep = (
-        b'nonsense\n[1]\n{"out": 1}\n'
-        + 100_000 * b"["
-        + b"\n"
-        + b'{"reason": 1'
-        + 5000 * b"0"
-        + b"}\n"
-    )
-    report.write_bytes(b"a\rb\n" + deep + report.read_bytes())
+    lines += [report.read_bytes().strip(), *(json.dumps(each).encode() for each in damaged)]
+    report.write_bytes(b"a\rb\n" + b"\n".join(lines) + b"\n")
     before = report.read_bytes()
-    assert run_batch("in")[2].splitlines()[-1].startswith("nothing to do: 3 done before")
+    assert run_batch("in/a.npy")[2].startswith("nothing to do: 1 done before")
     assert report.read_bytes() == before
 
 
@@ -143,19 +132,6 @@ def test_a_mesh_without_room_fails_by_its_name_and_leaves_nothing():
     want = f"Failed: in/a.npy: {Path('out/a.ply')} cannot be written: File too large\n"
     assert want in err and "Traceback" not in err
     assert [path.name for path in Path("out").rglob("*.p*")] == []
-
-
-def test_what_appears_while_the_batch_runs_is_kept(run_batch, monkeypatch):
-    right = batch_job.convert
-
-    def interfere(source, target, *rest, **options):
-        target.write_text("mine")
-        return right(source, target, *rest, **options)
-
-    monkeypatch.setattr(batch_job, "convert", interfere)
-    for _ in range(2):
-        assert run_batch("in/a.npy")[0] == 1
-        assert Path("out/a.ply").read_text() == "mine"
 
 
 def test_only_its_own_content_makes_a_mesh_the_batchs(run_batch):

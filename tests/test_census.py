@@ -6,7 +6,6 @@ from test_field_kinds import box
 
 from super_sdf import make_grid
 from super_sdf.grid import census
-from super_sdf.grid.census import Census
 from super_sdf.grid.planes import SamplePlanes
 from super_sdf.steps.survey import survey
 
@@ -52,41 +51,17 @@ KINDS = {
 
 @pytest.mark.parametrize("small", [True, False], ids=["kept", "not kept"])
 @pytest.mark.parametrize("name", KINDS)
-def test_a_grid_is_read_at_most_three_times(name, small, monkeypatch):
+def test_a_grid_is_read_at_most_three_times_and_taken_the_same_in_parts(name, small, monkeypatch):
     kind, values = KINDS[name]
+    want = make_grid(values, spacing=1.0, origin=0.0)
     if not small:  # in several parts
         monkeypatch.setattr(census, "KEPT_BYTES", 0)
         monkeypatch.setattr(census, "TOGETHER", values[0].size)
         monkeypatch.setattr(census, "READ_SAMPLES", 4 * values[0].size)
     counted = Counted(values)
     grid = make_grid(counted, spacing=1.0, origin=0.0)
-    assert grid.field.kind == kind
+    assert grid.field.kind == kind == want.field.kind and grid.notes == want.notes
     band, reads = survey(grid), counted.reads.copy()
-    whole = survey(make_grid(values, spacing=1.0, origin=0.0))
-    assert np.array_equal(band.patches, whole.patches) and band.field.kind == whole.field.kind
+    assert np.array_equal(band.patches, survey(want).patches)
     # blocks of the survey share two planes, and those of filled samples some more
     assert np.median(reads) <= 3 and (reads <= 6).all()
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_the_census_is_the_same_in_whatever_parts_it_is_taken(name, monkeypatch):
-    values = KINDS[name][1]
-    whole = Census(values)
-    monkeypatch.setattr(census, "KEPT_BYTES", 0)
-    monkeypatch.setattr(census, "TOGETHER", values[0].size)
-    monkeypatch.setattr(census, "READ_SAMPLES", 0)
-    parts = Census(Counted(values))
-    for one, other in zip(whole.numbers, parts.numbers):
-        assert np.array_equal(one, other)
-    assert whole.numbers.has_two == parts.numbers.has_two == ("mask" in name)
-    if values.dtype != bool:
-        assert whole.are_labels == parts.are_labels
-        for ask in (
-            lambda one: one.looked.around,
-            lambda one: one.looked.cut,
-            lambda one: one.beside.vectors,
-            lambda one: one.everywhere.bend,
-            lambda one: one.pairs,
-            lambda one: one.unknown.root,
-        ):
-            assert np.array_equal(ask(whole), ask(parts), equal_nan=True)

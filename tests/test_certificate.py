@@ -8,27 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from batches import rows
 from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
 from super_sdf import Mesh, SdfGrid, topology
+from super_sdf.certificate import check, surface
 from super_sdf.certificate import search as slabs
-from super_sdf.certificate import surface
-from super_sdf.certificate.check import (
-    LIMITS,
-    NO_EVIDENCE,
-    PIERCED,
-    TOUCHING,
-    UNKNOWN,
-    check_files,
-    check_limits,
-    check_mesh,
-    colours,
-    exceeded,
-    stated_triangles,
-)
-from super_sdf.convert import ConvertOptions
-from super_sdf.errors import OptionError, OutOfMemoryError
+from super_sdf.certificate.check import LIMITS, check_mesh, exceeded, stated_triangles
 from super_sdf.files import mesh_writers
 from super_sdf.machine import extras
 
@@ -36,20 +23,18 @@ H = 1 / 24  # of the grids
 RADIUS = 0.4
 
 
-def sphere_values(h: float = H, radius: float = RADIUS, half: float = 0.6) -> np.ndarray:
-    axis = np.arange(-half, half + h / 2, h)
-    return np.sqrt(sum(x**2 for x in np.meshgrid(axis, axis, axis, indexing="ij"))) - radius
+def sphere_values() -> np.ndarray:
+    axis = np.arange(-0.6, 0.6 + H / 2, H)
+    return np.sqrt(sum(x**2 for x in np.meshgrid(axis, axis, axis, indexing="ij"))) - RADIUS
 
 
-def sphere_grid(clamp: float = np.inf) -> SdfGrid:
-    """Return the exact distance to the sphere of ``round_mesh``, truncated at ``clamp`` voxels."""
-    values = np.clip(sphere_values(), -clamp * H, clamp * H).astype(np.float32)
-    return SdfGrid(values, H, (-0.6, -0.6, -0.6))
+def grid_of(values: np.ndarray) -> SdfGrid:
+    return SdfGrid.trusted(values.astype(np.float32), H, (-0.6,) * 3)
 
 
-def round_mesh(radius: float = RADIUS) -> Mesh:
+def round_mesh(radius: float = RADIUS, subdivisions: int = 5) -> Mesh:
     """Return a fine sphere with vertices on it: triangles are at most 1e-4 voxels inside."""
-    found = trimesh.creation.icosphere(subdivisions=5, radius=radius)
+    found = trimesh.creation.icosphere(subdivisions=subdivisions, radius=radius)
     return Mesh(np.array(found.vertices), np.array(found.faces, np.int32))
 
 
@@ -58,23 +43,19 @@ def ball_mesh() -> Mesh:
     return round_mesh()
 
 
+GRID = grid_of(sphere_values())
+
+
 def moved(mesh: Mesh, x: float) -> Mesh:
     return Mesh(mesh.vertices + np.array([x, 0, 0]), mesh.faces)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_open_edges_are_those_that_no_triangle_passes_the_other_way(seed):
+def test_open_edges_are_those_that_no_triangle_passes_the_other_way():
     """Of triangles between a few vertices, in any pieces, and of a solid with holes."""
-    random = np.random.default_rng(seed)
-    solid = torus().faces
+    random, solid = np.random.default_rng(0), torus(24, 12).faces
     for faces in random.integers(0, 9, (60, 3)), solid, solid[random.random(len(solid)) < 0.99]:
-        passed = Counter()
-        for start, end in zip(faces.ravel().tolist(), np.roll(faces, -1, 1).ravel().tolist()):
-            passed[start, end] += 1
-        want = {
-            edge: n
-            for edge, n in (passed - Counter({e[::-1]: n for e, n in passed.items()})).items()
-        }
+        passed = Counter(zip(faces.ravel().tolist(), np.roll(faces, -1, 1).ravel().tolist()))
+        want = passed - Counter({edge[::-1]: n for edge, n in passed.items()})
         edges = topology.OpenEdges()
         for piece in np.array_split(faces.astype(np.int32) + 2**30, random.integers(1, 9)):
             edges.add(piece)
@@ -85,8 +66,8 @@ def test_open_edges_are_those_that_no_triangle_passes_the_other_way(seed):
         assert len(some) == sum(n for edge, n in want.items() if max(edge) < 5)
 
 
-def test_a_sphere_touches_the_balls_of_its_own_grid(ball_mesh):
-    found = check_mesh(ball_mesh, sphere_grid())
+def test_a_sphere_touches_the_balls_of_its_own_grid_also_inside_out(ball_mesh):
+    found = check_mesh(ball_mesh, GRID)
     figures = found.touching.summary()
     assert len(found.touching.values) > 3000 and found.touching.noisy == 0
     assert figures["largest"] < 0.005 and figures["share_above_tenth"] == 0
@@ -94,44 +75,47 @@ def test_a_sphere_touches_the_balls_of_its_own_grid(ball_mesh):
     assert found.surface.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=1e-3)
     assert found.surface.area == pytest.approx(4 * np.pi * RADIUS**2, rel=1e-3)
     assert (found.surface.components, found.surface.self_intersections) == (1, 0)
-
-
-def test_a_shift_is_its_cosine(ball_mesh):
-    """Along x by a: a sample in direction n is off by a n_x, the mean of its absolute a / 2."""
-    found = check_mesh(moved(ball_mesh, 0.1 * H), sphere_grid()).touching
-    assert found.summary()["largest"] == pytest.approx(0.1, abs=0.01)
-    assert found.summary()["mean"] == pytest.approx(0.05, abs=0.005)
-    cosine = found.points[:, 0] / np.linalg.norm(found.points, axis=1)
-    outside = np.sign(found.values)
-    clear = np.abs(found.values) > 0.2
-    np.testing.assert_allclose(found.residuals[clear], (-0.1 * cosine * outside)[clear], atol=0.01)
-    at = np.array(found.summary()["largest_at"])
-    assert abs(at[0]) > 0.9 * np.linalg.norm(at)
-
-
-def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
-    found = check_mesh(round_mesh(RADIUS - 0.2 * H), sphere_grid()).touching
-    clear = np.abs(found.values) > 0.3
-    outside = found.values > 0
-    np.testing.assert_allclose(found.residuals[clear & outside], 0.2, atol=0.01)
-    np.testing.assert_allclose(found.residuals[clear & ~outside], -0.2, atol=0.01)
-    between = (found.values < -0.001) & (found.values > -0.19)  # inside, the mesh says outside
-    expected = between & (
-        np.abs(found.values) + np.abs(found.residuals + np.abs(found.values)) > 0.1
-    )
-    assert np.array_equal(found.wrong_side, expected) and found.wrong_side.any()
-
-
-def test_a_mesh_inside_out_is_noticed(ball_mesh):
-    found = check_mesh(inverted(ball_mesh), sphere_grid())
+    found = check_mesh(inverted(ball_mesh), GRID)
     assert found.touching.summary()["largest"] < 0.005  # its triangles are where they should be
     assert not found.surface.oriented and found.surface.volume < 0
-    inside = found.touching.values < -0.1
-    assert found.touching.wrong_side[inside].all()
+    assert found.touching.wrong_side[found.touching.values < -0.1].all()
     assert "triangles that face inward" in found.faults()
 
 
-def test_holes_components_and_twists_are_counted(ball_mesh):
+def test_a_shift_is_its_cosine_and_so_are_the_colours(ball_mesh):
+    """Along x by a: a sample in direction n is off by a n_x, the mean of its absolute a / 2."""
+    whole = check_mesh(moved(ball_mesh, 0.1 * H), GRID)
+    found, figures = whole.touching, whole.touching.summary()
+    assert figures["largest"] == pytest.approx(0.1, abs=0.01)
+    assert figures["mean"] == pytest.approx(0.05, abs=0.005)
+    cosine = found.points[:, 0] / np.linalg.norm(found.points, axis=1)
+    clear = np.abs(found.values) > 0.2
+    want = -0.1 * cosine * np.sign(found.values)
+    np.testing.assert_allclose(found.residuals[clear], want[clear], atol=0.01)
+    at = np.array(figures["largest_at"])
+    assert abs(at[0]) > 0.9 * np.linalg.norm(at)
+    front = ball_mesh.vertices[:, 0] > 0.95 * RADIUS
+    residuals = np.abs(whole.residuals_at(ball_mesh.vertices)[front])
+    assert residuals.mean() == pytest.approx(0.1, abs=0.01)
+    assert np.isnan(whole.residuals_at(np.array([[9.0, 9, 9]]))).all()
+    said = check.colours(np.array([0, -1, -0.05, np.nan], np.float32))
+    assert [tuple(row) for row in said[[0, 1, 3]]] == [check.TOUCHING, check.PIERCED, check.UNKNOWN]
+    np.testing.assert_allclose(said[2], (np.array(check.TOUCHING) + check.PIERCED) / 2, atol=1)
+
+
+def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
+    found = check_mesh(round_mesh(RADIUS - 0.2 * H), GRID).touching
+    clear, outside = np.abs(found.values) > 0.3, found.values > 0
+    np.testing.assert_allclose(found.residuals[clear & outside], 0.2, atol=0.01)
+    np.testing.assert_allclose(found.residuals[clear & ~outside], -0.2, atol=0.01)
+    between = (found.values < -0.001) & (found.values > -0.19)  # inside, the mesh says outside
+    distance = np.abs(found.values)
+    expected = between & (distance + np.abs(found.residuals + distance) > 0.1)
+    assert np.array_equal(found.wrong_side, expected) and found.wrong_side.any()
+
+
+def test_holes_components_and_twists_are_counted():
+    ball_mesh = round_mesh(subdivisions=2)
     lidless = surface.examine_surface(Mesh(ball_mesh.vertices, ball_mesh.faces[1:]))
     assert not lidless.closed and lidless.edges.open_edges == 3
     assert lidless.manifold and lidless.oriented
@@ -146,6 +130,13 @@ def test_holes_components_and_twists_are_counted(ball_mesh):
     assert doubled.edges.crowded_edges == 3 and not doubled.manifold
     collapsed = np.concatenate([cube().faces, [[0, 0, 1]]]).astype(np.int32)
     assert surface.examine_surface(Mesh(cube().vertices, collapsed)).faults() == []
+
+
+def test_pairs_of_triangles_that_intersect_are_counted():
+    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.5], [0.3, 0.2, 0.5], [0.2, 0.3, 0.5]]
+    crossed = Mesh(np.array(corners, np.float64), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
+    assert slabs.self_intersections(crossed) == 1
+    assert slabs.self_intersections(cube()) == 0
 
 
 def test_a_vertex_shared_by_two_pieces_is_pinched():
@@ -183,87 +174,61 @@ def test_what_is_found_depends_neither_on_the_slabs_nor_on_processes(monkeypatch
 
 def test_sides_of_a_mesh_that_meets_itself_are_by_winding_number(ball_mesh):
     """A point in both balls is behind one sheet and nearest to the inner one, seen from inside."""
-    mesh = joined(ball_mesh, round_mesh(0.5 * RADIUS))
-    found = check_mesh(mesh, sphere_grid())
+    found = check_mesh(joined(ball_mesh, round_mesh(0.5 * RADIUS, 3)), GRID)
     assert found.surface.components == 2
     assert not found.touching.wrong_side.any()
 
 
-def test_truncated_samples_promise_nothing(ball_mesh):
-    near = check_mesh(ball_mesh, sphere_grid(clamp=1.5)).touching
-    whole = check_mesh(ball_mesh, sphere_grid()).touching
+def test_a_piece_far_from_every_sample_is_noticed():
+    """The samples near the surface see nothing of it, but those round it promise empty balls."""
+    ball_mesh, speck = round_mesh(subdivisions=4), round_mesh(0.02, 2)
+    found = check_mesh(joined(ball_mesh, speck), GRID)
+    assert found.touching.summary()["largest"] < 0.02
+    assert found.strays.count == len(speck.vertices)
+    assert found.strays.deepest == pytest.approx((RADIUS - 0.02) / H, abs=1)
+    outside = check_mesh(joined(ball_mesh, moved(ball_mesh, 2.0)), GRID)
+    assert outside.strays.beyond == len(ball_mesh.vertices)
+
+
+def test_truncated_and_noisy_samples_promise_nothing(ball_mesh):
+    near, early = (
+        check_mesh(ball_mesh, grid_of(np.clip(sphere_values(), -limit * H, limit * H))).touching
+        for limit in (1.5, 0.9)
+    )
+    whole = check_mesh(ball_mesh, GRID).touching
     assert len(near.values) == len(whole.values)  # beyond 1.4 voxels none counts anyway
-    early = check_mesh(ball_mesh, SdfGrid.trusted(
-        np.clip(sphere_values(), -0.9 * H, 0.9 * H).astype(np.float32), H, (-0.6,) * 3
-    )).touching  # fmt: skip
     assert np.abs(early.values).max() < 0.9 and early.cut_off > 1000
     assert early.summary()["largest"] < 0.005
-
-
-def test_noisy_samples_promise_nothing(ball_mesh):
-    noise = np.random.default_rng(0).uniform(-0.5, 0.5, sphere_values().shape) * H
-    noisy = SdfGrid.trusted((sphere_values() + 2 * noise).astype(np.float32), H, (-0.6,) * 3)
-    found = check_mesh(ball_mesh, noisy)
+    noise = np.random.default_rng(0).uniform(-1, 1, sphere_values().shape) * H
+    found = check_mesh(ball_mesh, grid_of(sphere_values() + noise))
     assert len(found.touching.values) == 0 and found.touching.noisy > 3000
     assert found.report()["residual"] is None and found.strays is None
     assert "residual: unknown, since no sample is exact" in found.lines()
     none = dict.fromkeys(LIMITS)
-    assert exceeded(found, {**none, "max_mean": 9.0}) == [NO_EVIDENCE]
+    assert exceeded(found, {**none, "max_mean": 9.0}) == [check.NO_EVIDENCE]
     assert exceeded(found, none) == []
 
 
-def test_a_piece_far_from_every_sample_is_noticed(ball_mesh):
-    """The samples near the surface see nothing of it, but those round it promise empty balls."""
-    speck = round_mesh(0.02)
-    found = check_mesh(joined(ball_mesh, speck), sphere_grid())
-    assert found.touching.summary()["largest"] < 0.005
-    assert found.strays.count == len(speck.vertices)
-    assert found.strays.deepest == pytest.approx((RADIUS - 0.02) / H, abs=1)
-    outside = check_mesh(moved(joined(ball_mesh, moved(ball_mesh, 2.0)), 0), sphere_grid())
-    assert outside.strays.beyond == len(ball_mesh.vertices)
-
-
-def test_colours_are_those_of_the_residuals(ball_mesh):
-    found = check_mesh(moved(ball_mesh, 0.1 * H), sphere_grid())
-    values = found.residuals_at(ball_mesh.vertices)
-    front = ball_mesh.vertices[:, 0] > 0.95 * RADIUS
-    assert np.abs(values[front]).mean() == pytest.approx(0.1, abs=0.01)
-    said = colours(np.array([0, -1, -0.05, np.nan], np.float32))
-    assert [tuple(row) for row in said[[0, 1, 3]]] == [TOUCHING, PIERCED, UNKNOWN]
-    np.testing.assert_allclose(said[2], (np.array(TOUCHING) + PIERCED) / 2, atol=1)
-    far = found.residuals_at(np.array([[9.0, 9, 9]]))
-    assert np.isnan(far).all()
-
-
-def test_memory_is_refused_with_the_figure(ball_mesh, tmp_path):
-    path = saved(ball_mesh, tmp_path / "ball.ply")
-    assert stated_triangles(path) == len(ball_mesh.faces)
-    assert stated_triangles(saved(ball_mesh, tmp_path / "ball.stl")) == len(ball_mesh.faces)
-    assert stated_triangles(saved(ball_mesh, tmp_path / "ball.off")) == 0
-    with pytest.raises(
-        OutOfMemoryError, match=r"checking 20,480 triangles needs \d+ MB of memory, 9 MB"
-    ):
-        check_files(path, tmp_path / "never-read.npz", ConvertOptions(max_memory=9_000_000))
+def test_the_triangles_that_a_file_states_are_read_from_its_head(tmp_path):
+    mesh = round_mesh(subdivisions=1)
+    stated = [stated_triangles(saved(mesh, tmp_path / f"a.{end}")) for end in ("ply", "stl", "off")]
+    assert stated == [80, 80, 0]
 
 
 def test_limits(ball_mesh):
-    found, names = check_mesh(moved(ball_mesh, 0.15 * H), sphere_grid()), list(LIMITS)
+    found, names = check_mesh(moved(ball_mesh, 0.15 * H), GRID), list(LIMITS)
     assert exceeded(found, dict(zip(names, (0.2, 0.1, 0.5)))) == []
-    passed = exceeded(found, dict(zip(names, (0.1, 0.05, 0.01))))
-    assert passed[0].startswith("the largest residual is 0.1")
-    assert passed[0].endswith(" voxels, --max-residual is 0.1")
-    assert passed[1].startswith("the mean residual is 0.07")
-    assert passed[2].endswith(", --max-share is 0.01") and len(passed) == 3
-    for wrong in ((-1.0, None, None), (None, np.nan, None), (None, None, 2.0)):
-        with pytest.raises(OptionError):
-            check_limits(dict(zip(names, wrong)))
+    largest, mean, share = exceeded(found, dict(zip(names, (0.1, 0.05, 0.01))))
+    assert largest.startswith("the largest residual is 0.1")
+    assert largest.endswith(" voxels, --max-residual is 0.1")
+    assert mean.startswith("the mean residual is 0.07") and share.endswith(", --max-share is 0.01")
 
 
 @pytest.fixture
 def here(tmp_path, monkeypatch, ball_mesh):
     """A folder with a grid of the sphere, its mesh, and a shifted one."""
     monkeypatch.chdir(tmp_path)
-    np.savez("ball.npz", values=sphere_grid().values, spacing=H, origin=(-0.6, -0.6, -0.6))
+    np.savez("ball.npz", values=GRID.values, spacing=H, origin=(-0.6, -0.6, -0.6))
     saved(ball_mesh, Path("ball.ply"))
     saved(moved(ball_mesh, 0.1 * H), Path("off.ply"))
     return tmp_path
@@ -301,7 +266,17 @@ def test_the_offset_is_that_of_the_mesh(here, command):
     assert command(*words)[0] == 1
 
 
-def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
+def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
+    monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
+    before = sorted(os.listdir())
+    line = "needs igl: pip install -e '.[report]' in a clone of super-sdf"
+    assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}\n")
+    for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
+        assert command(*words, "--check")[::2] == (1, f"Error: --check {line}\n")
+    assert sorted(os.listdir()) == before
+
+
+def test_the_coloured_mesh_is_a_mesh_with_residuals_whole_or_not_there(here, command, monkeypatch):
     assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "-q") == (0, "", "")
     mesh = trimesh.load("c.ply", process=False)
     assert len(mesh.faces) == 20480 and mesh.is_watertight
@@ -309,6 +284,16 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
     assert np.abs(residual).max() == pytest.approx(0.1, abs=0.01)
     worst = mesh.visual.vertex_colors[np.abs(residual).argmax()][:3]
     assert abs(int(worst[0]) - int(worst[2])) > 100
+
+    def full(faces):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(mesh_writers, "_ply_rows", full)
+    Path("c.ply").write_text("old")
+    before = sorted(os.listdir())
+    want = (1, "", "Error: c.ply cannot be written: No space left on device\n")
+    assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "--force") == want
+    assert sorted(os.listdir()) == before and Path("c.ply").read_text() == "old"
 
 
 @pytest.mark.parametrize(
@@ -320,9 +305,11 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
         ("ball.ply ball.npz --out off.ply", 1, "off.ply exists: remove it or use --force"),
         ("ball.ply ball.npz --out ball.ply --force", 1, "ball.ply is the same file as ball.ply:"),
         ("ball.ply ball.npz --max-share 2", 2, "--max-share is 2: give a share from 0 to 1"),
+        ("ball.ply ball.npz --max-mean nan", 2, "--max-mean is nan: give "),
+        ("ball.ply ball.npz --max-residual -1", 2, "--max-residual is -1: give "),
         ("ball.ply ball.npz --offset nan", 2, "--offset is nan: give a finite number, in world"),
         ("ball.ply ball.npz --offset 9", 1, "no surface at 9: the values go from "),
-        ("ball.ply ball.npz --max-memory 9M", 1, "checking 20,480 triangles needs "),
+        ("ball.ply none.npz --max-memory 9M", 1, "of memory, 9 MB may be taken in all; "),
     ],
 )
 def test_errors_are_one_line_and_leave_nothing(here, command, words, code, message):
@@ -333,36 +320,12 @@ def test_errors_are_one_line_and_leave_nothing(here, command, words, code, messa
     assert sorted(os.listdir()) == before
 
 
-def test_a_coloured_mesh_is_never_left_half_written(here, command, monkeypatch):
-    def full(faces):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(mesh_writers, "_ply_rows", full)
-    Path("c.ply").write_text("old")
-    before = sorted(os.listdir())
-    code, out, err = command("check", "off.ply", "ball.npz", "--out", "c.ply", "--force")
-    assert (code, out) == (1, "")
-    assert err == "Error: c.ply cannot be written: No space left on device\n"
-    assert sorted(os.listdir()) == before and Path("c.ply").read_text() == "old"
-
-
-def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
-    monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
-    line = "needs igl: pip install -e '.[report]' in a clone of super-sdf\n"
-    assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}")
-    for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
-        code, _, err = command(*words, "--check")
-        assert (code, err) == (1, f"Error: --check {line}")
-    assert not Path("new.ply").exists() and not Path("new").exists()
-
-
 def test_upsample_checks_what_it_wrote(here, command):
-    code, out, err = command("upsample", "ball.npz", "new.ply", "--check", "--json")
-    assert code == 0
-    report = json.loads(out)["check"]
-    assert report["residual"]["mean"] < 0.02 and report["surface"]["closed"]
-    assert err.splitlines()[-1].startswith("Check: residual 0.00")
-    assert err.splitlines()[-1].endswith("; no faults")
+    words = ("upsample", "ball.npz", "new.ply", "--factor", 2, "--check", "--json")
+    code, out, err = command(*words)
+    report, last = json.loads(out)["check"], err.splitlines()[-1]
+    assert code == 0 and report["residual"]["mean"] < 0.02 and report["surface"]["closed"]
+    assert last.startswith("Check: residual 0.00") and last.endswith("; no faults")
 
 
 def test_batch_records_certificates_and_makes_those_that_are_missing(here, run_batch):
@@ -370,16 +333,8 @@ def test_batch_records_certificates_and_makes_those_that_are_missing(here, run_b
     np.savez("in/a.npz", values=ball(16, 5.0).values, spacing=1.0)
     assert run_batch("in")[0] == 0
     code, _, err = run_batch("in", "--check")
-    row = json.loads(Path("out/report.jsonl").read_text().splitlines()[-1])
-    assert code == 0 and row["check"]["residual"]["largest"] < 0.2
-    assert row["check"]["surface"]["closed"]
+    check = rows()[-1]["check"]
+    assert code == 0 and check["residual"]["largest"] < 0.2 and check["surface"]["closed"]
     assert "1 done, 0 failed" in err and "Check: mean residual 0.0" in err
     for flags in (("--check",), ()):  # now it is there
         assert "nothing to do: 1 done before" in run_batch("in", *flags)[2]
-
-
-def test_pairs_of_triangles_that_intersect_are_counted():
-    corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.5], [0.3, 0.2, 0.5], [0.2, 0.3, 0.5]]
-    crossed = Mesh(np.array(corners, np.float64), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
-    assert slabs.self_intersections(crossed) == 1
-    assert slabs.self_intersections(cube()) == 0

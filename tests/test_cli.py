@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import zipfile
 from pathlib import Path
 
@@ -88,17 +87,6 @@ def test_noise_is_told(here, command):
     assert " % of the band the values differ by more than distances can: they are taken" in err
 
 
-def test_a_network_without_int8_is_refused_if_that_is_asked_for(here, command):
-    shutil.copy(shipped_models()["fast"], "own.onnx")
-    words = ("upsample", "in.npy", "out.ply", "--model", "own.onnx", "--json")
-    code, _, err = command(*words, "--precision", "int8")
-    assert code == 2 and "own.onnx has no int8 variant, own-int8.onnx: write one with" in err
-    code, out, _ = command(*words)
-    assert code == 0 and json.loads(out)["precision"] == "float32"
-    code, out, _ = command("upsample", "in.npy", "other.ply", "--device", "cpu", "--json")
-    assert code == 0 and json.loads(out)["precision"] == "int8"
-
-
 def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
     from super_sdf.network.network import Network
 
@@ -111,18 +99,29 @@ def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command
     assert trimesh.load("out.ply").is_watertight
 
 
-def test_info_names_versions_devices_and_models(command):
+def test_version_help_info_and_usage_errors(command):
+    assert command("--version") == (0, f"super-sdf, version {super_sdf.__version__}\n", "")
+    for flag in ("-h", "--help"):
+        assert "Turn coarse signed distance grids into fine meshes" in command(flag)[1]
     code, out, _ = command("info")
     assert code == 0 and out.startswith(f"super-sdf {super_sdf.__version__}\n")
     assert "model base\n" in out and "devices: cpu" in out
     facts = json.loads(command("info", "--json")[1])
     assert facts["models"]["base"]["format_version"] == 1
+    assert command("upsample")[0] == 2
+    assert command("nonsense") == (2, "", "Error: No such command 'nonsense'.\n")
 
 
-def test_version_and_help(command):
-    assert command("--version") == (0, f"super-sdf, version {super_sdf.__version__}\n", "")
-    for flag in ("-h", "--help"):
-        assert "Turn coarse signed distance grids into fine meshes" in command(flag)[1]
+def test_every_option_has_help_and_is_in_the_table_once():
+    for name in cli.COMMANDS:
+        options = cli.cli.get_command(None, name).params
+        assert all(one.help for one in options if isinstance(one, click.Option)), name
+    taken = {parameter.name: parameter for parameter in upsample_command.params}
+    assert all(taken[name].default == OPTIONS[name].default for name in UPSAMPLE)
+    assert set(Values.__annotations__) < set(GRID)
+    assert tuple(f".{name}" for name in MESH_FORMATS) == MESH_SUFFIXES
+    for text in (upsample_command.help, write_mesh.__doc__):
+        assert all(f" {suffix}" in text for suffix in MESH_SUFFIXES)
 
 
 def save_archive(name, **members):
@@ -153,71 +152,45 @@ def bad_files() -> None:
     np.save("constant.npy", np.ones((3, 3, 3)))
 
 
+SHORT = "is truncated: its header promises 20 x 20 x 20 float32, 32,000 bytes, but 15,936 follow"
 CASES = {
-    ("none.npy",): (1, "none.npy does not exist"),
-    ("in.raw",): (2, f"in.raw is not a grid file: give one of {', '.join(GRID_SUFFIXES)}"),
-    ("text.npy",): (1, "text.npy is not an .npy array: its header cannot be read"),
-    ("empty.npy",): (1, "empty.npy is empty: give a file with something in it"),
-    ("text.npz",): (1, "text.npz is not a readable .npz archive: File is not a zip file"),
-    ("objects.npy",): (1, "objects.npy holds Python objects: save the numbers alone"),
-    ("other.npz",): (1, "other.npz has no key 'values' (it holds field, more)"),
-    ("spaced.npz",): (1, "spaced.npz[spacing] has shape (7,): give one number or three"),
-    ("short.npy",): (
-        1,
-        "short.npy is truncated: its header promises 20 x 20 x 20 float32, 32,000 bytes, "
-        "but 15,936 follow",
-    ),
-    ("short.npz",): (
-        1,
-        "short.npz[values] is truncated: its header promises 20 x 20 x 20 float32, 32,000 bytes, "
-        "but 15,936 follow",
-    ),
-    ("damaged.npz",): (
-        1,
-        "damaged.npz[values] is damaged: its checksum is wrong",
-    ),
-    ("constant.npy",): (1, "every value is 1: a constant field has no surface"),
-    ("in.npy", "--label", "1.5"): (
-        2,
-        "--label is 1.5: give a whole number, -2^63 to 2^64 - 1",
-    ),
-    ("in.npy", "--scale", "0"): (2, "--scale is 0: give a number greater than 0"),
-    ("in.npy", "--triangles", "3"): (2, "--triangles is 3: give 4 or more, as a closed mesh has"),
-    ("in.npy", "--simplify", "1", "--triangles", "9"): (
-        2,
-        "--simplify 1 and --triangles 9: give only one of them",
-    ),
-    ("in.npy", "--factor", "5"): (
-        2,
-        "--factor is 5: give an even number from 2 to 16 (an odd one has no node on the samples)",
-    ),
-    ("in.npy", "--factor", "four"): (
-        2,
-        "Invalid value for '--factor': 'four' is not a valid integer.",
-    ),
-    ("in.npy", "--spacing", "1,2"): (
-        2,
-        "Invalid value for '--spacing': '1,2': give one number, or three separated by commas",
-    ),
-    ("in.npy", "--direction", "1,0,0"): (
-        2,
-        "Invalid value for '--direction': '1,0,0': give nine numbers separated by commas, row by "
-        "row",
-    ),
-    ("in.npy", "--model", "huge"): (
-        1,
-        "no model 'huge': give an ONNX file or one of: fast, base, best",
-    ),
+    "none.npy": "none.npy does not exist",
+    "text.npy": "text.npy is not an .npy array: its header cannot be read",
+    "empty.npy": "empty.npy is empty: give a file with something in it",
+    "text.npz": "text.npz is not a readable .npz archive: File is not a zip file",
+    "objects.npy": "objects.npy holds Python objects: save the numbers alone",
+    "other.npz": "other.npz has no key 'values' (it holds field, more)",
+    "spaced.npz": "spaced.npz[spacing] has shape (7,): give one number or three",
+    "short.npy": f"short.npy {SHORT}",
+    "short.npz": f"short.npz[values] {SHORT}",
+    "damaged.npz": "damaged.npz[values] is damaged: its checksum is wrong",
+    "constant.npy": "every value is 1: a constant field has no surface",
+    "in.npy --model huge": "no model 'huge': give an ONNX file or one of: fast, base, best",
+}
+WRONG = {
+    "in.raw": f"in.raw is not a grid file: give one of {', '.join(GRID_SUFFIXES)}",
+    "in.npy --label 1.5": "--label is 1.5: give a whole number, -2^63 to 2^64 - 1",
+    "in.npy --scale 0": "--scale is 0: give a number greater than 0",
+    "in.npy --simplify -1": "--simplify is -1: give a number greater than 0",
+    "in.npy --factor 18": "--factor is 18: give an even number from 2 to 16 (an odd one has no "
+    "node on the samples)",
+    "in.npy --factor four": "Invalid value for '--factor': 'four' is not a valid integer.",
+    "in.npy --spacing 1,2": "Invalid value for '--spacing': '1,2': give one number, or three "
+    "separated by commas",
+    "in.npy --spacing 1,nan,1": "--spacing is nan: give a finite number",
+    "in.npy --level 1.5 --label 2": "--label 2 and --level 1.5: give only one of them",
+    "in.npy --direction 1,0,0": "Invalid value for '--direction': '1,0,0': give nine numbers "
+    "separated by commas, row by row",
 }
 
 
-@pytest.mark.parametrize("arguments", CASES, ids=" ".join)
-def test_bad_input_is_one_line_and_no_file(here, command, arguments):
+@pytest.mark.parametrize("words", [*CASES, *WRONG])
+def test_bad_input_is_one_line_and_no_file(here, command, words):
     bad_files()
     before = sorted(os.listdir())
-    code, want = CASES[arguments]
-    source, *words = arguments
-    assert command("upsample", source, "out.ply", *words) == (code, "", f"Error: {want}\n")
+    source, *options = words.split()
+    code, want = (1, CASES[words]) if words in CASES else (2, WRONG[words])
+    assert command("upsample", source, "out.ply", *options) == (code, "", f"Error: {want}\n")
     assert sorted(os.listdir()) == before
 
 
@@ -243,22 +216,19 @@ def test_a_factor_beyond_memory_is_refused_before_the_work(here, command, monkey
     assert err.endswith("(--max-memory)\n")
 
 
+QUICK = ("--factor", 2, "--quality", "fast")
 OWN_INPUTS = {
-    "upsample in.npy out.ply --factor 2 --quality fast": ("in.npy", "out.ply"),
-    "upsample in.npy new.ply --factor 2 --quality fast --save-field out.npy": ("in.npy", "out.npy"),
-    "upsample raw.mhd out.ply --factor 2 --quality fast": ("raw.bin", "out.ply"),
+    "upsample in.npy out.ply": ("in.npy", "out.ply"),
+    "upsample in.npy new.ply --save-field out.npy": ("in.npy", "out.npy"),
+    "upsample raw.mhd out.ply": ("raw.bin", "out.ply"),
     "check ball.ply in.npy --out out.ply": ("ball.ply", "out.ply"),
     "sample ball.ply out.npz -n 9": ("ball.ply", "out.npz"),
 }
 
 
-FIRST, *REST = OWN_INPUTS
-
-
-@pytest.mark.parametrize(
-    "words, link", [(FIRST, os.symlink), (FIRST, os.link), *((words, os.link) for words in REST)]
-)
-def test_no_command_writes_over_its_own_input(here, command, words, link):
+@pytest.mark.parametrize("words", OWN_INPUTS)
+def test_no_command_writes_over_its_own_input(here, command, words):
+    """Soft links: ``test_a_file_is_apart_from_another_only_if_it_is_another``."""
     values = np.load("in.npy").astype("<f4")
     values.tofile("raw.bin")
     size = " ".join(map(str, values.shape[::-1]))
@@ -268,7 +238,7 @@ def test_no_command_writes_over_its_own_input(here, command, words, link):
     )
     write_mesh(reconstruct(ball(12, 3.0), trilinear, 2), "ball.ply")
     source, target = OWN_INPUTS[words]
-    link(source, target)
+    os.link(source, target)
     before, names = Path(source).read_bytes(), sorted(os.listdir())
     want = f"Error: {target} is the same file as {source}: give another file\n"
     assert command(*words.split(), "--force") == (1, "", want)
@@ -292,26 +262,23 @@ def test_targets_are_checked_before_the_work(here, command, target):
     assert Path("there.ply").read_text() == "mine"
 
 
-def test_a_folder_without_permission_is_named(here, command, monkeypatch):
+def test_no_permission_and_no_memory_are_one_line_each(here, command, monkeypatch):
+    def exhaust(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr("super_sdf.pipeline.refine", exhaust)
+    want = "Error: out of memory: use a smaller --factor or grid\n"
+    assert command("upsample", "in.npy", "out.ply") == (1, "", want)
     monkeypatch.setattr("super_sdf.files.output.os.access", lambda path, mode: False)
     want = "Error: out.ply cannot be written: no permission in .\n"
     assert command("upsample", "in.npy", "out.ply") == (1, "", want)
 
 
-@pytest.mark.parametrize("stage", ["pipeline.refine", "files.mesh_writers.write_split"])
-def test_an_interrupt_at_any_stage_leaves_nothing(here, command, monkeypatch, stage):
-    def interrupt(*_, **__):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(f"super_sdf.{stage}", interrupt)
-    code, out, err = command("upsample", "in.npy", "out.ply", "--quiet")
-    assert (code, out, err.strip()) == (130, "", "Error: interrupted; nothing was written")
-    assert os.listdir() == ["in.npy"]
-
-
 @pytest.mark.parametrize(
     "step, options, written",
     [
+        ("pipeline.refine", (), "nothing was written"),
+        ("files.mesh_writers.write_split", (), "nothing was written"),
         (
             "cli.upsample.Upsampling.print_report",
             ("--save-field", "f.npz"),
@@ -325,64 +292,33 @@ def test_an_interrupt_says_what_is_written(here, command, monkeypatch, step, opt
         raise KeyboardInterrupt
 
     monkeypatch.setattr(f"super_sdf.{step}", interrupt)
-    code, out, err = command("upsample", "in.npy", "out.ply", "--quiet", *options)
-    assert (code, out, err) == (130, "", f"Error: interrupted; {written}\n")
-    assert trimesh.load("out.ply").is_watertight
-
-
-def test_running_out_of_memory_is_one_line(here, command, monkeypatch):
-    def exhaust(*_, **__):
-        raise MemoryError
-
-    monkeypatch.setattr("super_sdf.pipeline.refine", exhaust)
-    want = "Error: out of memory: use a smaller --factor or grid\n"
-    assert command("upsample", "in.npy", "out.ply") == (1, "", want)
+    code, out, err = command("upsample", "in.npy", "out.ply", "--quiet", *QUICK, *options)
+    assert (code, out, err.strip()) == (130, "", f"Error: interrupted; {written}")
+    if written == "nothing was written":
+        assert os.listdir() == ["in.npy"]
+    else:
+        assert trimesh.load("out.ply").is_watertight
 
 
 def test_less_memory_gives_the_same_file(here, command, bare_plan):
-    values = np.concatenate([ball().values] * 4)  # four balls in a row: longer than a slab needs
-    np.save("row.npy", values)
-    options = "row.npy", "--spacing", "1", "--quality", "fast", "--json"
-    _, out, _ = command("upsample", *options, "one.ply", "--max-memory", "4G")
-    _, other, _ = command("upsample", *options, "two.ply", "--max-memory", "108M")
-    one, two = json.loads(out), json.loads(other)
-    assert one["slabs"] == 1 and two["slabs"] > 1 and two["planned_bytes"] <= 108e6
+    row = np.concatenate([ball(14, 4.0).values] * 5)  # balls in a row: longer than a slab needs
+    np.save("row.npy", row)
+    found = []
+    for memory in ("4G", "103M"):
+        words = ("row.npy", f"{memory}.ply", "--spacing", 1, "--max-memory", memory, *QUICK)
+        found.append(json.loads(command("upsample", *words, "--json")[1]))
+    one, two = found
+    assert one["slabs"] == 1 and two["slabs"] > 1 and two["planned_bytes"] <= 103e6
     assert one["triangles"] == two["triangles"]
-    assert Path("one.ply").read_bytes() == Path("two.ply").read_bytes()
+    assert Path("4G.ply").read_bytes() == Path("103M.ply").read_bytes()
 
 
 @pytest.mark.parametrize("size", ["much", "", "-4G", "1e999"])
 def test_a_size_that_is_none_is_named(here, command, size):
     code, _, err = command("upsample", "in.npy", "out.ply", "--max-memory", size)
     assert code == 2 and f"{size!r}: give a number of bytes such as 1500M or 4G" in err
-    assert (parse_size("1500M"), parse_size("4g"), parse_size("123")) == (
-        15 * 10**8,
-        4 * 10**9,
-        123,
-    )
-
-
-def test_usage_errors_exit_with_2(command):
-    assert command("upsample")[0] == 2
-    assert command("nonsense") == (2, "", "Error: No such command 'nonsense'.\n")
-
-
-def test_every_option_has_help():
-    for name in cli.COMMANDS:
-        subcommand = cli.cli.get_command(None, name)
-        for parameter in subcommand.params:
-            if isinstance(parameter, click.Option):
-                assert parameter.help, parameter.name
-
-
-def test_each_option_is_in_the_table_once_and_each_mesh_format_in_the_help():
-    taken = {parameter.name: parameter for parameter in upsample_command.params}
-    for name in UPSAMPLE:
-        assert taken[name].default == OPTIONS[name].default
-    assert set(Values.__annotations__) < set(GRID)
-    assert tuple(f".{name}" for name in MESH_FORMATS) == MESH_SUFFIXES
-    for text in (upsample_command.help, write_mesh.__doc__):
-        assert all(f" {suffix}" in text for suffix in MESH_SUFFIXES)
+    sizes = {"1500M": 15 * 10**8, "4g": 4 * 10**9, "123": 123}
+    assert {text: parse_size(text) for text in sizes} == sizes
 
 
 def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):
@@ -394,18 +330,17 @@ def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):
     assert (code, err) == (0, "") and json.loads(out)["expected_bytes"] > 400_000
 
 
-def test_wrong_values_are_named_as_typed_and_in_lists_by_their_names(command, tmp_path):
-    grid = str(tmp_path / "a.npy")
-    np.save(grid, np.zeros((4, 4, 4)))
-    cases = {
-        "--simplify -1": "--simplify is -1:",
-        "--spacing 1,nan,1": "--spacing is nan:",
-        "--level 1.5 --label 2": "--label 2 and --level 1.5:",
-    }
-    for words, shown in cases.items():
-        code, _, err = command("upsample", grid, "a.ply", *words.split())
-        assert code == 2 and err.startswith(f"Error: {shown} give ")
-    listed = tmp_path / "list.jsonl"
-    listed.write_text(json.dumps({"in": grid, "simplify": -1}))
-    _, _, err = command("batch", listed, "--out", tmp_path / "out", "--simplify", "0.5")
+def test_wrong_values_are_named_in_lists_by_their_names(here, command):
+    Path("list.jsonl").write_text('{"in": "in.npy", "simplify": -1}')
+    _, _, err = command("batch", "list.jsonl", "--out", "out", "--simplify", "0.5")
     assert "'simplify' is -1: give a number" in err and "--simplify" not in err
+
+
+@pytest.mark.parametrize("quality", ["base", "best"])
+@pytest.mark.parametrize("words", ["upsample in.npy out.ply", "batch in.npy --out meshes"])
+def test_a_model_and_a_quality_are_not_given_at_once(here, command, quality, words):
+    model = str(shipped_models()["fast"])
+    message = f"Error: --model {model} replaces --quality {quality}: give only one of them\n"
+    refused = command(*words.split(), "--model", model, "--quality", quality)
+    assert refused == (2, "", message) and os.listdir() == ["in.npy"]
+    assert command(*words.split(), "--model", model, "--factor", 2)[0] == 0

@@ -51,8 +51,7 @@ def start(*words, path=None):
 
 def end(process):
     """Kill a process and those that it started."""
-    family = [*psutil.Process(process.pid).children(recursive=True), process]
-    for member in family:
+    for member in (*psutil.Process(process.pid).children(recursive=True), process):
         member.kill()
     process.wait()
 
@@ -137,119 +136,109 @@ def test_a_batch_on_a_cluster_of_this_machine_writes_what_one_without_it_writes(
     assert code == 1 and "nothing to do: 3 done before" in err
 
 
-def test_a_signal_ends_batch_and_workers_in_a_line():
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_batch_that_is_ended_or_killed_leaves_no_workers(monkeypatch, tmp_path, number):
     larger_grids(9)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where a killed one leaves the workers' folder
     process = start_batch(*LOCAL, "--jobs", 2)
     workers = workers_of(process)
     assert len(workers) >= 2
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(number)
     _, err = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 128 + signal.SIGTERM
-    assert err.startswith("Error: ended by SIGTERM: ") and err.count("\n") == 1
-    assert err.endswith("of 13 are done and kept; run it again to go on\n")
-    assert all_end(workers) and not list(Path("out").rglob(".*.part"))
-
-
-def test_a_killed_batch_leaves_no_workers(monkeypatch, tmp_path):
-    larger_grids(9)
-    monkeypatch.setenv("TMPDIR", str(tmp_path))  # where it leaves the workers' folder
-    process = start_batch(*LOCAL, "--jobs", 2)
-    workers = workers_of(process)
-    process.kill()
-    process.communicate()
     assert all_end(workers)
+    if number == signal.SIGTERM:
+        assert process.returncode == 128 + number
+        assert err.startswith("Error: ended by SIGTERM: ") and err.count("\n") == 1
+        assert err.endswith("of 13 are done and kept; run it again to go on\n")
+        assert not list(Path("out").rglob(".*.part"))
 
 
-def test_workers_at_an_address_write_the_same_bytes(command, scheduler, start_worker):
-    worker = start_worker()
-    code, _, err = command("batch", "in", "--out", "out", *QUICK, "--cluster", scheduler[0])
+def test_workers_at_an_address_write_the_same_bytes_until_the_scheduler_is_lost(
+    command, scheduler, start_worker
+):
+    worker, (address, process) = start_worker(), scheduler
+    code, _, err = command("batch", "in", "--out", "out", *QUICK, "--cluster", address)
     assert code == 1 and ", 1 failed; 3 meshes closed" in err
     command("batch", "in", "--out", "plain", *PLAIN, *FAST)
     assert meshes("out") == meshes("plain") and len(meshes("out")) == 3
     assert worker.poll() is None  # it stays for others
-
-
-def test_a_lost_scheduler_is_a_line_and_what_is_done_stays(command, scheduler, start_worker):
     larger_grids(9)
-    start_worker()
-    address, process = scheduler
-    batch = start_batch("--cluster", address)
+    batch = start_batch("--cluster", address, lines=6)
     end(process)
     _, err = batch.communicate(timeout=PATIENCE)
     want = f"Error: the connection to the Dask scheduler at {address} was lost: "
     assert batch.returncode == 1 and err == f"{want}run it again when the scheduler is back\n"
-    finished = len(rows())
-    assert finished < 13
+    assert 4 < len(rows()) < 13
     code, _, err = command("batch", "in", "--out", "out", *FAST, *PLAIN)
     assert code == 1 and len(rows()) == 13 and len(meshes("out")) == 12
 
 
-def test_a_worker_with_another_version_is_named(command, scheduler, start_worker, tmp_path):
+def test_no_worker_and_one_with_another_version_are_named(
+    command, scheduler, start_worker, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(connecting, "FIRST_WORKER_SECONDS", 0.1)
+    words = ("batch", "in", "--out", "out", *QUICK, "--cluster", scheduler[0])
+    want = f"the Dask scheduler at {scheduler[0]} has no workers: start some with "
+    assert command(*words) == (1, "", f"Error: {want}'dask worker {scheduler[0]}'\n")
     Path("other/super_sdf").mkdir(parents=True)
     Path("other/super_sdf/__init__.py").write_text('__version__ = "0.0.1"\n')
     start_worker(tmp_path / "other")
-    code, _, err = command("batch", "in", "--out", "out", *QUICK, "--cluster", scheduler[0])
     fault = f"has super-sdf 0.0.1, and here is {__version__}: install the same version there and"
+    code, _, err = command(*words)
     assert code == 1 and err.startswith("Error: worker tcp://127.0.0.1:")
-    assert err.endswith(f" {fault} here\n") and err.count("\n") == 1
-    assert not meshes("out")
-
-
-def test_a_scheduler_without_workers_is_named(command, scheduler, monkeypatch):
-    monkeypatch.setattr(connecting, "FIRST_WORKER_SECONDS", 0.1)
-    code, _, err = command("batch", "in", "--out", "out", *QUICK, "--cluster", scheduler[0])
-    want = f"the Dask scheduler at {scheduler[0]} has no workers: start some with "
-    assert (code, err) == (1, f"Error: {want}'dask worker {scheduler[0]}'\n")
+    assert err.endswith(f" {fault} here\n") and err.count("\n") == 1 and not meshes("out")
 
 
 def test_an_address_where_nobody_listens_is_named(command, monkeypatch):
     monkeypatch.setattr(connecting, "CONNECT_SECONDS", 0.3)
+
+    def said(address):
+        code, _, err = command("batch", "in", "--out", "out", "--cluster", address)
+        assert code == 1 and err.startswith(f"Error: no Dask scheduler answers at {address}")
+        return err.removeprefix(f"Error: no Dask scheduler answers at {address}")
+
+    want = ": start one with 'dask scheduler' and workers with 'dask worker ADDRESS', or give "
+    want += "'local' or another address\n"
     with socket.socket() as bound:
         bound.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{bound.getsockname()[1]}"
-        code, _, err = command("batch", "in", "--out", "out", "--cluster", address)
-    want = f"no Dask scheduler answers at {address}: start one with 'dask scheduler' and workers "
-    want += "with 'dask worker ADDRESS', or give 'local' or another address"
-    assert (code, err) == (1, f"Error: {want}\n")
+        assert said(f"tcp://127.0.0.1:{bound.getsockname()[1]}") == want
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
-        code, _, err = command("batch", "in", "--out", "out", "--cluster", address)
-    assert code == 1 and err.startswith(f"Error: no Dask scheduler answers at {address}: start one")
-    code, _, err = command("batch", "in", "--out", "out", "--cluster", "nothing://here")
-    assert code == 1 and err.startswith("Error: no Dask scheduler answers at nothing://here (")
+        assert said(f"tcp://127.0.0.1:{silent.getsockname()[1]}") == want
+    assert said("nothing://here").startswith(" (")
 
 
-def test_workers_of_this_machine_leave_no_folder_and_open_no_dashboard(monkeypatch, tmp_path):
+def test_workers_of_this_machine_leave_no_folder_and_are_not_waited_for_long(monkeypatch, tmp_path):
+    """Nor do they open a dashboard."""
     (tmp_path / "temporary").mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setattr(crew_module, "PATIENCE_SECONDS", -1.0)
     with connect("local", workers=1) as cluster:
         scheduler = cluster.client.scheduler_info()
         assert os.listdir(tempfile.tempdir)
         opened = [process["services"] for process in (scheduler, *scheduler["workers"].values())]
+        with Crew(cluster, Needs("fast"), prepare_to_wait, pytest.fail) as crew:
+            monkeypatch.setattr(cluster.client, "nthreads", dict)
+            want = r"^the cluster local has had no worker for -1 s: "
+            with pytest.raises(ClusterError, match=want):
+                list(crew.completed(deque(range(3))))
     assert opened == [{}, {}] and not os.listdir(tempfile.tempdir)
 
 
-def test_a_missing_extra_is_named(command, monkeypatch):
-    monkeypatch.setattr("super_sdf.machine.extras.find_spec", lambda name: None)
-    code, _, err = command("batch", "in", "--out", "out", *LOCAL)
-    want = "--cluster needs distributed: pip install -e '.[cluster]' in a clone of super-sdf"
-    assert (code, err) == (1, f"Error: {want}\n") and not Path("out").exists()
+def test_what_cannot_be_asked_is_refused_and_a_dry_run_connects_to_nothing(command, monkeypatch):
+    def asked(*words):
+        return command("batch", "in", "--out", "out", "--cluster", *words)
 
-
-def test_options_that_do_not_go_together_are_refused(command):
     address = "tcp://10.0.0.1:8786"
-    code, _, err = command("batch", "in", "--out", "out", "--cluster", address, "--jobs", 2)
-    want = f"--jobs 2 is for workers of this machine: those at {address} are as many as were "
-    want += "started there; give only one of --jobs and that --cluster"
-    assert (code, err) == (2, f"Error: {want}\n")
-    code, _, err = command("batch", "in", "--out", "out", "--cluster", " ")
-    want = "--cluster is empty: give local or the address of a Dask scheduler"
-    assert (code, err) == (2, f"Error: {want}\n") and not Path("out").exists()
-
-
-def test_a_dry_run_connects_to_nothing(command):
-    code, _, err = command("batch", "in", "--out", "out", "--cluster", "no:1", "--dry-run")
+    want = f"Error: --jobs 2 is for workers of this machine: those at {address} are as many as "
+    want += "were started there; give only one of --jobs and that --cluster\n"
+    assert asked(address, "--jobs", 2) == (2, "", want)
+    want = "Error: --cluster is empty: give local or the address of a Dask scheduler\n"
+    assert asked(" ") == (2, "", want)
+    code, _, err = asked("no:1", "--dry-run")
     assert code == 0 and err.startswith("4 to do, ")
+    monkeypatch.setattr("super_sdf.machine.extras.find_spec", lambda name: None)
+    want = "--cluster needs distributed: pip install -e '.[cluster]' in a clone of super-sdf"
+    assert asked("local") == (1, "", f"Error: {want}\n") and not Path("out").exists()
 
 
 def prepare_to_count(limits):
@@ -267,17 +256,16 @@ def prepare_to_count(limits):
 
 
 def test_a_task_that_kills_workers_is_the_only_one_that_fails():
+    """The others are done by the worker that takes the place of the only one."""
     with (
-        connect("local", workers=2, threads=1) as cluster,
+        connect("local", workers=1, threads=1) as cluster,
         Crew(cluster, Needs("fast"), prepare_to_count, pytest.fail) as crew,
     ):
         results = dict(crew.completed(deque(range(12))))
         assert list(crew.in_order(range(5, 9))) == [(2 * task, 1) for task in range(5, 9)]
-        assert results.pop(3) == Death(
-            "was lost 2 times by the cluster (most likely out of memory)"
-        )
-        assert results.pop(4) == Death("ended with OSError: four")
-        assert results == {task: (2 * task, 1) for task in range(12) if task not in (3, 4)}
+    lost = Death("was lost 2 times by the cluster (most likely out of memory)")
+    assert results.pop(3) == lost and results.pop(4) == Death("ended with OSError: four")
+    assert results == {task: (2 * task, 1) for task in range(12) if task not in (3, 4)}
 
 
 def prepare_to_wait(limits):
@@ -285,72 +273,37 @@ def prepare_to_wait(limits):
     return lambda task, check_wanted: time.sleep(0.12) or os.getpid()
 
 
-@pytest.mark.parametrize("fault", ["", "is odd"])
-def test_a_worker_that_comes_later_is_checked_and_used_or_named(monkeypatch, fault):
+def test_a_worker_that_comes_later_is_checked_and_used_or_named(monkeypatch):
     monkeypatch.setattr(crew_module, "LOOK_SECONDS", 0.1)
-    tasks, warnings, needs, pids = deque(range(4)), [], Needs("fast"), set()
+    needs = Needs("fast")
     with connect("local", workers=2, threads=1) as cluster:
         checked = check_workers(cluster, needs)
         (first, limits), (second, _) = checked.members.items()
-        if fault:
-            found = replace(checked, members={}, faults={second: fault})
-            monkeypatch.setattr(crew_module, "check_some", lambda *_: found)
         known = replace(checked, members={first: limits})
         monkeypatch.setattr(crew_module, "check_workers", lambda *_: known)
-        with Crew(cluster, needs, prepare_to_wait, warnings.append) as crew:
-            for _, pid in crew.completed(tasks):
-                pids.add(pid)
-                if not warnings and len(pids) < 2:
-                    tasks.append(0)  # until the other was looked at
-    assert len(pids) == (1 if fault else 2)
-    assert warnings == ([f"worker {second} is odd; it is not used"] if fault else [])
-
-
-def test_work_goes_on_when_all_workers_were_replaced():
-    with (
-        connect("local", workers=1, threads=1) as cluster,
-        Crew(cluster, Needs("fast"), prepare_to_wait, pytest.fail) as crew,
-    ):
-        results = crew.in_order(range(3))
-        pids = [next(results)]
-        os.kill(pids[0], signal.SIGKILL)
-        pids += results
-        assert len(pids) == 3 and len(set(pids)) == 2
-
-
-def test_a_cluster_without_workers_is_not_waited_for_long(monkeypatch):
-    monkeypatch.setattr(crew_module, "PATIENCE_SECONDS", -1.0)
-    with (
-        connect("local", workers=1) as cluster,
-        Crew(cluster, Needs("fast"), prepare_to_wait, pytest.fail) as crew,
-    ):
-        monkeypatch.setattr(cluster.client, "nthreads", dict)
-        with pytest.raises(ClusterError, match=r"^the cluster local has had no worker for -1 s: "):
-            list(crew.completed(deque(range(3))))
-
-
-def expected(**changes):
-    """Return what is here, changed: of the network, the folder, and a file in it."""
-    path = Path("in/a.npy").resolve()
-    needs = Needs("fast", modules=changes.pop("modules", ()), folder=Path.cwd())
-    models, sizes = needs.digests_of_models(), {path: path.stat().st_size}
-    return Expected(needs, models, sizes, None, True)._replace(**changes)
+        for fault in ("", "is odd"):
+            if fault:
+                found = replace(checked, members={}, faults={second: fault})
+                monkeypatch.setattr(crew_module, "check_some", lambda *_, found=found: found)
+            tasks, warnings, pids = deque(range(4)), [], set()
+            with Crew(cluster, needs, prepare_to_wait, warnings.append) as crew:
+                for _, pid in crew.completed(tasks):
+                    pids.add(pid)
+                    if not warnings and len(pids) < 2:
+                        tasks.append(0)  # until the other was looked at
+            assert len(pids) == (1 if fault else 2)
+            assert warnings == ([f"worker {second} is odd; it is not used"] if fault else [])
 
 
 FAULTS = {
-    "does not see the network x.onnx: put it where all machines see it": {
-        "models": {"x.onnx": "0"}
-    },
-    "has another file of the network base.onnx: copy the one from here": {
-        "models": {"base.onnx": "0"}
-    },
+    "": {},
+    "does not see the network x.onnx: put it where all machines see it": {"models": {"x.onnx": ""}},
+    "has another file of the network base.onnx: copy the": {"models": {"base.onnx": "0"}},
     "lacks nowhere: install there what is installed here": {"modules": ("nowhere",)},
     "does not see /no/file: put the inputs where all machines see them by this path": {
         "sizes": {Path("/no/file"): 1}
     },
-    "sees another /dev/null: its folder has to be the same on all machines": {
-        "sizes": {Path("/dev/null"): 7}
-    },
+    "sees another /dev/null: its folder has to be the same": {"sizes": {Path("/dev/null"): 7}},
     "does not see the output folder /: write to a folder that all machines share under ": {
         "probe": (Path("/no file"), "text")
     },
@@ -359,30 +312,28 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_what_a_worker_lacks_is_said(fault):
-    assert checking.what_is_lacking(expected()) == ""
-    assert checking.what_is_lacking(expected(**FAULTS[fault])).startswith(fault)
+    path, changes = Path("in/a.npy").resolve(), dict(FAULTS[fault])
+    needs = Needs("fast", modules=changes.pop("modules", ()), folder=Path.cwd())
+    here = Expected(needs, needs.digests_of_models(), {path: path.stat().st_size}, None, True)
+    found = checking.what_is_lacking(here._replace(**changes))
+    assert found.startswith(fault) and bool(found) == bool(fault)
 
 
-def test_workers_without_the_package_or_with_other_sources_are_named():
+def test_workers_without_the_package_or_with_other_sources_or_versions_are_named():
+    missing = ModuleNotFoundError("No module named 'super_sdf'")
     want = f"does not have super-sdf: install version {__version__} of it there"
-    assert checking.judge_version(ModuleNotFoundError("No module named 'super_sdf'")) == want
-    assert checking.judge_version(__version__) == ""
+    assert checking.judge_version(missing) == want and checking.judge_version(__version__) == ""
     want = f"cannot import super-sdf (SyntaxError: no): install {__version__} there"
     assert checking.judge_version(SyntaxError("no")) == want
     want = f"has other sources of super-sdf {__version__} than are here: install the same state "
     assert checking.judge_sources("0") == f"{want}there and restart it"
     assert checking.judge_sources(checking.digest_of_sources()) == ""
-    assert checking.first_of(["tcp://a", "tcp://b"]) == "worker tcp://a and 1 other"
-
-
-def test_other_versions_of_what_computes_are_a_warning():
     here = checking.versions()
     own = checking.Report("", "host", here)
     other = own._replace(versions={**here, "numpy": "numpy 1.26.0"})
-    assert checking.warnings_of({"tcp://a": other, "tcp://b": own, "tcp://c": other}) == [
-        f"worker tcp://a and 1 other have numpy 1.26.0, and here is {here['numpy']}: results may "
-        "differ in their last bits"
-    ]
+    want = f"worker tcp://a and 1 other have numpy 1.26.0, and here is {here['numpy']}: results may"
+    warnings = checking.warnings_of({"tcp://a": other, "tcp://b": own, "tcp://c": other})
+    assert warnings == [f"{want} differ in their last bits"]
 
 
 OTHER_PROCESSOR = """
@@ -445,3 +396,13 @@ def test_a_worker_plans_with_what_its_machine_and_dask_allow():
     assert share(Resources(0), 1, 10**10, 2 * 10**9, 2) == Resources(1, 6 * 10**8)
     assert share(Resources(2, 10**9), 1, 10**10, 1) == Resources(2, 10**9)
     assert share(Resources(2, 10**9), 1, 10**9, None) == Resources(2, 75 * 10**7)
+
+
+def test_local_workers_that_do_not_start_are_one_line(monkeypatch):
+    def fail(*given, **named):
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr(connecting, "SpecCluster", fail)
+    said = r"^the local workers do not start \(Nanny failed to start.\): run it again, with fewer "
+    with pytest.raises(ClusterError, match=said), connecting.connect("local", workers=1):
+        pass

@@ -39,42 +39,18 @@ def test_options_take_effect_and_the_result_is_reported():
     options = ConvertOptions(
         2, spacing=(2.0,), origin=(1.0, 2.0, 3.0), inside="positive", offset=2.0
     )
-    done = convert("in.npy", "out.ply", trilinear, options)
-    assert (done.grid.shape, done.grid.spacing, done.grid.origin) == (
-        (16,) * 3,
-        (2.0,) * 3,
-        (1.0, 2.0, 3.0),
-    )
+    steps = []
+    done = convert("in.npy", "out.ply", trilinear, options, progress=lambda *s: steps.append(s))
+    grid, mesh = done.grid, trimesh.load("out.ply")
+    assert (grid.shape, grid.spacing, grid.origin) == ((16,) * 3, (2.0,) * 3, (1.0, 2.0, 3.0))
     assert done.notes == () and done.warnings == () and done.closed
-    mesh = trimesh.load("out.ply")
     counts = len(mesh.vertices), len(mesh.faces)
     assert counts == (done.counts["vertices"], done.counts["triangles"])
     np.testing.assert_allclose(done.report()["bounds"], mesh.bounds)
     assert mesh.extents == pytest.approx([20] * 3, rel=0.02)
     assert mesh.bounds.mean(0) == pytest.approx(np.array([1, 2, 3]) + 2 * 7.63, abs=0.2)
-
-
-def test_stages_are_timed_and_steps_reported():
-    steps = []
-    done = convert(
-        "in.npy", "out.ply", trilinear, ConvertOptions(2), progress=lambda *s: steps.append(s)
-    )
     assert list(done.seconds) == ["read", "band", "network", "nodes", "isosurface", "write"]
     assert steps == [(20, 1000), (800, 1000), (900, 1000), (1000, 1000)]
-
-
-def in_slabs(monkeypatch, values, cap, spoil):
-    """Convert a grid in three slabs, of which the last is spoilt; return the error."""
-    np.save("cut.npy", values)
-    slabs = in_pieces(SdfGrid(values, 1.0), CLOSE, monkeypatch, 3, factor=2, cap=cap)
-    first = sum(slab.counts["vertices"] for slab in slabs[:2])
-    mesh = slabs[2].meshes[0]
-    slabs[2].meshes[0] = Mesh(mesh.vertices, spoil(mesh.faces, first))
-    monkeypatch.setattr(super_sdf.convert, "reconstruct_slabs", lambda *_, **__: iter(slabs))
-    with pytest.raises(MeshError) as caught:
-        convert("cut.npy", "out.ply", trilinear, ConvertOptions(2, cap=cap))
-    assert not os.path.exists("out.ply")
-    return str(caught.value), slabs
 
 
 def without_one(faces, first):
@@ -87,29 +63,35 @@ def with_one_twice(faces, first):
     return np.append(faces, faces[(faces < first).sum(1) == 2][:1], 0)
 
 
+BETWEEN = (
+    "1 open edge at plane {1}, between planes {0} to {2} and planes {1} to {3}: run it again, "
+)
+
+
 @pytest.mark.parametrize(
-    "cap, end, spoil",
+    "cap, end, spoil, want",
     [
-        (True, 9, without_one),
-        (False, 16, without_one),
-        (False, 9, with_one_twice),
+        (True, 9, without_one, BETWEEN),
+        (False, 16, without_one, BETWEEN),
+        (False, 9, with_one_twice, BETWEEN),
+        (True, 16, lambda faces, _: faces[:-1], "3 open edges in planes "),
     ],
 )
-def test_slabs_that_do_not_meet_are_an_error(monkeypatch, cap, end, spoil):
+def test_slabs_that_do_not_meet_and_holes_are_errors(monkeypatch, cap, end, spoil, want):
     """Whether the surface ends within the grid, is capped or is left open."""
     values = ball(16, 4.0).values[:, :end]
-    said, slabs = in_slabs(monkeypatch, values, cap, spoil)
+    np.save("cut.npy", values)
+    slabs = in_pieces(SdfGrid(values, 1.0), CLOSE, monkeypatch, 3, factor=2, cap=cap)
+    before = sum(slab.counts["vertices"] for slab in slabs[:2])
+    mesh = slabs[2].meshes[0]
+    slabs[2].meshes[0] = Mesh(mesh.vertices, spoil(mesh.faces, before))
+    monkeypatch.setattr(super_sdf.convert, "reconstruct_slabs", lambda *_, **__: iter(slabs))
+    with pytest.raises(MeshError) as caught:
+        convert("cut.npy", "out.ply", trilinear, ConvertOptions(2, cap=cap))
+    assert not os.path.exists("out.ply")
     (first, start), (_, stop) = slabs[1].planes, slabs[2].planes
-    assert said == (
-        f"the mesh is torn, with 1 open edge at plane {start}, between planes {first} to "
-        f"{start - 1} and planes {start} to {stop - 1}: run it again, and report it if that does "
-        "not help"
-    )
-
-
-def test_a_hole_in_a_mesh_is_an_error(monkeypatch):
-    said, _ = in_slabs(monkeypatch, ball(16, 4.0).values, True, lambda faces, _: faces[:-1])
-    assert said.startswith("the mesh is torn, with 3 open edges in planes ")
+    said = want.format(first, start, start - 1, stop - 1)
+    assert str(caught.value).startswith(f"the mesh is torn, with {said}")
 
 
 def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():
@@ -124,34 +106,31 @@ def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():
 
 
 @pytest.mark.parametrize("suffix", MESH_SUFFIXES)
-def test_the_size_of_the_file_is_estimated(suffix, factor=2):
+def test_the_size_of_the_file_is_estimated(suffix):
     cap = suffix in (".ply", ".stl")
     x, y, z = np.indices((24,) * 3) * 0.5
     gyroid = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
     np.save("gyroid.npy", gyroid.astype(np.float32))
-    done = convert(
-        "gyroid.npy", f"out{suffix}", trilinear, ConvertOptions(factor, spacing=(1.0,), cap=cap)
-    )
-    report, size = done.report(), os.path.getsize(f"out{suffix}")
-    assert report["expected_triangles"] == pytest.approx(
-        report["triangles"], rel=0.1 if cap else 0.08
-    )
+    options = ConvertOptions(2, spacing=(1.0,), cap=cap)
+    report = convert("gyroid.npy", f"out{suffix}", trilinear, options).report()
+    near = pytest.approx(report["triangles"], rel=0.1 if cap else 0.08)
+    assert report["expected_triangles"] == near
+    size = os.path.getsize(f"out{suffix}")
     assert report["expected_bytes"] == pytest.approx(size, rel=0.35)
 
 
 def test_a_large_file_is_announced_before_the_work(monkeypatch):
     announced = []
-    options = ConvertOptions(2)
-    convert("in.npy", "out.ply", trilinear, options, announce=announced.append)
-    assert announced == []
-    monkeypatch.setattr(meshes, "LARGE", 40_000)
 
     def work(*_):
         assert announced == ["new.ply will have about 2,500 triangles, 47,424 bytes"]
         raise MemoryError
 
+    convert("in.npy", "out.ply", trilinear, ConvertOptions(2), announce=announced.append)
+    assert announced == []
+    monkeypatch.setattr(meshes, "LARGE", 40_000)
     with pytest.raises(MemoryError):
-        convert("in.npy", "new.ply", work, options, announce=announced.append)
+        convert("in.npy", "new.ply", work, ConvertOptions(2), announce=announced.append)
 
 
 def test_a_file_that_its_disk_cannot_hold_is_refused_before_the_work(monkeypatch):

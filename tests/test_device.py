@@ -10,8 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import ball
-from test_network import network_inputs
 
 from super_sdf import load_network
 from super_sdf.errors import DeviceError, ModelError
@@ -19,11 +17,9 @@ from super_sdf.network import device
 from super_sdf.network.contract import INPUTS, one_voxel
 from super_sdf.network.device import CPU, CUDA, CUDA_OPTIONS
 from super_sdf.network.network import shipped_models
-from super_sdf.network.onnx import CHUNK_INPUT, CUDA_CHUNK, ort, run_bound
-from super_sdf.steps.nodes import block_offsets
+from super_sdf.network.onnx import CHUNK_INPUT, CUDA_CHUNK, ort
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
-ROOT = Path(__file__).parent.parent
 ASKED = "cuda was asked for, but "
 HERE = f"onnxruntime {ort.__version__}"
 
@@ -107,14 +103,6 @@ def cuda_session(cuda_build, monkeypatch):
     return fake
 
 
-def test_bound_runs_give_the_values_of_plain_ones():
-    patches, table, rows = network_inputs(ball())
-    feeds = dict(zip(INPUTS, (patches, table, rows[::2].copy(), block_offsets(4))))
-    session = load_network("fast", device="cpu").session
-    plain = session.run(None, feeds)[0]
-    np.testing.assert_allclose(run_bound(session, feeds, "cpu"), plain, atol=1e-5)
-
-
 @pytest.mark.parametrize("requested", ["auto", "cuda"])
 def test_cuda_that_works_is_used(cuda_session, requested):
     network = load_network(device=requested)
@@ -132,15 +120,13 @@ def test_cuda_that_works_is_used(cuda_session, requested):
     assert shrinks == "gpu:0"
 
 
-def test_onnxruntime_without_cuda_is_an_error_that_names_the_package():
-    reason = f"{HERE} here has no CUDA provider: install onnxruntime-gpu in place of onnxruntime"
-    with pytest.raises(DeviceError, match=f"^{ASKED}{reason}; or use --device cpu$"):
-        load_network(device="cuda")
+NO_PROVIDER = f"{HERE} here has no CUDA provider: install onnxruntime-gpu in place of onnxruntime"
 
 
 @pytest.mark.parametrize(
     ("missing", "reason"),
     [
+        ("the provider", NO_PROVIDER),
         ("libcuda.so.1", "there is no libcuda.so.1: install the NVIDIA driver"),
         (
             "libcublasLt.so.13",
@@ -149,40 +135,35 @@ def test_onnxruntime_without_cuda_is_an_error_that_names_the_package():
         ),
     ],
 )
-def test_a_missing_library_is_named(cuda_build, monkeypatch, missing, reason):
+def test_what_is_missing_for_cuda_is_named(cuda_build, monkeypatch, missing, reason):
+    if missing == "the provider":
+        monkeypatch.setattr(ort, "get_available_providers", lambda: [CPU])
+        monkeypatch.setattr(ort, "cuda_version", "")
     monkeypatch.setattr(ctypes, "CDLL", no_library(missing))
     with pytest.raises(DeviceError) as caught:
         load_network(device="cuda")
     assert str(caught.value) == f"{ASKED}{reason}; or use --device cpu"
 
 
-def test_a_provider_that_falls_back_in_silence_is_an_error(cuda_session, monkeypatch):
-    monkeypatch.setattr(cuda_session, "get_providers", lambda: [CPU])
-    with pytest.raises(DeviceError, match="could not start its CUDA provider; or use --device"):
-        load_network(device="cuda")
-
-
-def test_a_gpu_on_which_the_network_does_not_run_is_an_error(cuda_session):
+def test_a_provider_that_falls_back_or_fails_is_an_error(cuda_session, monkeypatch):
+    network = load_network(device="cuda")
     cuda_session.fails = "/a.cc:1 T f() [with T = int] CUDA failure 2: out of memory ; GPU=0 ; x"
+    with pytest.raises(DeviceError, match=r"^the network failed on cuda: CUDA failure 2: out of"):
+        network(*one_voxel().values())
     with pytest.raises(DeviceError) as caught:
         load_network(device="cuda")
     reason = "CUDA does not run here: CUDA failure 2: out of memory"
     assert str(caught.value) == f"{ASKED}{reason}; or use --device cpu"
-
-
-def test_a_run_that_fails_later_is_an_error(cuda_session):
-    network = load_network(device="cuda")
-    cuda_session.fails = "CUDA failure 2: out of memory ; GPU=0"
-    with pytest.raises(DeviceError, match=r"^the network failed on cuda: CUDA failure 2: out of"):
-        network(*one_voxel().values())
+    monkeypatch.setattr(cuda_session, "get_providers", lambda: [CPU])
+    with pytest.raises(DeviceError, match="could not start its CUDA provider; or use --device"):
+        load_network(device="cuda")
 
 
 @pytest.mark.parametrize("gpu", [True, False])
 def test_auto_falls_back_with_a_note_if_there_is_a_gpu(monkeypatch, gpu):
     monkeypatch.setattr(device, "has_gpu", lambda: gpu)
     network = load_network(device="auto")
-    reason = f"{HERE} here has no CUDA provider: install onnxruntime-gpu in place of onnxruntime"
-    note = f"a GPU seems to be here, but the network runs on the CPU: {reason}"
+    note = f"a GPU seems to be here, but the network runs on the CPU: {NO_PROVIDER}"
     assert (network.device, network.precision) == ("cpu", "int8")
     assert network.notes == (note,) * gpu
 
@@ -194,18 +175,8 @@ def test_a_bad_file_is_not_reported_as_a_failure_of_cuda(tmp_path, monkeypatch, 
         load_network(tmp_path / "bad.onnx", device=requested)
 
 
-def test_a_gpu_is_seen_by_its_driver(monkeypatch):
-    monkeypatch.setattr(Path, "exists", lambda self: False)
-    monkeypatch.setattr(ctypes, "CDLL", no_library("libcuda.so.1"))
-    assert not device.has_gpu()
-    monkeypatch.setattr(ctypes, "CDLL", no_library(None))
-    assert device.has_gpu()
-    monkeypatch.setattr(ctypes, "CDLL", no_library("libcuda.so.1"))
-    monkeypatch.setattr(Path, "exists", lambda self: str(self) == "/dev/nvidia0")
-    assert device.has_gpu()
-
-
-def test_nvidia_smi_describes_the_gpu(tmp_path, monkeypatch):
+@pytest.mark.parametrize("has_driver, has_file", [(False, False), (True, False), (False, True)])
+def test_a_gpu_is_seen_by_its_driver_and_described(monkeypatch, tmp_path, has_driver, has_file):
     monkeypatch.setenv("PATH", str(tmp_path))
     assert device.describe_gpu() is None
     fake = tmp_path / "nvidia-smi"
@@ -213,6 +184,9 @@ def test_nvidia_smi_describes_the_gpu(tmp_path, monkeypatch):
     fake.chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}:/bin:/usr/bin")
     assert device.describe_gpu() == "NVIDIA H100, driver 580.1, 83.9 GB free"
+    monkeypatch.setattr(ctypes, "CDLL", no_library(None if has_driver else "libcuda.so.1"))
+    monkeypatch.setattr(Path, "exists", lambda self: has_file and str(self) == "/dev/nvidia0")
+    assert device.has_gpu() == (has_driver or has_file)
 
 
 def test_shipped_files_let_the_chunk_be_chosen():

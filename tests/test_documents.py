@@ -64,17 +64,11 @@ def test_sentences_are_short_and_of_today(page):
     assert not long and not past
 
 
-def test_the_readme_and_the_cards_are_short():
+def test_the_readme_and_the_cards_are_short_and_its_first_commands_run_the_job_and_the_tests():
     assert len(README.read_text().splitlines()) <= 120
     assert all(len(card.read_text().splitlines()) <= 80 for card in CARDS)
-
-
-def test_what_the_readme_links_to_is_there():
     links = re.findall(r"\]\(([^)#]+)", README.read_text())
     assert len(links) > 25 and all((ROOT / link).exists() for link in links)
-
-
-def test_the_first_two_commands_set_up_and_run_the_job_and_the_tests():
     first, second = blocks("sh")[:2]
     assert first.startswith("python3 -m venv .venv && ") and second.startswith("python3 -m venv")
     assert "super-sdf upsample examples/part.npz part.ply" in first
@@ -93,6 +87,9 @@ def test_the_main_job_of_the_readme(tmp_path, monkeypatch):
     off = 0.15  # millimetres, a tenth of the spacing: see examples/README.md
     assert (mesh.bounds[0] > -off).all()
     assert (mesh.bounds[1] < np.array([66.06, 73.45, 15.55]) + off).all()
+    assert (ROOT / "examples" / "part.npz").stat().st_size < 600_000
+    text = (ROOT / "examples" / "README.md").read_text()
+    assert "trimesh" in text and "MIT" in text
 
 
 @pytest.fixture
@@ -175,13 +172,6 @@ def test_examples_run(example, tmp_path, monkeypatch, capsys):
     runpy.run_path(str(example), run_name="__main__")
     assert capsys.readouterr().out
     assert all(trimesh.load(path).is_watertight for path in tmp_path.iterdir())
-
-
-def test_the_example_grid_is_small_and_named():
-    grid = ROOT / "examples" / "part.npz"
-    assert grid.stat().st_size < 600_000
-    text = (ROOT / "examples" / "README.md").read_text()
-    assert "trimesh" in text and "MIT" in text
 
 
 def test_the_functions_on_the_tour_are_there():

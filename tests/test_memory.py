@@ -29,23 +29,27 @@ from super_sdf.steps import survey as survey_step
 from super_sdf.steps.survey import look_at_band, survey
 
 # Arrays of 4 MB in a row, of which the last stays: the C library keeps what is freed before it.
+# Arrays of 4 MB in a row, of which the last stays: the C library keeps what is freed before it.
 FREED = """
+import sys
 import numpy as np
-from super_sdf.machine.memory import held_memory, give_back
+from super_sdf.machine import memory
 
 def free_all_but_one():
     np.ones(3_900_000)  # 31 MB: from now on the library keeps pieces of this size
     return [np.ones(500_000) for _ in range(20)][-1]
 
-start = held_memory()
+start = memory.held_memory()
 last = free_all_but_one()
-kept = held_memory() - start
-give_back()
-print(kept, held_memory() - start)
+kept = memory.held_memory() - start
+memory.give_back()
+print(kept, memory.held_memory() - start)
+memory.free_memory(), memory.held_memory(peak=True), memory.forget_peak()
+assert 'psutil' not in sys.modules
 """
 
 
-def test_what_is_freed_is_given_back():
+def test_what_is_freed_is_given_back_and_where_proc_is_psutil_is_not_imported():
     run = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
     kept, left = map(int, run.stdout.split())
     assert kept > 70e6 and left < 10e6
@@ -60,25 +64,26 @@ def test_a_c_library_that_has_no_such_calls_is_left_alone(monkeypatch, error):
     memory.give_back()
 
 
-@pytest.mark.parametrize(
-    "size, want",
-    [(999, "0 MB"), (10**13, "10,000.00 GB")],
-)
-def test_sizes_are_said_as_they_are_given(size, want):
-    assert memory.in_words(size) == want
+def test_sizes_are_said_as_they_are_given():
+    assert (memory.in_words(999), memory.in_words(10**13)) == ("0 MB", "10,000.00 GB")
 
 
 @pytest.fixture
 def elsewhere(monkeypatch):
     """Return how to be on a system without /proc, where psutil tells these figures."""
 
-    def go(platform, **figures):
+    def go(platform, peak, **figures):
         process = SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=3_000_000, **figures))
-        system = SimpleNamespace(available=7_000_000)
-        module = SimpleNamespace(
-            Process=lambda: process, virtual_memory=lambda: system, Error=ProcessLookupError
+        told = SimpleNamespace(
+            Process=lambda: process,
+            virtual_memory=lambda: SimpleNamespace(available=7_000_000),
+            Error=ProcessLookupError,
         )
-        monkeypatch.setitem(sys.modules, "psutil", module)
+        usage = SimpleNamespace(
+            RUSAGE_SELF=0, getrusage=lambda who: SimpleNamespace(ru_maxrss=peak)
+        )
+        monkeypatch.setitem(sys.modules, "psutil", told)
+        monkeypatch.setitem(sys.modules, "resource", usage if peak else None)
         monkeypatch.setattr(sys, "platform", platform)
         for name in ("SYSTEM", "PROCESS"):
             monkeypatch.setattr(memory, name, Path("/no/proc"))
@@ -86,27 +91,19 @@ def elsewhere(monkeypatch):
     return go
 
 
-def test_on_windows_psutil_tells(elsewhere, monkeypatch):
-    elsewhere("win32", peak_wset=5_000_000)
-    monkeypatch.setitem(sys.modules, "resource", None)  # Windows has none
+@pytest.mark.parametrize(
+    "platform, peak, figures, want",
+    [
+        ("win32", None, {"peak_wset": 5_000_000}, 5_000_000),  # Windows has no getrusage
+        ("darwin", 6_000_000, {}, 6_000_000),
+        ("freebsd14", 6_000, {}, 6_144_000),  # in kB there
+    ],
+)
+def test_without_proc_psutil_tells_or_nobody(elsewhere, monkeypatch, platform, peak, figures, want):
+    elsewhere(platform, peak, **figures)
     assert memory.free_memory() == 7_000_000
-    assert memory.held_memory() == 3_000_000 and memory.held_memory(peak=True) == 5_000_000
+    assert memory.held_memory() == 3_000_000 and memory.held_memory(peak=True) == want
     assert memory.memory_bound() == 3_000_000 + 4_200_000
-
-
-def test_on_macos_psutil_tells_and_getrusage_the_peak_in_bytes(elsewhere, monkeypatch):
-    elsewhere("darwin")
-    usage = SimpleNamespace(ru_maxrss=6_000_000)
-    resource = SimpleNamespace(RUSAGE_SELF=0, getrusage=lambda who: usage)
-    monkeypatch.setitem(sys.modules, "resource", resource)
-    assert memory.free_memory() == 7_000_000
-    assert memory.held_memory() == 3_000_000 and memory.held_memory(peak=True) == 6_000_000
-    monkeypatch.setattr(sys, "platform", "freebsd14")
-    assert memory.held_memory(peak=True) == 6_000_000 * 1024
-
-
-def test_where_nothing_tells_nothing_is_known(elsewhere, monkeypatch):
-    elsewhere("win32")
     for module in ("psutil", "resource"):
         monkeypatch.setitem(sys.modules, module, None)
     assert memory.free_memory() is memory.held_memory() is memory.held_memory(peak=True) is None
@@ -123,20 +120,9 @@ def test_psutil_agrees_with_proc(monkeypatch):
     assert memory.free_memory() >= 0.5 * free  # a container's limit is known to /proc alone
 
 
-def test_where_proc_is_psutil_is_not_imported():
-    script = "import sys; from super_sdf.machine import memory as m; m.free_memory();"
-    script += "m.held_memory(peak=True); m.forget_peak(); assert 'psutil' not in sys.modules"
-    subprocess.run([sys.executable, "-c", script], check=True)
-
-
 def noise(*shape):
     """Return values of both signs at random: the surface is beside nearly every sample."""
     return np.random.default_rng(0).integers(-100, 101, shape).astype(np.int8)
-
-
-def rough(*shape):
-    """Return normal noise."""
-    return np.random.default_rng(0).normal(size=shape)
 
 
 @contextmanager
@@ -175,16 +161,18 @@ def test_the_samples_that_are_taken_do_not_depend_on_the_parts(most):
 def test_few_samples_show_what_all_show(monkeypatch):
     i, j, k = np.indices((40, 40, 40)) * (np.pi / 16)
     values = np.sin(i) * np.cos(j) + np.sin(j) * np.cos(k) + np.sin(k) * np.cos(i)
-    everything = weigh(Census(values).looked, (np.pi / 16,) * 3)
-    length = Census(values).beside.typical_length
+
+    def shown():
+        return weigh(Census(values).looked, (np.pi / 16,) * 3), Census(values).beside
+
+    everything, whole = shown()
     monkeypatch.setattr(census, "MOST_LOOKED_AT", 500)
     monkeypatch.setattr(census, "MOST_BESIDE", 2000)
-    few = weigh(Census(values).looked, (np.pi / 16,) * 3)
-    assert few.samples == 500 < everything.samples
+    few, beside = shown()
+    assert few.samples == 500 < everything.samples and len(beside.bend) == 2000
     assert few.slope == pytest.approx(everything.slope, rel=0.03)
     assert few.wrong == pytest.approx(everything.wrong, abs=0.06)
-    beside = Census(values).beside
-    assert len(beside.bend) == 2000 and beside.typical_length == pytest.approx(length, rel=0.05)
+    assert beside.typical_length == pytest.approx(whole.typical_length, rel=0.05)
 
 
 def test_the_survey_holds_nothing_twice(monkeypatch):
@@ -197,13 +185,18 @@ def test_the_survey_holds_nothing_twice(monkeypatch):
     assert len(band.voxel_ijk) == 48 * 64 * 64 and peak[0] < 1.3 * kept
 
 
-@pytest.mark.parametrize(
-    "values, offset", [(ball(24).values, 0.7), (3 * rough(20, 12, 15), 0.0)], ids=["ball", "noise"]
-)
-def test_the_band_is_the_same_in_whatever_blocks_and_windows_it_is_found(
-    values, offset, monkeypatch
-):
-    grid = SdfGrid.trusted(values, (1.0,) * 3)
+@pytest.mark.parametrize("kind, offset", [("ball", 0.7), ("noise", 0.0)])
+def test_the_band_is_the_same_in_whatever_blocks_and_windows_it_is_found(kind, offset, monkeypatch):
+    rough = 3 * np.random.default_rng(0).normal(size=(20, 12, 15))
+    grid = SdfGrid.trusted(ball(24).values if kind == "ball" else rough, (1.0,) * 3)
+
+    def near_offset(seen):
+        """Return the samples near an offset, and those of them at which the field jumps."""
+        return [
+            (sum(jump.near for jump in way), sum(jump.edges for jump in way))
+            for way in zip(*seen.jumps)
+        ]
+
     want, seen = survey(grid, offset), look_at_band(grid, offset)
     for window, block in ((3000, 2000), (1, 1)):
         monkeypatch.setattr(survey_step, "WINDOW_SAMPLES", window)
@@ -221,18 +214,9 @@ def test_the_band_is_the_same_in_whatever_blocks_and_windows_it_is_found(
     assert seen.beyond == len(want.beyond.number)
 
 
-def near_offset(seen):
-    """Return the samples near an offset, and those of them at which the field jumps."""
-    return [
-        (sum(jump.near for jump in way), sum(jump.edges for jump in way))
-        for way in zip(*seen.jumps)
-    ]
-
-
 def test_samples_that_were_cut_off_are_not_kept():
     """Most of a grid that was truncated at three voxels is so."""
-    cut = np.clip(ball().values, -3, 3)
-    band = survey(SdfGrid.trusted(cut, (1.0,) * 3))
+    band = survey(SdfGrid.trusted(np.clip(ball().values, -3, 3), (1.0,) * 3))
     assert len(band.beyond.number) and np.abs(band.beyond.value).max() < 6
 
 

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import warnings
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from onnx_files import DOUBLE, FLOAT, metadata, write_network
 
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
+from super_sdf.neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
 from super_sdf.network.decoder import check_output, to_blocks
 from super_sdf.network.network import KIND_MODELS, Network, shipped_models
 from super_sdf.network.onnx import CORE_CHUNK, CPU_CHUNK, cpu_chunk
@@ -50,15 +50,23 @@ def test_shipped_networks_are_small_and_fulfil_the_contract():
         assert card["trained_on"] and card["trained_from_commit"] and card["accuracy"]
 
 
-@pytest.mark.parametrize("factor", [4, 8])
-def test_a_prediction_depends_neither_on_threads_nor_on_the_other_voxels_decoded(factor):
+@pytest.mark.parametrize("name, precision, factor", [("fast", "float32", 8), ("base", "int8", 4)])
+def test_a_prediction_depends_neither_on_threads_nor_on_other_voxels(name, precision, factor):
     """Bit for bit, so that a mesh does not depend on its slabs or on the number of threads."""
-    patches, table, rows = network_inputs(ball())
-    offsets = block_offsets(factor)
-    one, two = (load_network("fast", threads=threads, precision="float32") for threads in (1, 2))
-    values = one(patches, table, rows, offsets)
-    for some in (rows[40:], rows[7:8]):
-        np.testing.assert_array_equal(two(patches, table, some, offsets), values[some])
+    grid = ball(30, 11.0)
+    patches, table, rows = network_inputs(grid)
+    voxels, offsets = find_band(rescale(grid)), block_offsets(factor)
+    one, two = (load_network(name, threads=n, precision=precision) for n in (1, 2))
+    whole = one(patches, table, rows, offsets)
+    for some in (rows, rows[40:], rows[7:8]):
+        np.testing.assert_array_equal(two(patches, table, some, offsets), whole[some])
+    reach = one.card["receptive_field"]
+    for first, last in ((8, 10), (10, 21)):  # as slabs: those beyond the reach are not there
+        wanted = (voxels[:, 0] >= first) & (voxels[:, 0] < last)
+        near = (voxels[:, 0] >= first - reach) & (voxels[:, 0] < last + reach)
+        some = np.flatnonzero(wanted[near]).astype(np.int32)
+        part = one(patches[near], neighbour_table(voxels[near], grid.shape), some, offsets)
+        np.testing.assert_array_equal(part, whole[wanted])
 
 
 def test_shipped_networks_run_in_int8_on_the_cpu_and_other_files_as_they_are(tmp_path):
@@ -74,36 +82,27 @@ def test_shipped_networks_run_in_int8_on_the_cpu_and_other_files_as_they_are(tmp
     assert load_network(own, precision="int8").precision == "int8"
 
 
-def test_int8_gives_the_same_bits_for_any_part_and_any_threads():
-    """The other voxels in a call make no difference, so slabs make none either."""
-    grid = ball(36, 13.0)
-    field = rescale(grid)
-    voxels = find_band(field)
-    rows = np.arange(len(voxels), dtype=np.int32)
-    patches, table = gather_patches(field, voxels), neighbour_table(voxels, grid.shape)
-    network = load_network(precision="int8", threads=1)
-    whole = network(patches, table, rows, block_offsets(4))
-    pair = load_network(precision="int8", threads=2)
-    np.testing.assert_array_equal(pair(patches, table, rows, block_offsets(4)), whole)
-    for first, last in ((10, 12), (12, 25)):
-        wanted = (voxels[:, 0] >= first) & (voxels[:, 0] < last)
-        reach = network.card["receptive_field"]
-        near = (voxels[:, 0] >= first - reach) & (voxels[:, 0] < last + reach)
-        some_table = neighbour_table(voxels[near], grid.shape)
-        some = np.flatnonzero(wanted[near]).astype(np.int32)
-        part = network(patches[near], some_table, some, block_offsets(4))
-        np.testing.assert_array_equal(part, whole[wanted])
+REFUSED = [
+    (OptionError, r"none\.onnx has no int8 variant, .*none-int8\.onnx: write",
+     {"model": "none.onnx", "precision": "int8"}),
+    (OptionError, "precision is 'int4': give one of auto, float32, int8", {"precision": "int4"}),
+    (DeviceError, "int8 is for the CPU: use --precision float32",
+     {"precision": "int8", "device": "cuda"}),
+    (FileError, "no model 'other': give an ONNX file or one of: fast, base, best",
+     {"model": "other"}),
+    (ModelError, r"bad\.onnx is no ONNX file that onnxruntime can run", {"model": "bad.onnx"}),
+    (DeviceError, "device is 'tpu': give one of auto, cpu, cuda", {"device": "tpu"}),
+]  # fmt: skip
 
 
-def test_int8_without_an_int8_file_is_an_error(tmp_path):
-    with pytest.raises(
-        OptionError, match=r"none\.onnx has no int8 variant, .*none-int8\.onnx: write"
-    ):
-        load_network(tmp_path / "none.onnx", precision="int8")
-    with pytest.raises(OptionError, match="precision is 'int4': give one of auto, float32, int8"):
-        load_network(precision="int4")
-    with pytest.raises(DeviceError, match="int8 is for the CPU: use --precision float32"):
-        load_network(precision="int8", device="cuda")
+@pytest.mark.parametrize("error, message, asked", REFUSED)
+def test_names_files_and_devices_that_do_not_exist_are_refused(
+    tmp_path, monkeypatch, error, message, asked
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.onnx").write_bytes(b"not a graph")
+    with pytest.raises(error, match=message):
+        load_network(**asked)
 
 
 def test_a_failing_run_is_a_device_error():
@@ -112,28 +111,11 @@ def test_a_failing_run_is_a_device_error():
         load_network()(patches, table, rows + 10**6, block_offsets(2))
 
 
-def test_names_files_and_devices_that_do_not_exist_are_refused(tmp_path):
-    with pytest.raises(
-        FileError, match="no model 'other': give an ONNX file or one of: fast, base, best"
-    ):
-        load_network("other")
-    (tmp_path / "bad.onnx").write_bytes(b"not a graph")
-    with pytest.raises(ModelError, match=r"bad\.onnx is no ONNX file that onnxruntime can run"):
-        load_network(tmp_path / "bad.onnx")
-    with pytest.raises(DeviceError, match="device is 'tpu': give one of auto, cpu, cuda"):
-        load_network(device="tpu")
-
-
-@pytest.fixture
-def no_warnings():
-    """Turn warnings into errors."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        yield
-
-
-def test_any_file_that_fulfils_the_contract_runs(tmp_path):
-    assert len(reconstruct(ball(), load_network(write_network(tmp_path / "own.onnx"))).faces)
+def test_any_file_that_fulfils_the_contract_runs_also_without_a_receptive_field(tmp_path):
+    card = {"format_version": "1", "note": "not JSON"}
+    network = load_network(write_network(tmp_path / "own.onnx", card=card), device="cpu")
+    assert network.receptive_field is None and network.card["note"] == "not JSON"
+    assert len(reconstruct(ball(), network).faces)
 
 
 # The last operators of a network, the declaration of its output, and the error.
@@ -167,11 +149,10 @@ NAN = [
 ]
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("last", [INFINITE, NAN], ids=["infinite", "NaN"])
 @pytest.mark.parametrize("symmetries", [1, 2])
-def test_values_that_are_not_finite_are_refused_with_their_count(
-    tmp_path, no_warnings, last, symmetries
-):
+def test_values_that_are_not_finite_are_refused_with_their_count(tmp_path, last, symmetries):
     loaded = load_network(write_network(tmp_path / "own.onnx", last), device="cpu")
     network = Network(loaded.session, loaded.card, "cpu", symmetries)
     for work in (upsample, reconstruct):
@@ -185,8 +166,9 @@ def test_values_that_are_not_finite_are_refused_with_their_count(
         )
 
 
+@pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", [np.nan, -np.inf, 1e16])
-def test_one_bad_value_among_many_is_found(no_warnings, value):
+def test_one_bad_value_among_many_is_found(value):
     values = np.zeros((5000, 125), np.float32)
     assert not to_blocks(values).any()
     values[4800, 7] = value
@@ -242,12 +224,6 @@ def test_invalid_metadata_is_an_error_of_one_line(tmp_path, name):
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 400 + len(str(path))
 
 
-def test_a_card_need_not_have_the_receptive_field(tmp_path):
-    card = {"format_version": "1", "note": "not JSON"}
-    network = load_network(write_network(tmp_path / "own.onnx", card=card), device="cpu")
-    assert network.receptive_field is None and network.card["note"] == "not JSON"
-
-
 def test_a_wider_network_takes_more_memory(tmp_path):
     shipped, path = shipped_models()["fast"], tmp_path / "wide.onnx"
     path.write_bytes(shipped.read_bytes() + metadata({"channels": "128"}))
@@ -256,32 +232,79 @@ def test_a_wider_network_takes_more_memory(tmp_path):
     assert wide.averaged(4).memory_bytes == (1744, 12)
 
 
-@pytest.mark.parametrize(
-    "kind", ["folder", "FIFO", "empty", "half", "text", "absent", "long", "NUL"]
-)
-def test_a_path_that_is_no_model_file_is_an_error_of_one_line(tmp_path, command, kind):
-    path = tmp_path / "own.onnx"
-    if kind == "folder":
-        path.mkdir()
-    elif kind == "FIFO":
-        os.mkfifo(path)
-    elif kind in ("empty", "half", "text"):
-        whole = shipped_models()["fast"].read_bytes()
-        path.write_bytes({"empty": b"", "half": whole[: len(whole) // 2], "text": b"me\n"}[kind])
-    elif kind in ("long", "NUL"):
-        path = {"long": "n" * 300 + ".onnx", "NUL": "a\0b.onnx"}[kind]
-    np.save(tmp_path / "in.npy", ball().values)
-    words = tmp_path / "in.npy", tmp_path / "out.ply", "--model", path, "--spacing", "1"
-    code, out, err = command("upsample", *words, "--device", "cpu")
+WHOLE = shipped_models()["fast"].read_bytes()
+CONTENTS = {"empty": b"", "half": WHOLE[: len(WHOLE) // 2], "text": b"me\n"}
+
+
+@pytest.mark.parametrize("kind", ["folder", "FIFO", *CONTENTS, "absent", "n" * 300, "a\0b"])
+def test_a_path_that_is_no_model_file_is_an_error_of_one_line(tmp_path, monkeypatch, command, kind):
+    monkeypatch.chdir(tmp_path)
+    os.mkdir("folder.onnx")
+    os.mkfifo("FIFO.onnx")
+    for name, content in CONTENTS.items():
+        (tmp_path / f"{name}.onnx").write_bytes(content)
+    np.save("in.npy", ball().values)
+    words = "in.npy", "out.ply", "--model", f"{kind}.onnx", "--spacing", "1", "--device", "cpu"
+    code, out, err = command("upsample", *words)
     assert (code, out, err.count("\n")) == (1, "", 1) and err.startswith("Error: ")
-    assert "own.onnx" in err or kind in ("long", "NUL")
-    assert not (tmp_path / "out.ply").exists()
+    assert f"{kind}.onnx" in err or kind == "a\0b"
+    assert not os.path.exists("out.ply")
 
 
-@pytest.mark.parametrize("voxels", [1, 511, 512, 1023, 1024, 50_000])
 @pytest.mark.parametrize("threads", [1, 2, 64])
-def test_chunks_on_the_cpu_are_equal_and_leave_a_row_free(voxels, threads):
-    rows = cpu_chunk(voxels, threads)
-    chunks = -(-(voxels + 1) // rows)
-    assert rows <= min(CORE_CHUNK * threads, CPU_CHUNK)
-    assert chunks * rows - (voxels + 1) < chunks  # less than a row of each is padding
+def test_chunks_on_the_cpu_are_equal_and_leave_a_row_free(threads):
+    for voxels in (1, 511, 512, 1023, 1024, 50_000):
+        rows = cpu_chunk(voxels, threads)
+        chunks = -(-(voxels + 1) // rows)
+        assert rows <= min(CORE_CHUNK * threads, CPU_CHUNK)
+        assert chunks * rows - (voxels + 1) < chunks  # less than a row of each is padding
+
+
+def test_the_symmetries_are_a_group_of_48_with_half_turns_first_then_reflections():
+    group = cube_symmetries()
+    assert len({symmetry.tobytes() for symmetry in group}) == 48
+    np.testing.assert_array_equal(group[0], np.eye(3))
+    for symmetry in group:
+        np.testing.assert_array_equal(symmetry @ symmetry.T, np.eye(3))
+        assert {(symmetry @ other).tobytes() for other in group} == {g.tobytes() for g in group}
+    assert (np.abs(group[:8]) == np.eye(3)).all()
+    assert np.linalg.det(group[:4]).tolist() == [1, 1, 1, 1]
+
+
+def test_a_turned_plane_is_a_plane():
+    normal = np.array([0.5, -0.3, 0.8])
+    patches = (NEIGHBOURHOOD @ normal).astype(np.float32)[None]
+    table = np.arange(27, dtype=np.int32)[None]
+    for symmetry in cube_symmetries():
+        turned, places, offsets = turn(symmetry, patches, table, block_offsets(2))
+        np.testing.assert_allclose(turned[0], NEIGHBOURHOOD @ symmetry @ normal, atol=1e-6)
+        np.testing.assert_array_equal(turned[0], patches[0, places[0]])
+        np.testing.assert_allclose(offsets @ symmetry, block_offsets(2), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("symmetries", "flipped"),
+    [(4, (0, 1)), (4, (1, 2)), (8, (0, 1, 2))],
+    ids=["half turn about z", "about x", "inverted"],
+)
+def test_a_mean_maps_a_turned_field_to_the_turned_surface(symmetries, flipped):
+    """The plain network does so only approximately; otherwise the mean would have no effect."""
+    field, nodes = rescale(ball(16, 5.0)), tuple(axis + 3 for axis in flipped)
+    plain, apart = load_network("fast"), {}
+
+    def dense_values(network, field):
+        """Return the values at the nodes of every voxel of the band, NaN elsewhere."""
+        voxels = find_band(field)
+        rows = np.arange(len(voxels), dtype=np.int32)
+        table = neighbour_table(voxels, field.shape)
+        values = network(gather_patches(field, voxels), table, rows, block_offsets(2))
+        dense = np.full((*field.shape, 3, 3, 3), np.nan, np.float32)
+        dense[tuple(voxels.T)] = values.reshape(-1, 3, 3, 3)
+        return dense
+
+    for network in (plain, plain.averaged(symmetries)):
+        turned = dense_values(network, np.ascontiguousarray(np.flip(field, flipped)))
+        off = np.abs(np.flip(turned, flipped + nodes) - dense_values(network, field))
+        apart[network.symmetries] = np.nanmax(off)
+    assert apart[symmetries] < 1e-5 < 1e-3 < apart[1]
+    assert load_network("best").symmetries == 4

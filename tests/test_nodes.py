@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from super_sdf.errors import OptionError
-from super_sdf.options import check_factor
 from super_sdf.steps.band import neighbour_table
 from super_sdf.steps.field import FineField
 from super_sdf.steps.nodes import (
@@ -32,59 +30,28 @@ def test_offsets_are_equation_5_on_the_lattice(factor):
     np.testing.assert_array_equal(steps, np.round(steps))
 
 
-@pytest.mark.parametrize("factor", [-2, 0, 3, 18])
-def test_odd_and_absurd_factors_are_refused(factor):
-    message = (
-        f"factor is {factor}: give an even number from 2 to 16 "
-        r"\(an odd one has no node on the samples\)"
-    )
-    with pytest.raises(OptionError, match=message):
-        check_factor(factor)
-
-
-def field_of(voxels, table, factor, blocks=None):
-    """Return a field of these voxels, which numbers their nodes."""
-    blocks = np.empty(((factor + 1) ** 3, len(voxels)), np.float32) if blocks is None else blocks
-    return FineField((6, 5, 7), factor, voxels, blocks, share_parts(table), (0, 6))
-
-
-@pytest.mark.parametrize(("seed", "factor"), [(0, 2), (1, 4)])
-def test_nodes_have_one_number_for_each_position(seed, factor):
-    voxels, table = some_voxels(seed)
-    field = field_of(voxels, table, factor)
-    position = (voxels[:, None] * factor + block_ijk(factor)).reshape(-1, 3)
-    different, inverse = np.unique(position, axis=0, return_inverse=True)
-    assert field.parts.count_nodes(factor) == len(different)
-    pairs = np.unique(np.stack([inverse.ravel(), field.numbers.ravel()]), axis=1)
-    assert pairs.shape[1] == len(different)
-
-
 @pytest.mark.parametrize(("factor", "threads"), [(2, 3), (4, 1)])
-def test_shared_nodes_are_plain_means_in_every_block(monkeypatch, factor, threads):
+def test_nodes_have_a_number_for_each_position_and_are_plain_means_of_all_blocks(
+    monkeypatch, factor, threads
+):
     monkeypatch.setattr("super_sdf.machine.resources.MIN_PER_THREAD", 1)
     voxels, table = some_voxels(7)
     blocks = np.random.default_rng(0).normal(size=((factor + 1) ** 3, len(voxels) + 1))
     blocks = blocks.astype(np.float32)
     blocks[:, -1] = 0
-    field = field_of(voxels, table, factor, blocks[:, :-1])
+    parts = share_parts(table)
+    field = FineField((6, 5, 7), factor, voxels, blocks[:, :-1], parts, (0, 6))
     numbers = field.numbers.ravel()
+    position = (voxels[:, None] * factor + block_ijk(factor)).reshape(-1, 3)
+    different, inverse = np.unique(position, axis=0, return_inverse=True)
+    pairs = np.unique(np.stack([inverse.ravel(), numbers]), axis=1)
+    assert parts.count_nodes(factor) == len(different) == pairs.shape[1]
     total = np.bincount(numbers, blocks[:, :-1].T.ravel())
-    average_shared(blocks, field.parts, factor, threads)
+    average_shared(blocks, parts, factor, threads)
     want = (total / np.bincount(numbers)).astype(np.float32)
     np.testing.assert_array_equal(blocks[:, :-1].T, want[field.numbers])
     np.testing.assert_array_equal(field.values, want)
     assert not blocks[:, -1].any()
-
-
-def test_pinned_nodes_take_the_sign_of_the_skipped_voxel():
-    parts = share_parts(np.where(np.arange(27) == 13, 0, -1)[None].astype(np.int32))
-    blocks = np.ones((27, 1), np.float32)
-    patches = np.ones((1, 27), np.float32)
-    patches[0, 22] = -1  # the neighbour at +x is inside, that at -x outside; no others in the grid
-    ijk, voxels = np.array([[1, 0, 0]], np.int32), np.zeros(1, np.int32)
-    skipped = signs_of_skipped(parts, ijk, patches, voxels, (3, 1, 1))
-    assert pin_to_skipped(blocks, parts, 2, skipped).tolist() == [9]
-    np.testing.assert_array_equal(blocks[:, 0] < 0, block_ijk(2)[:, 0] == 2)
 
 
 def test_a_pinned_node_of_two_voxels_is_pinned_in_both_and_counted_once():

@@ -10,15 +10,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from super_sdf.errors import FileError, GridError, SuperSdfError, WriteError
+from super_sdf.errors import GridError, SuperSdfError, WriteError
 from super_sdf.files import output
-from super_sdf.files.output import (
-    check_apart,
-    check_free,
-    part_path,
-    remove_abandoned_parts,
-    replacing,
-)
+from super_sdf.files.output import check_apart, check_free, remove_abandoned_parts, replacing
 
 
 @pytest.fixture(autouse=True)
@@ -72,12 +66,14 @@ def test_by_force_a_link_stays_one_and_what_it_leads_to_is_written(there):
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o664, 0o755])
-def test_a_file_that_is_replaced_keeps_its_mode(mode):
-    Path("out.ply").write_text("old")
-    os.chmod("out.ply", mode)
-    make("out.ply", force=True)
-    assert Path("out.ply").read_text() == "mine"
-    assert stat.S_IMODE(os.stat("out.ply").st_mode) == mode
+@pytest.mark.parametrize("name", ["out.ply", "x" * 251 + ".ply", "ä" * 125 + ".ply"])
+def test_a_file_that_is_replaced_keeps_its_mode_also_of_the_longest_names(name, mode):
+    make(name)
+    os.chmod(name, mode)
+    Path(name).write_text("old")
+    make(name, force=True)
+    assert Path(name).read_text() == "mine" and os.listdir() == [name]
+    assert stat.S_IMODE(os.stat(name).st_mode) == mode
 
 
 def test_a_file_that_is_write_protected_is_kept():
@@ -117,15 +113,9 @@ def test_places_where_no_file_can_be_are_named():
     assert refusal("a\0b").endswith(" cannot be written: embedded null byte")
 
 
-@pytest.mark.parametrize("name", ["x" * 251 + ".ply", "ä" * 125 + ".ply"])
-def test_the_longest_names_are_written(name):
-    make(name)
-    assert os.listdir() == [name]
-
-
 def leave_part(target, pid):
     """Make what a killed process leaves, and a spool; return their names."""
-    part = part_path(Path(target))
+    part = output.part_path(Path(target))
     names = [part.name.replace(f".{os.getpid()}.", f".{pid}.")]
     names.append(f"{names[0]}.abc_1234")
     for name in names:
@@ -159,23 +149,22 @@ def test_what_is_being_written_is_not_touched():
         with pytest.raises(WriteError, match=r"^out.ply is being written already: wait for it$"):
             make("out.ply", force=True)
     assert os.listdir() == ["out.ply"]
-
-
-def test_parts_of_a_process_that_is_known_to_have_ended_go():
     left = leave_part("out.ply", 1)
-    remove_abandoned_parts([Path("out.ply")], pid=1)
+    remove_abandoned_parts([Path("out.ply")], pid=1)  # which is known to have ended
     assert not set(left) & set(os.listdir())
 
 
-def test_errors_keep_their_words():
-    full = OSError(errno.ENOSPC, "No space left on device")
-    errors = {
-        "no surface": GridError("no surface"),
-        "in.npy is damaged": FileError("in.npy is damaged"),
-        "out.ply cannot be written: No space left on device": full,
-    }
-    for want, error in errors.items():
-        with pytest.raises(SuperSdfError) as caught, replacing(Path("out.ply")):
-            raise error
-        assert str(caught.value) == want
-    assert os.listdir() == []
+@pytest.mark.parametrize(
+    "want, error",
+    [
+        ("no surface", GridError("no surface")),
+        (
+            "out.ply cannot be written: No space left on device",
+            OSError(errno.ENOSPC, "No space left on device"),
+        ),
+    ],
+)
+def test_errors_keep_their_words(want, error):
+    with pytest.raises(SuperSdfError) as caught, replacing(Path("out.ply")):
+        raise error
+    assert str(caught.value) == want and os.listdir() == []

@@ -9,9 +9,10 @@ from io import BytesIO
 import numpy as np
 import pytest
 import trimesh
-from conftest import ball, trilinear
+from conftest import ball
 from pages import blocks, wedge
 from PIL import Image
+from skimage.measure import marching_cubes
 
 from super_sdf import Mesh, SdfGrid, reconstruct
 from super_sdf.certificate.check import FULL, check_mesh
@@ -23,7 +24,6 @@ from super_sdf.pages.items import (
     Item,
     certificate_facts,
     entry_of,
-    entry_of_report,
     item_of,
     read_head,
     read_meshes,
@@ -73,6 +73,8 @@ def test_a_packed_mesh_comes_out_within_half_a_step():
 def test_residuals_are_full_at_a_tenth_of_a_voxel_and_unknown_ones_are_told_apart():
     values = np.array([0, FULL, -FULL, 5, -5, FULL / 2, np.nan], np.float32)
     assert residual_bytes(values).tolist() == [0, 127, -127, 127, -127, 64, -128]
+    assert certificate_facts({"error": "no room"}) == [["not checked", "no room"]]
+    assert certificate_facts({}) == []
 
 
 def test_a_large_mesh_is_simplified_and_its_caption_has_both_counts(monkeypatch):
@@ -87,16 +89,13 @@ def test_a_large_mesh_is_simplified_and_its_caption_has_both_counts(monkeypatch)
     assert not item.meshes and item.thumbnail and "not shown: simplifying" in item.remarks[0]
 
 
-MIRRORED = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-
-
 def coarse(grid, offset=0.0):
     """Return coarse marching cubes of a grid."""
     lattice = cubic_grid(grid, offset)
     return coarse_surface(survey(lattice, offset), lattice)
 
 
-@pytest.mark.parametrize("direction", [None, MIRRORED])
+@pytest.mark.parametrize("direction", [None, ((-1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))])
 def test_coarse_marching_cubes_lie_on_the_surface_and_face_outward(direction):
     values = ball(20, 6.0).values
     grid = SdfGrid.trusted(values * 2, (2, 2, 2), (5, -7, 1), direction=direction)
@@ -111,10 +110,7 @@ def test_coarse_marching_cubes_lie_on_the_surface_and_face_outward(direction):
 
 def test_coarse_marching_cubes_are_those_of_a_library():
     """Of any field whose cells have one case: as many triangles, vertices at the same places."""
-    from skimage.measure import marching_cubes
-
-    grid = SdfGrid(wedge(), 1.0)
-    mesh = coarse(grid)
+    mesh = coarse(SdfGrid(wedge(), 1.0))
     vertices, faces, _, _ = marching_cubes(wedge(), 0.0, method="lorensen")
     assert mesh.is_closed() and len(mesh.faces) == len(faces)
     assert np.abs(np.sort(mesh.vertices, 0) - np.sort(vertices, 0)).max() < 2e-3
@@ -136,7 +132,7 @@ def test_an_item_has_the_residuals_of_both_meshes_and_the_certificate():
     assert caption.startswith("marching cubes of the samples, made equally spaced: ")
 
 
-def test_the_file_of_an_item_is_read_back(tmp_path):
+def test_the_file_of_an_item_is_read_back_and_what_is_none_is_none(tmp_path):
     path, item = tmp_path / "0123456789abcdef.js", Item(remarks=["a\u2028b"], made_of="digest")
     item.show(NASTY, icosphere(1))
     write_item(item, path)
@@ -147,12 +143,9 @@ def test_the_file_of_an_item_is_read_back(tmp_path):
     comment, call, rest = path.read_text("ascii").split("\n")
     assert comment.startswith("// {") and rest == ""
     assert call.startswith('superSdfMeshes("0123456789abcdef", [{"caption": "')
-
-
-@pytest.mark.parametrize("text", ["", "// ", "// []", '// {"other": 1}', "\0\xff"])
-def test_a_file_that_is_no_item_is_none(tmp_path, text):
-    (tmp_path / "a.js").write_text(text, "latin-1")
-    assert read_head(tmp_path / "a.js") is None
+    for text in ("", "// ", "// []", '// {"other": 1}', "\0\xff"):
+        path.write_text(text, "latin-1")
+        assert read_head(path) is None
     assert read_head(tmp_path / "missing.js") is None
 
 
@@ -167,7 +160,7 @@ def test_a_thumbnail_is_a_small_picture_of_the_mesh_lit_from_the_right():
     assert thumbnail(Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))) is None
 
 
-def test_what_comes_from_files_cannot_be_markup_and_is_read_back():
+def test_what_comes_from_files_cannot_be_markup_and_is_read_back(tmp_path):
     said = facts(title=NASTY, files=[entry_of(NASTY, notes=[NASTY])])
     page = make_page(said, {"0": [{"caption": NASTY}]})
     assert "<img src=x" not in page and "\u2028" not in page
@@ -175,6 +168,10 @@ def test_what_comes_from_files_cannot_be_markup_and_is_read_back():
     found = blocks(page)
     assert found["facts"]["title"] == NASTY and found["facts"]["files"][0]["notes"] == [NASTY]
     assert found["meshes-0"] == [{"caption": NASTY}]
+    write_page(page, tmp_path / "a.html")
+    (tmp_path / "b.html").write_text("<!doctype html>")
+    known = [is_page(tmp_path / name) for name in ("a.html", "b.html", "missing.html")]
+    assert known == [True, False, False]
 
 
 @pytest.mark.parametrize("beside", [False, True])
@@ -193,33 +190,3 @@ def test_the_policy_allows_these_scripts_and_nothing_else(beside):
     assert rules["style-src"].split() == hashes("style")
     assert rules["default-src"] == "'none'" and rules["img-src"] == "data:"
     assert not re.search(r'(src|href)="(?!data:,)', page)
-
-
-def test_a_page_knows_itself(tmp_path):
-    write_page(make_page(facts()), tmp_path / "a.html")
-    (tmp_path / "b.html").write_text("<!doctype html>")
-    assert is_page(tmp_path / "a.html")
-    assert not is_page(tmp_path / "b.html") and not is_page(tmp_path / "missing.html")
-
-
-def test_the_entry_of_a_report_says_counts_times_notes_and_the_certificate():
-    grid = SdfGrid(wedge(), (1.0, 1.0, 1.0))
-    certificate = check_mesh(reconstruct(grid, trilinear, 2), grid).report()
-    report = {
-        **{"input": "a.npy", "output": "a.ply", "shape": [24, 24, 24], "triangles": 12345},
-        **{"closed": True, "bounds": [[0, 0, 0], [1, 2.5, 3]], "inferred": ["x"], "notes": ["y"]},
-        **{"warnings": ["z"], "check": certificate, "seconds": {"read": 0.5, "network": 1.25}},
-    }
-    entry = entry_of_report("a.ply", report, None)
-    assert entry["line"] == "12,345 triangles, closed, from 24 x 24 x 24 samples"
-    assert entry["notes"] == ["x", "y"] and entry["warnings"] == ["z"] and entry["seconds"] == 1.75
-    assert entry["stages"] == [["read", "0.50 s"], ["network", "1.25 s"]]
-    assert entry["residual"] == certificate["residual"]["mean"] and entry["faults"] == []
-    assert ["bounds", "(0, 0, 0) to (1, 2.5, 3)"] in entry["facts"]
-    assert ["surface", "closed, oriented, manifold"] in entry["certificate"]
-    assert entry["remarks"] == ["not drawn: run the command again for its picture and its meshes"]
-
-
-def test_a_certificate_that_could_not_be_made_says_why():
-    assert certificate_facts({"error": "no room"}) == [["not checked", "no room"]]
-    assert certificate_facts({}) == []

@@ -11,40 +11,34 @@ from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
 from super_sdf.errors import GridError
 from super_sdf.mesh import CLEARANCE
 from super_sdf.steps import survey
+from super_sdf.steps.band import find_band
 from super_sdf.steps.nodes import block_ijk
 
-FACTORS = [2, 4, 8]
 
-
-@pytest.fixture(scope="module")
-def network():
-    return load_network()
-
-
-def plane(shape=(9, 11, 10)):
-    normal = np.array([0.48, -0.6, 0.64])
-    ijk = np.indices(shape).reshape(3, -1).T
-    middle = np.array(shape) / 2 - 0.3
-    return SdfGrid.trusted(((ijk - middle) @ normal).reshape(shape), (1.0,) * 3), normal, middle
-
-
-@pytest.mark.parametrize("factor", FACTORS)
+@pytest.mark.parametrize("factor", [2, 8])
 def test_a_plane_is_exact(factor):
-    grid, normal, middle = plane()
-    mesh = reconstruct(grid, trilinear, factor)
+    shape, normal = (9, 11, 10), np.array([0.48, -0.6, 0.64])
+    middle = np.array(shape) / 2 - 0.3
+    values = (np.indices(shape).reshape(3, -1).T - middle) @ normal
+    mesh = reconstruct(SdfGrid.trusted(values.reshape(shape), (1.0,) * 3), trilinear, factor)
     assert np.abs((mesh.vertices - middle) @ normal).max() < 1.01 * CLEARANCE / factor
     corners = mesh.vertices[mesh.faces]
     facing = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) @ normal
     assert facing.min() > -1e-6  # outward: towards positive values
 
 
-@pytest.mark.parametrize("factor", FACTORS)
-def test_a_sphere_is_within_a_twentieth_of_a_voxel(network, factor):
-    grid = ball(24, 8.0)
-    mesh = reconstruct(grid, network, factor)
-    error = np.linalg.norm(mesh.vertices - (12 - 0.37), axis=1) - 8.0
+@pytest.mark.parametrize("factor, offset", [(2, 0), (4, 1.5), (8, 0)])
+def test_a_sphere_is_within_a_twentieth_of_a_voxel(network, factor, offset):
+    """An offset is a shift of the field."""
+    mesh = reconstruct(ball(20, 6.0), network, factor, offset=offset)
+    error = np.linalg.norm(mesh.vertices - (10 - 0.37), axis=1) - 6.0 - offset
     assert np.abs(error).max() < 0.05
     assert mesh.open_edges() == 0 and mesh.volume() > 0
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_network()
 
 
 def values_at_samples(field):
@@ -76,19 +70,15 @@ def test_noisy_samples_are_corrected(network):
 
 
 def test_unit_and_origin_only_scale_and_move_the_vertices(network):
-    grid = ball()
-    mesh = reconstruct(grid, network)
+    """Grids need not be cubes."""
+    grid = ball(shape=(17, 20, 26))
+    mesh = reconstruct(grid, network, 2)
+    middle = np.array(grid.shape) / 2 - 0.37
+    np.testing.assert_allclose((mesh.vertices.max(0) + mesh.vertices.min(0)) / 2, middle, atol=0.05)
     for unit, origin in ((2.0**-10, (0, 0, 0)), (1024.0, (0, 0, 0)), (1.0, (-3, 5, 7))):
-        other = reconstruct(SdfGrid(grid.values * unit, (unit,) * 3, origin), network)
+        other = reconstruct(SdfGrid(grid.values * unit, (unit,) * 3, origin), network, 2)
         np.testing.assert_array_equal(mesh.faces, other.faces)
         np.testing.assert_allclose((other.vertices - origin) / unit, mesh.vertices, atol=2e-5)
-
-
-def test_grids_need_not_be_cubes(network):
-    mesh = reconstruct(ball(shape=(17, 20, 26)), network)
-    assert mesh.open_edges() == 0
-    middle = np.array([17, 20, 26]) / 2 - 0.37
-    np.testing.assert_allclose((mesh.vertices.max(0) + mesh.vertices.min(0)) / 2, middle, atol=0.05)
 
 
 SYMMETRIES = [
@@ -137,13 +127,6 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     assert cKDTree(part.vertices).query(whole.vertices)[0].max() < 1e-5  # sums in another order
 
 
-def test_an_offset_is_a_shift_of_the_field(network):
-    grid = ball()
-    grown = reconstruct(grid, network, offset=1.5)
-    radius = np.linalg.norm(grown.vertices - (10 - 0.37), axis=1)
-    np.testing.assert_allclose(radius, 7.5, atol=0.05)
-
-
 def test_threads_give_the_same_mesh(network):
     from concurrent.futures import ThreadPoolExecutor
 
@@ -155,11 +138,10 @@ def test_threads_give_the_same_mesh(network):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_field_without_a_surface_is_refused():
-    for low in (0.5, 5.0):
-        grid = SdfGrid(np.linspace(low, 9, 27).reshape(3, 3, 3), (1.0,) * 3)
-        with pytest.raises(GridError, match=f"no surface at 0: the values go from {low:g} to 9"):
-            upsample(grid, lambda patches, *rest: np.ones((len(rest[1]), 125), np.float32))
+def test_both_voxels_of_a_jump_over_the_band_are_in_it():
+    values = np.full((6, 4, 4), 9.0, np.float32)
+    values[3:] = -9.0
+    assert set(find_band(values)[:, 0]) == {2, 3}
 
 
 def test_two_samples_an_axis_are_enough(network):
@@ -168,7 +150,13 @@ def test_two_samples_an_axis_are_enough(network):
     np.testing.assert_allclose(mesh.vertices[:, 0], 0.5, atol=0.05)
 
 
-def test_a_band_too_far_for_a_surface_is_refused(network):
-    values = 1.3 + 0.01 * np.indices((8, 8, 8))[0]  # in the band, but too far to hold a surface
-    with pytest.raises(GridError, match=r"no surface at 0: the values go from 1\.3 to 1\.37"):
-        reconstruct(SdfGrid(values, (1.0,) * 3), network, cap=True)
+@pytest.mark.parametrize("low, high", [(0.5, 9), (5, 9), (1.3, 1.37)])
+def test_a_field_without_a_surface_is_refused(low, high):
+    """Also where it is in the band, but too far to hold a surface."""
+    values = np.repeat(np.linspace(low, high, 8), 64).reshape(8, 8, 8)
+    with pytest.raises(GridError, match=f"no surface at 0: the values go from {low:g} to {high:g}"):
+        reconstruct(
+            SdfGrid(values, (1.0,) * 3),
+            lambda patches, table, voxels, offsets: np.ones((len(voxels), 125), np.float32),
+            cap=True,
+        )

@@ -98,6 +98,15 @@ def test_a_process_killed_before_it_is_ready_is_replaced(monkeypatch):
     assert work([2, 3], square, 1) == {2: 4, 3: 9} and victims[0].exitcode == -signal.SIGKILL
 
 
+def test_without_room_for_a_process_that_is_said(monkeypatch):
+    def refuse_files(self):
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(Pool, "_start_worker", refuse_files)
+    with pytest.raises(SuperSdfError, match="no process can be started: Too many open files: try"):
+        work([1], square)
+
+
 def test_processes_end_with_the_iteration():
     started = Pool(deque(range(50)), square)
     results = started.results(2)
@@ -108,20 +117,12 @@ def test_processes_end_with_the_iteration():
     assert not started.workers
 
 
-def test_without_room_for_a_process_that_is_said(monkeypatch):
-    def refuse_files(self):
-        raise OSError(24, "Too many open files")
-
-    monkeypatch.setattr(Pool, "_start_worker", refuse_files)
-    with pytest.raises(SuperSdfError, match="no process can be started: Too many open files: try"):
-        work([1], square)
-
-
 def test_an_end_has_a_name():
-    assert describe_exit(3) == "ended with exit code 3"
-    assert describe_exit(-signal.SIGTERM) == "was killed by SIGTERM"
-    assert describe_exit(-63) == "was killed by signal 63"
-    assert describe_exit(0xC0000005) == "crashed (0xc0000005)"  # Windows: access violation
+    names = {
+        **{3: "ended with exit code 3", -signal.SIGTERM: "was killed by SIGTERM"},
+        **{-63: "was killed by signal 63", 0xC0000005: "crashed (0xc0000005)"},  # of Windows
+    }
+    assert {code: describe_exit(code) for code in names} == names
 
 
 def test_on_windows_signals_are_not_blocked(monkeypatch):

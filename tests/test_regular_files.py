@@ -1,7 +1,6 @@
 """Only regular files are read: what stands in the way is said, and nothing is waited for."""
 
 import os
-import re
 import socket
 from pathlib import Path
 
@@ -42,54 +41,39 @@ WHAT_IS_WRONG = {
     "missing.npy": "does not exist",
     "file/in.npy": "does not exist: the path before its last / is not a folder",
     "n" * 300: "does not exist: the name is longer than the system allows",
+    "a\0.npy": "is not a valid file name",
+    "a\ud800.npy": "is not a valid file name",
 }
 
 
-@pytest.mark.parametrize("name", WHAT_IS_WRONG)
+@pytest.mark.parametrize("name", WHAT_IS_WRONG, ids=ascii)
 def test_what_is_no_regular_file_is_named(name):
     make_every_kind()
-    with pytest.raises(FileError, match=f"^{re.escape(name)} {re.escape(WHAT_IS_WRONG[name])}$"):
+    with pytest.raises(FileError) as caught:
         check_regular_file(name)
+    shown = name if name.isprintable() else repr(name)
+    assert str(caught.value) == f"{shown} {WHAT_IS_WRONG[name]}"
 
 
-@pytest.mark.parametrize("name", ["a\0.npy", "a\ud800.npy"])
-def test_a_name_that_no_file_can_have(name):
-    with pytest.raises(FileError, match="^" + re.escape(f"{name!r} is not a valid file name")):
-        check_regular_file(name)
-
-
-def test_a_file_that_may_not_be_read(monkeypatch):
-    Path("file").touch()
+def test_files_and_links_to_them_pass_unless_they_may_not_be_read(monkeypatch):
+    Path("file").write_bytes(b"x")
+    Path("link").symlink_to("file")
+    assert check_regular_file("link") == Path("link")
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may read everything
     with pytest.raises(FileError, match=r"^file cannot be read: permission denied$"):
         check_regular_file("file")
 
 
-def test_files_and_links_to_them_pass():
-    Path("file").write_bytes(b"x")
-    Path("link").symlink_to("file")
-    assert check_regular_file("link") == Path("link")
-
-
-def commands_that_read(name: str) -> list[tuple[str, ...]]:
-    """Return the commands that are given a file of this name, as mesh or as model."""
-    return [
-        ("sample", f"{name}.ply", "out.npz", "-n", "8"),
-        ("upsample", "in.npy", "out.ply", "--model", f"{name}.ply"),
-    ]
-
-
-@pytest.mark.parametrize("which", range(2))
-@pytest.mark.parametrize("name", ["pipe", "zero", "loop"])
-def test_every_command_reads_regular_files_alone(command, name, which):
-    os.mkfifo("pipe.ply")
-    Path("zero.ply").symlink_to("/dev/zero")
-    Path("loop.ply").symlink_to("loop.ply")
-    trimesh.creation.box().export("cube.ply")
+@pytest.mark.parametrize(
+    "words", ["sample {} out.npz -n 8", "upsample in.npy out.ply --model {}"], ids=["mesh", "model"]
+)
+@pytest.mark.parametrize("name", ["pipe.npy", "zero.npy", "loop.npy"])
+def test_every_command_reads_regular_files_alone(command, name, words):
+    make_every_kind()
+    Path("a.ply").symlink_to(name)
     np.save("in.npy", ball(12, 3.0).values)
-    wrong = WHAT_IS_WRONG[f"{name}.npy"]
-    code, _, err = command(*commands_that_read(name)[which])
-    assert (code, err) == (1, f"Error: {name}.ply {wrong}\n")
+    code, _, err = command(*words.format("a.ply").split())
+    assert (code, err) == (1, f"Error: a.ply {WHAT_IS_WRONG[name]}\n")
 
 
 def test_a_mesh_that_names_a_pipe_is_read_without_it():

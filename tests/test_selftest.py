@@ -15,6 +15,9 @@ from super_sdf.selftest import Finding, run_checks
 pytestmark = pytest.mark.usefixtures("cpu_build")
 
 
+NETWORKS = ("base", "fast", "mask", "noisy")
+
+
 def find(findings, what):
     """Return the finding on something."""
     return next(finding for finding in findings if finding.what == what)
@@ -44,17 +47,10 @@ def gpu(monkeypatch, only_fast):
 
 def test_everything_is_checked_on_the_cpu():
     findings = list(run_checks("cpu"))
+    networks = [f"{name}{kind}" for kind in ("", "-int8") for name in NETWORKS]
     assert [finding.what for finding in findings] == [
-        "versions",
-        "memory",
-        "network base on cpu",
-        "network fast on cpu",
-        "network mask on cpu",
-        "network noisy on cpu",
-        "network base-int8 on cpu",
-        "network fast-int8 on cpu",
-        "network mask-int8 on cpu",
-        "network noisy-int8 on cpu",
+        *("versions", "memory"),
+        *(f"network {name} on cpu" for name in networks),
         *(f"extra {name}" for name in EXTRAS),
     ]
     assert all(finding.state != "failed" for finding in findings)
@@ -94,15 +90,12 @@ def test_wrong_values_fail(monkeypatch, wrong, only_fast):
     assert find(run_checks("cpu"), "network fast on cpu").state == "failed"
 
 
-def test_both_kinds_of_onnxruntime_at_once_fail(monkeypatch):
+def test_both_kinds_of_onnxruntime_at_once_fail_and_a_missing_extra_is_named(monkeypatch):
     monkeypatch.setattr(selftest, "is_installed", lambda package: True)
     found = selftest.check_versions()
     assert found.state == "failed" and found.says.endswith(
         "; onnxruntime and onnxruntime-gpu are both installed: uninstall both, then install one"
     )
-
-
-def test_a_missing_extra_is_named_with_its_way_out(monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda module: None)
     assert selftest.check_extra("3mf", EXTRAS["3mf"]) == Finding(
         "missing", "extra 3mf", "no lxml, networkx: pip install -e '.[3mf]' in a clone of super-sdf"
@@ -123,6 +116,7 @@ def test_the_command_prints_a_line_a_check_and_its_exit_code_tells(command, only
 
 
 SHIPPED = network.shipped_models()
+MISSING = "super-sdf was installed without its networks: install it again"
 
 
 @pytest.fixture
@@ -133,28 +127,23 @@ def models(tmp_path, monkeypatch):
     return folder
 
 
-def test_a_package_without_networks_says_so(models, command, tmp_path):
-    said = "super-sdf was installed without its networks: install it again"
+def test_a_package_without_networks_or_that_for_masks_says_so(models, command, tmp_path):
     code, out, err = command("info")
-    assert (code, out.splitlines()[-1], err) == (1, f"models: {said}", "")
+    assert (code, out.splitlines()[-1], err) == (1, f"models: {MISSING}", "")
     code, out, err = command("info", "--json")
-    assert (code, json.loads(out)["fault"], json.loads(out)["models"], err) == (1, said, {}, "")
+    facts = json.loads(out)
+    assert (code, facts["fault"], facts["models"], err) == (1, MISSING, {}, "")
     code, out, err = command("info", "--check", "--device", "cpu")
-    assert (code, err) == (1, "") and f"failed   networks: {said}\n" in out
-    code, out, err = command("upsample", "in.npy", tmp_path / "out.ply")
-    assert (code, out, err) == (1, "", f"Error: the network 'base' is missing: {said}\n")
-
-
-def test_a_package_without_the_network_for_masks_says_so(models, tmp_path, command):
+    assert (code, err) == (1, "") and f"failed   networks: {MISSING}\n" in out
+    words = ("upsample", tmp_path / "in.npy", tmp_path / "out.ply")
+    assert command(*words) == (1, "", f"Error: the network 'base' is missing: {MISSING}\n")
     models.mkdir()
     (models / "fast.onnx").write_bytes(SHIPPED["fast"].read_bytes())
     network._load_once.cache_clear()
     np.save(tmp_path / "in.npy", np.linalg.norm(np.indices((9, 9, 9)) - 4, axis=0) < 3)
-    code, _, err = command(
-        *("upsample", tmp_path / "in.npy", tmp_path / "out.ply", "--quality", "fast")
-    )
-    said = "super-sdf was installed without its networks: install it again"
-    assert (code, err.splitlines()[-1]) == (1, f"Error: the network 'mask' is missing: {said}")
+    code, _, err = command(*words, "--quality", "fast")
+    want = f"Error: the network 'mask' is missing: {MISSING}"
+    assert (code, err.splitlines()[-1]) == (1, want)
 
 
 def test_a_network_file_that_cannot_be_read_is_a_line_and_the_others_are_shown(models, command):

@@ -71,15 +71,12 @@ def test_what_cannot_be_worked_with_is_refused(
     assert not list(here.glob("out/*"))
 
 
-def test_a_truncated_shard_is_named(here):
+def test_a_truncated_shard_is_named_and_small_meshes_alone_are_all_taken(here):
     np.savez("whole.npz", windows=np.zeros(1000))
     path = Path("shard-0-0000.npz")
     path.write_bytes(Path("whole.npz").read_bytes()[:500])
     with pytest.raises(FileError, match=r"shard-0-0000\.npz is not a shard: "):
         next(read_shard(path))
-
-
-def test_small_meshes_alone_are_all_taken(here):
     for name in "abc":
         Path(f"{name}.ply").write_text("small")
     prisms, others = find_meshes(Path())

@@ -60,16 +60,6 @@ def test_shared_nodes_have_the_mean_that_the_runtime_gives_them():
     assert np.abs(got - singly).max() > 1e-3
 
 
-def test_samples_side_by_side_have_their_own_values():
-    net, one, other = small_net(), prepare(ball_sample()), prepare(ball_sample(2))
-    other = replace(other, offsets=one.offsets[:27], targets=one.targets[:, :27])
-    one = replace(one, offsets=one.offsets[-27:], targets=one.targets[:, -27:])
-    batch = batch_of([one, other])
-    got = predict(net, batch, encode(net, batch)).split(batch.counts)
-    for values, sample in zip(got, (one, other)):
-        torch.testing.assert_close(values, predicted(net, sample), atol=1e-5, rtol=0)
-
-
 def test_the_gradient_reaches_the_voxels_that_share_a_node():
     sample, net = prepare(ball_sample()), small_net()
     corner = np.array([[1, 1, 1]], np.float32)

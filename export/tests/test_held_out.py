@@ -17,9 +17,5 @@ def test_a_file_has_the_errors_that_its_network_has_in_training(tmp_path, small_
     errors = measure(small_net(), Store(tmp_path).held_out)
     assert row_of(small_file, tmp_path).startswith(f"| small.onnx | {' | '.join(errors.cells())} |")
     assert Errors(0.0139412, 0.018441, 0.03981).cells() == ["0.01394", "0.01844", "0.0398"]
-
-
-def test_an_int8_network_is_refused(tmp_path):
-    path = shipped_models()["base"].with_name("base-int8.onnx")
     with pytest.raises(ModelError, match="is an int8 network: give the float32 network it was"):
-        row_of(path, tmp_path)
+        row_of(shipped_models()["base-int8"], tmp_path)

@@ -21,11 +21,8 @@ def test_a_table_has_the_kind_with_the_largest_error_first():
     ]
 
 
-def test_the_ranges_are_those_of_training():
+def test_windows_of_a_kind_are_as_many_as_were_asked_of_the_sizes_of_training():
     assert (RANGES[0][0], RANGES[-1][-1]) == SIZES
     assert [low for low, _ in RANGES[1:]] == [high for _, high in RANGES[:-1]]
-
-
-def test_windows_of_a_kind_are_as_many_as_were_asked():
     windows = draw_windows(np.random.default_rng(1), drawn_from(FAMILIES["prism"]), (7, 17), 3)
     assert len(windows) == 3 and all(len(window.targets) for window in windows)

@@ -16,14 +16,13 @@ from export.quantize import (
 )
 from export.to_onnx import make_card, write_model
 from super_sdf.network.network import load_network, shipped_models
-from super_sdf.network.onnx import ort
 
 SMALL = NetworkConfig(channels=16, blocks=3, hidden=32, functions=24, trunk=16, frequencies=2)
 
 
 @pytest.fixture(scope="module")
 def calibration():
-    return draw_samples(6)
+    return draw_samples(4)
 
 
 @pytest.fixture(scope="module")
@@ -56,39 +55,23 @@ def test_a_rounded_layer_is_near_and_zero_is_exact():
     assert np.abs(got - want).mean() < 0.02 * np.abs(want).mean()
 
 
-def test_no_pair_of_products_is_cut_off_on_processors_without_vnni():
-    assert 2 * LEVELS * MOST < 2**15
-
-
-def test_layers_without_weights_keep_their_bias():
+def test_layers_without_weights_keep_their_bias_and_no_pair_of_products_is_cut_off():
+    assert 2 * LEVELS * MOST < 2**15  # on processors without VNNI
     bias = torch.tensor([3.0, 0.0])
     layer = whole_layer(torch.zeros(4, 2), bias, np.ones(4), np.ones(2))
     np.testing.assert_allclose(layer.bias * layer.scales, bias, rtol=1e-6)
 
 
-def test_the_int8_file_is_near_the_float32_one_and_carries_its_card(files, calibration):
+def test_the_int8_file_is_near_the_float32_one_carries_its_card_and_is_written_again(
+    files, calibration
+):
+    """What onnxruntime makes of its layers: test_gated."""
     assert distance_apart(*files[:2], calibration).mean() < 3e-3
     card = load_network(files[1]).card
     assert (card["name"], card["precision"], card["receptive_field"]) == ("small-int8", "int8", 4)
     assert load_network(files[0], precision="int8").card == card  # the one beside it
-
-
-def test_the_same_file_is_written_again(files):
     one, other = (onnx.load(path) for path in files[1:])
     assert one.graph == other.graph
-
-
-def test_onnxruntime_runs_each_layer_in_whole_numbers(files, tmp_path):
-    options = ort.SessionOptions()
-    options.optimized_model_filepath = str(tmp_path / "optimised.onnx")
-    ort.InferenceSession(str(files[1]), options, providers=["CPUExecutionProvider"])
-    nodes = onnx.load(tmp_path / "optimised.onnx").graph.node
-    bodies = [a.g for node in nodes for a in node.attribute if a.name == "body"]
-    kinds = ["Gather", "Gather", "Reshape", "QGemm", "QGemm", "QGemm", "Add"]
-    rounding = ["QuantizeLinear"]  # for the next block
-    stem, *blocks, head = [[node.op_type for node in body.node] for body in bodies]
-    assert blocks == [kinds + rounding] * 2 + [kinds] and "QGemm" not in stem + head
-    assert "QuantizeLinear" in stem
 
 
 def test_nothing_stands_between_a_product_and_its_rounding(files):
@@ -98,7 +81,4 @@ def test_nothing_stands_between_a_product_and_its_rounding(files):
         for body in (a.g for node in nodes for a in node.attribute if a.name == "body"):
             made = {node.output[0]: node.op_type for node in body.node}
             rounded = [node for node in body.node if node.op_type == "QuantizeLinear"]
-            assert {made[node.input[0]] for node in rounded} <= {"Gemm", "Add", "Mul"}, (
-                path,
-                body.name,
-            )
+            assert {made[node.input[0]] for node in rounded} <= {"Gemm", "Add", "Mul"}, path

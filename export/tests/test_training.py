@@ -8,60 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
-from export.augment import (
-    CLEAN,
-    Prepared,
-    Shares,
-    batch_table,
-    inverted,
-    masked,
-    noisy,
-    prepare,
-    prepare_mask,
-    shifted,
-    turned,
-)
+from export import augment, dataset, network, to_onnx
+from export.augment import CLEAN, Prepared, Shares, prepare
 from export.batches import batch_of, encode
-from export.dataset import (
-    CORNERS,
-    draw_offsets,
-    fill_shard,
-    make_sample,
-    mesh_order,
-    read_shard,
-    signed_distance,
-    write_shard,
-)
 from export.dormant import dormant_share, moments, rectified_layers, revive
-from export.network import (
-    SIZES,
-    GatherMatMul,
-    SuperSdfNet,
-    columns_of,
-    interpolation_weights,
-    is_noisy,
-    pad,
-)
-from export.recipe import (
-    RECIPE,
-    differences,
-    make_optimisers,
-    sample_errors,
-)
+from export.network import SIZES, GatherMatMul, SuperSdfNet
+from export.recipe import RECIPE, differences, make_optimisers, sample_errors
 from export.run_log import read_log
 from export.store import Store
 from export.tests.small_net import SMALL, small_net
-from export.to_onnx import (
-    check_awake,
-    make_card,
-    noisy_ball,
-    parity,
-    read_network,
-    read_weights,
-    rewrite,
-    write_model,
-)
 from export.train import Run, autocast, take_step, train
 from super_sdf import Mesh, load_network
 from super_sdf.errors import FileError, OptionError
@@ -73,56 +30,30 @@ from super_sdf.steps.band import is_lipschitz, neighbour_table
 from super_sdf.steps.nodes import block_offsets
 from super_sdf.truth.solid import Solid
 
-
-def box(low=(-0.3, -0.2, -0.1), high=(0.4, 0.3, 0.2)) -> Mesh:
-    import trimesh
-
-    made = trimesh.creation.box(bounds=[low, high])
-    return Mesh(np.array(made.vertices), np.array(made.faces, np.int32))
-
-
-def box_distance(points, low=(-0.3, -0.2, -0.1), high=(0.4, 0.3, 0.2)):
-    """The closed form, negative inside."""
-    beyond = np.maximum(np.array(low) - points, points - np.array(high))
-    outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
-    return outside + np.minimum(beyond.max(1), 0)
-
-
-def test_targets_are_the_distance_at_the_query_points():
-    rng = np.random.default_rng(1)
-    sample = make_sample(rng, box())
-    prepared = prepare(sample)
-    middle = np.abs(sample.offsets).max(1) < 0.3
-    got = prepared.targets[:, middle]
-    sampled = prepared.patches[prepared.voxels, 13]
-    assert np.abs(got - sampled[:, None]).max() <= 0.3 * 3**0.5 + 2e-3  # 1-Lipschitz, float16
+LOW = np.array([[-0.3, -0.2, -0.1], [-0.1, -0.1, -0.05]])
+HIGH = np.array([[0.4, 0.3, 0.2], [0.6, 0.2, 0.1]])
 
 
 def test_signs_are_right_where_a_mesh_intersects_itself():
-    one, other = box(), box((-0.1, -0.1, -0.05), (0.6, 0.2, 0.1))
-    both = Mesh(
-        np.concatenate([one.vertices, other.vertices]),
-        np.concatenate([one.faces, other.faces + len(one.vertices)]),
-    )
+    """Of two boxes that overlap."""
+    boxes = [trimesh.creation.box(bounds=bounds) for bounds in zip(LOW, HIGH)]
+    both = trimesh.util.concatenate(boxes)
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.7, (4000, 3))
-    inside = np.minimum(
-        box_distance(points), box_distance(points, (-0.1, -0.1, -0.05), (0.6, 0.2, 0.1))
-    )
-    found = signed_distance(rng, Solid(both), points)
-    np.testing.assert_array_equal(found < 0, inside < 0)
+    inside = ((points[:, None] > LOW) & (points[:, None] < HIGH)).all(2).any(1)
+    mesh = Mesh(np.array(both.vertices), np.array(both.faces, np.int32))
+    np.testing.assert_array_equal(dataset.signed_distance(rng, Solid(mesh), points) < 0, inside)
 
 
 def test_thin_solids_have_hardly_a_sample_inside():
-    samples = fill_shard(np.random.default_rng(0), [], 1.0, thin=1.0, count=4)
-    lowest = [sample.window.min() / 2 for sample in samples]
-    assert min(lowest) > -0.2 and max(lowest) < 0.6
+    samples = dataset.fill_shard(np.random.default_rng(0), [], 1.0, thin=1.0, count=2)
+    assert all(-0.2 < sample.window.min() / 2 < 0.6 for sample in samples)
     assert all((sample.targets < 0).any() for sample in samples)
 
 
 def test_shards_come_back_the_same(tmp_path, samples):
-    write_shard(tmp_path / "shard.npz", samples)
-    for before, after in zip(samples, read_shard(tmp_path / "shard.npz"), strict=True):
+    dataset.write_shard(tmp_path / "shard.npz", samples)
+    for before, after in zip(samples, dataset.read_shard(tmp_path / "shard.npz"), strict=True):
         for field in ("window", "offsets", "voxel_ijk", "targets"):
             np.testing.assert_array_equal(getattr(before, field), getattr(after, field))
 
@@ -141,8 +72,8 @@ def test_augmentation_is_a_symmetry():
         targets=np.tile(offsets / 2 @ normal, (125, 1)).astype(np.float32),
     )
     for seed in range(20):
-        now = turned(np.random.default_rng(seed), sample)
-        weights = interpolation_weights(torch.from_numpy(now.offsets)).numpy()
+        now = augment.turned(np.random.default_rng(seed), sample)
+        weights = network.interpolation_weights(torch.from_numpy(now.offsets)).numpy()
         np.testing.assert_allclose(now.patches @ weights.T, now.targets, atol=1e-5)
         present = now.table >= 0
         moves = (now.ijk[now.table] - now.ijk[:, None])[present]
@@ -151,72 +82,70 @@ def test_augmentation_is_a_symmetry():
 
 
 def test_targets_follow_the_level_and_the_side_but_not_the_noise(samples):
-    rng = np.random.default_rng(0)
-    sample = samples[0]
-    inside_out = inverted(rng, sample, Shares(inverted=1))
+    rng, sample = np.random.default_rng(0), samples[0]
+    inside_out = augment.inverted(rng, sample, Shares(inverted=1))
     np.testing.assert_array_equal(inside_out.window, -sample.window)
     np.testing.assert_array_equal(inside_out.targets, -sample.targets)
-    moved = shifted(rng, sample, Shares(shifted=1))
+    moved = augment.shifted(rng, sample, Shares(shifted=1))
     level = (sample.window - moved.window).mean()
     assert 0 < abs(level) <= 1
     np.testing.assert_allclose(sample.targets - moved.targets, level, atol=1e-3)
-    rough = noisy(rng, sample, Shares(noisy=1))
+    rough = augment.noisy(rng, sample, Shares(noisy=1))
     assert 0 < np.abs(rough.window - sample.window).max() <= 1
     np.testing.assert_array_equal(rough.targets, sample.targets)
-
-
-def test_a_mask_keeps_the_side_of_every_sample_and_exact_targets(samples):
-    sample, rng = samples[0], np.random.default_rng(0)
-    mask = masked(rng, sample)
+    mask = augment.masked(rng, sample)
     level = float(np.median(sample.targets.astype(np.float32) - mask.targets))
-    assert abs(level) <= 1
+    assert abs(level) <= 1 == np.abs(mask.window).min()  # half a voxel
     np.testing.assert_array_equal(mask.window < 0, sample.window < np.float32(level))
-    assert np.abs(mask.window).min() == 1  # half a voxel
     np.testing.assert_allclose(sample.targets - mask.targets, level, atol=1e-3)
-    assert not np.array_equal(masked(rng, sample).window, mask.window)
+    assert not np.array_equal(augment.masked(rng, sample).window, mask.window)
 
 
 def test_a_network_for_masks_corrects_every_sample_also_as_a_file(tmp_path, samples):
     net = SuperSdfNet(replace(SMALL, keeps_samples=False))
     torch.nn.init.constant_(net.correction.bias, 0.5)
-    batch = batch_of([prepare_mask(sample) for sample in samples[:2]])
+    batch = batch_of([augment.prepare_mask(sample) for sample in samples[:2]])
     with torch.no_grad():
         encoded = encode(net, batch)
         at_sample = net.decode(encoded, torch.zeros(1, 3))[:, 0]
         want = encoded.patches[:, CENTRE] + net.correction(encoded.features)[:, 0]
     torch.testing.assert_close(at_sample, want, atol=1e-5, rtol=0)
     path = tmp_path / "mask.onnx"
-    write_model(net, path, make_card(net, "mask", "nothing", "none"))
-    assert parity(net, path) < 2e-4 and load_network(path).card["inputs"] == "masks"
-    assert not read_network(path).config.keeps_samples
+    to_onnx.write_model(net, path, to_onnx.make_card(net, "mask", "nothing", "none"))
+    assert to_onnx.parity(net, path) < 2e-4 and load_network(path).card["inputs"] == "masks"
+    assert not to_onnx.read_network(path).config.keeps_samples
 
 
-def test_differences_are_the_gradient_of_a_linear_field():
-    offsets = draw_offsets(np.random.default_rng(0))
+def test_differences_are_the_gradient_and_the_errors_of_the_truth_are_zero(samples):
+    offsets = dataset.draw_offsets(np.random.default_rng(0))
     normal = np.array([0.5, -0.3, 0.8], np.float32)
     slopes = differences(torch.from_numpy(offsets @ normal)[None])
-    np.testing.assert_allclose(slopes[0], np.tile(normal, (CORNERS, 1)), atol=1e-6)
+    np.testing.assert_allclose(slopes[0], np.tile(normal, (dataset.CORNERS, 1)), atol=1e-6)
+    target = torch.from_numpy(samples[0].targets.astype(np.float32))
+    np.testing.assert_allclose(sample_errors(target, target), 0, atol=1e-6)
+    off = sample_errors(target + 0.2, target)
+    np.testing.assert_allclose(off, [0.1, 0.1, 0], atol=1e-6)  # in voxels
 
 
 def test_meshes_come_once_each_with_a_sixth_of_prisms():
     prisms, others = [Path(f"p{n}") for n in range(900)], [Path(f"o{n}") for n in range(500)]
-    order = mesh_order(0, prisms, others, 600)
+    order = dataset.mesh_order(0, prisms, others, 600)
     assert len(order) == len(set(order)) == 600
     assert set(others) < set(order)
-    assert len(set(mesh_order(0, prisms, others, 1200)[600:]) & set(prisms)) == 100
+    assert len(set(dataset.mesh_order(0, prisms, others, 1200)[600:]) & set(prisms)) == 100
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
 def test_a_convolution_gathers_some_voxels_after_others(dtype, monkeypatch):
     table = torch.randint(0, 101, (100, 27))  # 100: no voxel
     features, weight = torch.randn(100, 4).to(dtype), torch.randn(108, 3).to(dtype)
-    whole = columns_of(pad(features), table) @ weight
+    whole = network.columns_of(network.pad(features), table) @ weight
     monkeypatch.setattr("export.network.CHUNK", 7)
     torch.testing.assert_close(GatherMatMul.apply(features, weight, table, features[:0]), whole)
 
 
 def test_an_untrained_network_keeps_samples_and_planes():
-    weights = interpolation_weights(torch.from_numpy(block_offsets(4))).double().numpy()
+    weights = network.interpolation_weights(torch.from_numpy(block_offsets(4))).double().numpy()
     np.testing.assert_allclose(weights.sum(1), 1, atol=1e-6)
     np.testing.assert_allclose(weights @ NEIGHBOURHOOD, block_offsets(4) / 2, atol=1e-6)
     net = SuperSdfNet(SMALL)
@@ -226,38 +155,28 @@ def test_an_untrained_network_keeps_samples_and_planes():
 
 
 def test_a_run_learns_and_goes_on_where_it_stopped(tmp_path, samples):
-    write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
-    write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
+    dataset.write_shard(tmp_path / "shard-0-0000.npz", samples[:1])
+    dataset.write_shard(tmp_path / "shard-0-0001.npz", samples[1:])
     torch.manual_seed(0)
     recipe = replace(RECIPE, batch_voxels=1, shares=CLEAN)
-    run = Run(tmp_path, SuperSdfNet(SMALL), recipe)
-    rng = np.random.default_rng(0)
+    run, rng = Run(tmp_path, SuperSdfNet(SMALL), recipe), np.random.default_rng(0)
     store = Store(tmp_path, 1)
-    first = np.mean([take_step(run, store, rng, 0.1) for _ in range(4)])
-    for _ in range(150):
-        take_step(run, store, rng, 0.1)
-    last = np.mean([take_step(run, store, rng, 0.1) for _ in range(4)])
-    assert last < 0.9 * first and not np.isnan(store.sampler.losses).any()
+    losses = [take_step(run, store, rng, 0.1) for _ in range(80)]
+    assert np.mean(losses[-4:]) < 0.95 * np.mean(losses[:4])
+    assert not np.isnan(store.sampler.losses).any()
     run.save()
     again = Run(tmp_path, SuperSdfNet(SMALL))
     again.resume()
-    assert again.step == 158
+    assert again.step == 80
     for one, other in zip(run.net.parameters(), again.net.parameters()):
         torch.testing.assert_close(one, other)
     train(again, store, again.seconds / 60 + 0.01, seed=0)
-    assert again.step > 158
+    assert again.step > 80
     assert read_log(tmp_path / "log.csv")["step"][-1] == again.step  # the end is measured
     train(again, store, 0.01, seed=0)  # spent
     step = again.step
     train(again, store, 0.01, seed=0, began=time.monotonic())
     assert again.step > step and step == read_log(tmp_path / "log.csv")["step"][-2]
-
-
-def test_the_held_out_errors_of_the_truth_are_zero(samples):
-    target = torch.from_numpy(samples[0].targets.astype(np.float32))
-    np.testing.assert_allclose(sample_errors(target, target), 0, atol=1e-6)
-    off = sample_errors(target + 0.2, target)
-    np.testing.assert_allclose(off, [0.1, 0.1, 0], atol=1e-6)  # in voxels
 
 
 def test_steps_that_a_resumed_run_takes_again_count_once(tmp_path):
@@ -277,8 +196,8 @@ def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
     some = tuple(sample.voxel_ijk[len(sample.voxel_ijk) // 2])
     window[some] += 2.5
     prepared = prepare(replace(sample, window=window))
-    patches, table = torch.from_numpy(prepared.patches), batch_table([prepared.table])
-    noisy = is_noisy(patches, torch.from_numpy(table))[:, 0].numpy() > 0
+    patches, table = torch.from_numpy(prepared.patches), augment.batch_table([prepared.table])
+    noisy = network.is_noisy(patches, torch.from_numpy(table))[:, 0].numpy() > 0
     broken = ~is_lipschitz(prepared.patches)
     near = np.append(broken, False)[prepared.table].any(1)
     assert broken.any() and not near.all()
@@ -287,10 +206,12 @@ def test_noisy_are_the_voxels_whose_neighbours_are_no_distance(samples):
 
 def test_a_file_is_written_anew_with_the_same_values_and_card(tmp_path):
     shipped = shipped_models()["fast"]
-    rewrite(shipped, tmp_path / "fast.onnx")
+    to_onnx.rewrite(shipped, tmp_path / "fast.onnx")
     one, other = load_network(shipped, device="cpu"), load_network(tmp_path / "fast.onnx")
     assert one.card == other.card and [path.name for path in tmp_path.iterdir()] == ["fast.onnx"]
-    np.testing.assert_allclose(one(*noisy_ball()), other(*noisy_ball()), rtol=0, atol=2e-6)
+    np.testing.assert_allclose(
+        one(*to_onnx.noisy_ball()), other(*to_onnx.noisy_ball()), rtol=0, atol=2e-6
+    )
 
 
 def put_to_sleep(net, units=3):
@@ -300,34 +221,31 @@ def put_to_sleep(net, units=3):
             entry.bias[:units] = -1e4
 
 
-def test_dormant_units_are_counted_and_start_again_without_a_change(samples):
-    net, batch = small_net(), batch_of([prepare(samples[0])])
-    layers = rectified_layers(net)
-    units = sum(len(entry.bias) for entry in layers)
-    put_to_sleep(net)
-    assert dormant_share(net, [batch]) >= 3 * len(layers) / units
-    with torch.no_grad():
-        before = encode(net, batch)
-        offsets = torch.from_numpy(samples[0].offsets)
-        values = net.decode(before, offsets)
-        optimisers = make_optimisers(net, RECIPE)
-        assert revive(net, optimisers, [batch]) >= 3 * len(layers)
-        torch.testing.assert_close(net.decode(encode(net, batch), offsets), values)
-    assert dormant_share(net, [batch]) == 0
+def test_targets_are_the_distance_at_the_query_points(samples):
+    """They differ from the sample by no more than they are away from it."""
+    for prepared in map(prepare, samples):
+        sampled = prepared.patches[prepared.voxels, CENTRE][:, None]
+        away = np.linalg.norm(prepared.offsets, axis=1)
+        assert (np.abs(prepared.targets - sampled) <= away + 4e-3).all()  # float16
 
 
-def test_a_unit_that_starts_again_forgets_what_moved_it(samples):
+def test_dormant_units_start_again_without_a_change_and_forget_what_moved_them(samples):
     net, batch = small_net(), batch_of([prepare(samples[0])])
-    optimisers = make_optimisers(net, RECIPE)
-    values = net.decode(encode(net, batch), torch.from_numpy(samples[0].offsets))
-    values.square().mean().backward()
+    offsets = torch.from_numpy(samples[0].offsets)
+    layers, optimisers = rectified_layers(net), make_optimisers(net, RECIPE)
+    net.decode(encode(net, batch), offsets).square().mean().backward()
     for optimiser in optimisers:
         optimiser.step()
     put_to_sleep(net)
-    revive(net, optimisers, [batch])
-    for entry in rectified_layers(net):
-        kept = [m for optimiser in optimisers for m in moments(optimiser, entry.weight)]
-        assert kept and all((entry.incoming(array)[:3] == 0).all() for array in kept)
+    assert dormant_share(net, [batch]) >= 3 * len(layers) / sum(len(one.bias) for one in layers)
+    with torch.no_grad():
+        values = net.decode(encode(net, batch), offsets)
+        assert revive(net, optimisers, [batch]) >= 3 * len(layers)
+        torch.testing.assert_close(net.decode(encode(net, batch), offsets), values)
+    assert dormant_share(net, [batch]) == 0
+    for one in layers:
+        kept = [m for optimiser in optimisers for m in moments(optimiser, one.weight)]
+        assert kept and all((one.incoming(array)[:3] == 0).all() for array in kept)
 
 
 def test_a_run_starts_dormant_units_again_until_its_last_fifth(tmp_path, samples):
@@ -356,31 +274,29 @@ def test_a_network_with_dead_units_is_not_exported(samples, monkeypatch):
     net = small_net()
     monkeypatch.setattr("export.to_onnx.draw_samples", lambda **_: [prepare(samples[0])])
     revive(net, [], [batch_of([prepare(samples[0])])])
-    check_awake(net)
+    to_onnx.check_awake(net)
     put_to_sleep(net)
     with pytest.raises(SystemExit, match=r"% of the rectified units react to nothing, 1 % may"):
-        check_awake(net)
+        to_onnx.check_awake(net)
 
 
 @pytest.mark.parametrize("name", SIZES)
 def test_a_size_is_that_of_the_shipped_network(name):
-    assert read_network(shipped_models()[name]).config == SIZES[name]
+    assert to_onnx.read_network(shipped_models()[name]).config == SIZES[name]
 
 
 def test_the_onnx_file_agrees_with_torch_in_chunks_of_any_size(small_file):
-    network = load_network(small_file, device="cpu")
-    assert parity(small_net(), small_file) < 2e-4 and network.card["receptive_field"] == 3
-    feeds = dict(zip(INPUTS, noisy_ball()))
-    want = network.session.run(None, feeds)[0]
+    loaded, net = load_network(small_file, device="cpu"), small_net()
+    assert to_onnx.parity(net, small_file) < 2e-4 and loaded.card["receptive_field"] == 3
+    feeds = dict(zip(INPUTS, to_onnx.noisy_ball()))
+    want = loaded.session.run(None, feeds)[0]
     for rows in (7, 512, 10**4):
-        got = network.session.run(None, {**feeds, CHUNK_INPUT: np.array([rows])})[0]
+        got = loaded.session.run(None, {**feeds, CHUNK_INPUT: np.array([rows])})[0]
         np.testing.assert_allclose(got, want, atol=1e-5)
-
-
-def test_a_card_says_what_a_network_is_for(small_file):
-    net = small_net()
-    assert "inputs" not in make_card(net, "any", "nothing", "none")
-    write_model(net, small_file, make_card(net, "exact", "nothing", "none", EXACT_DISTANCES))
+    assert "inputs" not in to_onnx.make_card(net, "any", "nothing", "none")
+    to_onnx.write_model(
+        net, small_file, to_onnx.make_card(net, "exact", "nothing", "none", EXACT_DISTANCES)
+    )
     assert load_network(small_file).card["inputs"] == "exact distances"
 
 
@@ -389,8 +305,8 @@ def test_a_larger_network_starts_with_the_values_of_the_file(tmp_path, small_fil
     """What reads new units begins to learn at once."""
     larger = replace(SMALL, channels=channels, hidden=20, blocks=SMALL.blocks + 1, functions=40)
     run, net = Run(tmp_path, SuperSdfNet(larger)), small_net()
-    run.start_from(read_weights(small_file))
-    arrays = [torch.from_numpy(array) for array in noisy_ball()]
+    run.start_from(to_onnx.read_weights(small_file))
+    arrays = [torch.from_numpy(array) for array in to_onnx.noisy_ball()]
     values = run.net(*arrays)
     with torch.no_grad():
         torch.testing.assert_close(values, net(*arrays))
@@ -406,10 +322,10 @@ def test_a_larger_network_starts_with_the_values_of_the_file(tmp_path, small_fil
 def test_no_network_starts_from_a_larger_one(tmp_path, small_file):
     run = Run(tmp_path, SuperSdfNet(replace(SMALL, hidden=12)))
     with pytest.raises(OptionError, match=r"stem.0.weight is \(16, 27\), more than the \(12, 27\)"):
-        run.start_from(read_weights(small_file))
+        run.start_from(to_onnx.read_weights(small_file))
     run = Run(tmp_path, SuperSdfNet(replace(SMALL, blocks=1)))
     with pytest.raises(OptionError, match=r"of 2 blocks, more than the 1 of this size: .* 2$"):
-        run.start_from(read_weights(small_file))
+        run.start_from(to_onnx.read_weights(small_file))
 
 
 @pytest.mark.parametrize(
