@@ -42,8 +42,9 @@ from ..steps.survey import (
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
-# Slabs cost no time if they see at most so many times as many voxels as one, each of them many.
-SEEN_AGAIN, LARGE = 1.15, 250_000
+# Slabs take no more time than one if together they see at most this many times its voxels ...
+SEEN_AGAIN = 1.15
+LARGE = 250_000  # ... and each of them at least so many
 REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + debris.REACH_IN_VOXELS
 
 

@@ -51,7 +51,8 @@ TEMPORARIES = 64  # numbers per sample in the search for its foot point
 PRIOR_WEIGHT = 0.2  # of the assumption that the error is 0, in foot points
 VARIANCE_PENALTY = 0.5  # how strongly disagreement of the errors reduces their mean
 CORNER_PARTS = np.flatnonzero(np.abs(NEIGHBOURHOOD).all(1))
-MEANS = {1: 1, 2: 2}  # how often errors are averaged on lattices of so many cells along a block
+# By cells along a block: how often errors are averaged on the lattice of such cells.
+MEANS = {1: 1, 2: 2}
 
 # The fitted values of a block depend on this many planes of voxels to either side: one each time
 # that errors are averaged, for the foot points in the blocks beside; then the foot points' samples,
