@@ -101,15 +101,15 @@ def add_rounded(body: onnx.GraphProto, block: IntBlock) -> str:
 
 def keep_absent(graph: onnx.GraphProto, read: onnx.NodeProto, block: IntBlock) -> None:
     """Set the last row that a block reads, which index -1 refers to, to the zero point."""
-    writer, name = IntWriter(f"{read.name}_absent_"), read.output[0]
+    name, width = read.output[0], len(block.reduce.scales)
+    writer = IntWriter(f"{read.name}_absent_")
     read.output[0] = f"{name}_written"
-    row = np.full((1, len(block.reduce.scales)), block.zero)
-    given = read.output[0], writer.constant(np.array([[-1]])), writer.constant(row)
-    writer.op("ScatterND", *given)
+    row = writer.constant(np.full((1, width), block.zero))
+    writer.op("ScatterND", read.output[0], writer.constant(np.array([[-1]])), row)
     writer.nodes[0].output[0] = name
     graph.node.insert(list(graph.node).index(read) + 1, writer.nodes[0])
     graph.initializer.extend(writer.constants)
-    width = len(block.reduce.scales)  # shapes of one name: it is changed in place
+    # one shape for both names, so that onnxruntime changes the array in place
     for value in (f"{name}_written", name):
         graph.value_info.append(declared(value, TensorProto.UINT8, ["padded", width]))
 

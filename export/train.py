@@ -220,12 +220,7 @@ NUMBERS = (
     ("batch", at_least(1), RECIPE.batch_voxels, "voxels of a batch; its last window may be more"),
     ("threads", at_least(1), 1, "that each work on a part of a batch; set OMP_NUM_THREADS=1 then"),
     ("blocks", at_least(1), None, "number of blocks, if not that of the size"),
-    (
-        "gated",
-        at_least(0),
-        None,
-        "number of blocks, the last ones, that run only where much is lost",
-    ),
+    ("gated", at_least(0), None, "last blocks, run where much is lost, if not those of the size"),
     ("revive-steps", at_least(0), RECIPE.revive_steps, "between restarts of dormant units; 0: no"),
     ("seed", at_least(0), 0, "of all that is drawn"),
 )

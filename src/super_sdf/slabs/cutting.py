@@ -13,9 +13,9 @@ The memory model, ``slab_bytes``, is measured by ``python -m lab figures --only 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,9 +42,8 @@ from ..steps.survey import (
 
 DEFAULT = BY_NAME[DEFAULT_MESHER]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
-# Slabs take no more time than one if together they see at most this many times its voxels ...
-SEEN_AGAIN = 1.15
-LARGE = 250_000  # ... and each of them at least so many
+SEEN_AGAIN = 1.15  # voxels that slabs see in all, over those of one slab, if they take no more time
+LARGE = 250_000  # voxels of a slab below which smaller slabs save little memory
 REACH_IN_VOXELS = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + debris.REACH_IN_VOXELS
 
 
@@ -121,20 +120,18 @@ def _ways(
 
     The first are as many as take no more time than one.
     """
-    least = 1 if receptive_field is None else count_free(band, receptive_field, beside, planes)
+    if receptive_field is None:
+        yield [whole(band)]
+        return
+    least = count_free(band, receptive_field, beside, planes)
     if planes is None and least == 1:
         yield [whole(band)]
-    if receptive_field is None:
-        return
     first, last = planes or (0, band.shape[0])
     for pieces in range(least, max(last - first, 2)):
         yield cut(band, pieces, receptive_field, beside, planes)
     decoding = np.flatnonzero(np.diff(band.decoded_before[first : last + 1])) + first
     bounds = [first, *decoding.tolist()[1:], last]  # each slab decodes something
-    yield [
-        slab_of(band, low, high, receptive_field, beside)
-        for low, high in itertools.pairwise(bounds)
-    ]
+    yield [slab_of(band, low, high, receptive_field, beside) for low, high in pairwise(bounds)]
 
 
 def check_vertices(band: Band, factor: int) -> None:
@@ -186,7 +183,7 @@ def equal_parts(before: NDArray[np.int64], pieces: int) -> list[tuple[int, int]]
     share = before / max(int(before[-1]), 1)
     inner = np.searchsorted(share, np.arange(1, pieces) / pieces)
     last = len(before) - 1
-    return list(itertools.pairwise(sorted(set(np.clip([0, *inner, last], 0, last).tolist()))))
+    return list(pairwise(sorted(set(np.clip([0, *inner, last], 0, last).tolist()))))
 
 
 def count_free(
@@ -201,7 +198,7 @@ def count_free(
     once = seen(1)
     return next(
         pieces
-        for pieces in itertools.count(1)
+        for pieces in count(1)
         if once < LARGE * (pieces + 1) or seen(pieces + 1) > SEEN_AGAIN * once
     )
 
