@@ -237,6 +237,14 @@ def test_values_that_are_cut_off_were_seen(cut, make):
         assert not any("exactly" in note for note in grid.notes)
 
 
+@pytest.mark.parametrize("half", [0.6, 0.9, 1.3])
+def test_flat_ground_of_a_thin_plate_was_seen_where_values_level_off(half):
+    outside = np.abs(np.indices((32,) * 3).T - 15.5) - np.array([11, 11, half])
+    distances = np.linalg.norm(np.maximum(outside, 0), axis=-1) + np.minimum(outside.max(-1), 0)
+    grid = make_grid(2 * np.tanh(distances / 2), **PLACE)
+    assert not any("exactly" in note for note in grid.notes)
+
+
 def test_zeros_on_the_surface_were_seen():
     place = np.abs(np.indices((24,) * 3) - 12) - np.array([7, 6, 4])[:, None, None, None]
     whole = np.linalg.norm(np.maximum(place, 0), axis=0) + np.minimum(place.max(0), 0)

@@ -36,6 +36,7 @@ STEEPEST, JUMP, UNSEEN = 0.95, 1.5, 0.9
 MIXED, FILLED_IN = 0.1, 0.03
 FEW_SPANS = 3.0  # times what few values span is more than they change by
 MANY = 4096  # samples among which different values are counted
+A_SIDE = 0.75  # share of the changes of sign beside one value from which it is one side
 ENOUGH = 30  # changes from which the steepest is known
 LEAST_JUMPS = 6  # beside one value
 SIDES = slice(1, None), slice(None, -1)  # of two samples beside each other
@@ -251,6 +252,8 @@ def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
         is_plateau = value == 0 and (has[0] & has[1]).sum() >= ENOUGH
         if not is_plateau and largest <= JUMP * _least_steep(pairs, ordered, has, extreme):
             continue
+        if value and _is_a_side(pairs, value):
+            continue
         steepest = _steepest(pairs, value, extremes)
         if value in extremes and _is_cut_near(pairs, value, steepest, extremes):
             continue
@@ -269,6 +272,12 @@ def _least_steep(pairs: Floats, ordered: Floats, has: BoolArray, extreme: BoolAr
     return float(ordered[first + int(STEEPEST * (rest - 1))]) if rest > ENOUGH else 0.0
 
 
+def _is_a_side(pairs: Floats, value: float) -> bool:
+    """Return whether the sign changes mostly beside a value, as beside thin flat parts."""
+    crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
+    return bool((crossing == value).any(0).mean() > A_SIDE) if crossing.size else False
+
+
 def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extremes) -> bool:
     """Return whether the sign changes between the extremes, and others are near a value."""
     crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
@@ -279,14 +288,19 @@ def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extreme
 
 def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
     """Return the steepest change of samples without a value, or all that they span, if few tell."""
-    rest, inner = pairs[pairs != value], pairs[~np.isin(pairs, (value, *extremes))]
-    changes = np.abs(pairs[1] - pairs[0])[(pairs != value).all(0)]
+    is_inner = ~np.isin(pairs, (value, *extremes))
+    rest, inner = pairs[pairs != value], pairs[is_inner]
+    change = np.abs(pairs[1] - pairs[0])
+    changes = change[(pairs != value).all(0)]
     span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
     changes = changes[(changes > 0) & (changes <= span)]
     if len(changes) < ENOUGH or len(distinct(inner[:MANY])) < LEAST_VALUES:
         low, high = rest.min(initial=0), rest.max(initial=0)
         return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
-    return quantile(changes, STEEPEST)
+    # A field that levels off, or with far spacings along one axis, is steepest at the surface.
+    across = change[is_inner.all(0) & ((pairs[0] > 0) != (pairs[1] > 0))]
+    steepest = quantile(changes, STEEPEST)
+    return max(steepest, quantile(across, STEEPEST)) if len(across) >= ENOUGH else steepest
 
 
 def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:
