@@ -190,7 +190,8 @@ def kind_table(rows: Sequence[Row], wanted: Callable[[str], bool]) -> str:
         pieces = f"{mc['pieces']}, {mine['pieces']}"
         body.append([label, taken, *distances, volume, pieces, closed_of(mine)])
     titles = ["values", "taken as", *(KIND_LABELS[method] for method in methods)]
-    return markdown([*titles, "volume off, at most: MC, super-sdf", "pieces", "closed"], body)
+    titles += ["volume off, at most: MC, super-sdf", "pieces: MC, super-sdf", "closed"]
+    return markdown(titles, body)
 
 
 def form_table(rows: Sequence[Row]) -> str:
@@ -200,7 +201,9 @@ def form_table(rows: Sequence[Row]) -> str:
         found, line = pick(chosen, kind=name), [name]
         for method in ("mc", "bspline", "ours"):
             line.append(", ".join(VOXELS.cell(r["voxels"]) for r in pick(found, method=method)))
-        body.append([*line, ", ".join(values(found, "taken_as"))])
+        taken = values(found, "taken_as")
+        by_size = (f"{row['size']}^3: {row['taken_as']}" for row in pick(found, method="ours"))
+        body.append([*line, taken[0] if len(taken) == 1 else "; ".join(by_size)])
     head = ", ".join(f"{n}^3" for n in values(chosen, "size"))
     return markdown([head, "marching cubes", "B-spline", "super-sdf", "taken as"], body)
 
@@ -208,7 +211,7 @@ def form_table(rows: Sequence[Row]) -> str:
 def slice_table(rows: Sequence[Row]) -> str:
     """Return masks and truncated distances with thick slices."""
     chosen = [{**row, "kind": f"1:1:{row['kind']}"} for row in pick(rows, set="slices")]
-    labels = {name: name for name in values(chosen, "method")}
+    labels = {name: name.replace("ours", "super-sdf") for name in values(chosen, "method")}
     return wide(chosen, labels, "method", VOXELS, among="kind")
 
 
@@ -389,8 +392,7 @@ def number(rows: Sequence[Row], name: str, words: Sequence[str]) -> str:
         raise FileError(f"there is no column {name!r}: give one of {', '.join(COLUMNS)}")
     column = COLUMNS[name]
     if "over" not in words:
-        cell = column.cell(row_of(rows, words)[name])
-        return cell.removeprefix("0") if column in (F1, NC) else cell
+        return column.cell(row_of(rows, words)[name])
     cut = list(words).index("over")
     one, other = (float(row_of(rows, w)[name]) for w in (words[:cut], words[cut + 1 :]))
     return f"{one / other:.0f}" if one >= 10 * other else f"{one / other:.1f}"
