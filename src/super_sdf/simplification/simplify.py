@@ -123,7 +123,7 @@ def simplify_mesh(
     if error is not None:
         result, warnings = within(mesh, original, error, rounds)
     else:
-        result, warnings = down_to(mesh, triangles or 0, rounds)
+        result, warnings = down_to(mesh, original, triangles or 0, rounds)
     deviation = Deviation(*original.deviation(result))
     if progress:
         progress(1.0)
