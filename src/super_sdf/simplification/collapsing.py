@@ -24,7 +24,7 @@ from ..mesh import Mesh
 from ..progress import ShareCallback
 from ..topology import OpenEdges, irregular_places, row_keys, vertex_components
 from ..truth.solid import Points, Solid
-from .measuring import Original
+from .measuring import Original, mean_side
 
 COLLAPSING_ROUNDS = 8  # in which the threshold rises to its end; from more, meshes get no smaller
 RISE = 5.0  # exponent of the threshold in a round
@@ -34,7 +34,7 @@ ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # triangles at 32^3, another one 9, 9, 8, 9 and 12 %.
 PLANE_DISTANCE = 2.0
 FIRST_DISTANCE = 0.5  # in the first pass, after which the others have a tenth of the triangles
-UNMEASURED = 2  # passes before one that is measured: they are seldom too far
+UNMEASURED = 3  # passes before one that is measured: they are seldom too far
 MOST_PASSES = 20
 ENOUGH = 0.9  # a pass that leaves more of the triangles is the last one
 LEAST_ERROR = 1e-2  # of a triangle's side: the first of the errors that double
@@ -87,7 +87,8 @@ class Passes:
                 return None
             wrong = np.concatenate([self._faults(result), self.too_far(result)])
             if not len(wrong):
-                return result if same_topology(result, self.meshes[0]) else None
+                same = np.array_equal(euler_numbers(result), self._euler_numbers)
+                return result if same else None
             first = self._keep(wrong)
             if first < 0:
                 return None
@@ -133,6 +134,10 @@ class Passes:
         edges = OpenEdges()  # much faster than ``irregular_places``
         edges.add(self.meshes[0].faces)
         return not len(edges)
+
+    @cached_property
+    def _euler_numbers(self) -> NDArray[np.int64]:
+        return euler_numbers(self.meshes[0])
 
     @cached_property
     def _before(self) -> NDArray[np.float64]:
@@ -195,20 +200,16 @@ def _collapsed_to(mesh: Mesh, triangles: int, rounds: Rounds) -> Mesh | None:
     return Passes(mesh, collapse, lambda result: ANYWHERE).accepted(1, rounds)
 
 
-def same_topology(one: Mesh, other: Mesh) -> bool:
-    """Return whether both meshes have as many components with the same Euler characteristics.
+def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
+    """Return twice the Euler characteristic of each component, sorted, of a mesh without open edges.
 
     That of the whole mesh alone does not change when a ball and a hole are lost. Open edges count.
     """
-
-    def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
-        component = vertex_components(mesh.faces, len(mesh.vertices))
-        used = np.bincount(mesh.faces.ravel(), minlength=len(component)) > 0
-        vertices = np.bincount(component[used])
-        triangles = np.bincount(component[mesh.faces[:, 0]])
-        return np.sort((2 * vertices - triangles)[triangles > 0])
-
-    return np.array_equal(euler_numbers(one), euler_numbers(other))
+    component = vertex_components(mesh.faces, len(mesh.vertices))
+    used = np.bincount(mesh.faces.ravel(), minlength=len(component)) > 0
+    triangles = np.bincount(component[mesh.faces[:, 0]])
+    vertices = np.bincount(component[used])
+    return np.sort((2 * vertices - triangles)[triangles > 0])
 
 
 def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
@@ -218,7 +219,7 @@ def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
     ``kept``, (m,) bool, stay as they are, with their vertices; open edges stay, too.
     """
     rising = {"alpha": COLLAPSING_ROUNDS**-RISE, "K": 1, "aggressiveness": RISE}  # to the distance
-    limits = {"target_count": 0, "max_iterations": COLLAPSING_ROUNDS, "update_rate": 1}
+    limits = {"target_count": 0, "max_iterations": COLLAPSING_ROUNDS}
     return _collapse(mesh, kept, distance, {**rising, **limits})
 
 
@@ -231,12 +232,6 @@ def collapse_to(mesh: Mesh, kept: BoolArray, triangles: int) -> Mesh:
     return _collapse(mesh, kept, mean_side(mesh), {"target_count": target, "update_rate": 1})
 
 
-def mean_side(mesh: Mesh) -> float:
-    """Return the mean length of the first sides of all triangles."""
-    ends = mesh.vertices[mesh.faces[:, :2]].astype(np.float64)
-    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
-
-
 def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any]) -> Mesh:
     """Return the mesh with the edges between triangles that are not kept collapsed.
 
@@ -245,7 +240,7 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
     """
     middle = mesh.vertices.mean(0, dtype=np.float64)
     scaled = (mesh.vertices - middle) / unit
-    used, collapsed = _renumbered(mesh.faces[~kept])
+    used, collapsed = _renumbered(mesh.faces[~kept], len(scaled))
     moved = scaled[used]
     if len(collapsed):
         with ONE_AT_A_TIME:
@@ -268,7 +263,7 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
     return Mesh(np.concatenate([vertices, mesh.vertices[extra]]), faces)
 
 
-def _renumbered(faces: IntArray) -> tuple[NDArray[np.intp], IntArray]:
-    """Return the vertices that faces (m, 3) use, and the faces with these numbered from 0."""
-    used, numbers = np.unique(faces.ravel(), return_inverse=True)
-    return used.astype(np.intp), numbers.astype(np.int32).reshape(-1, 3)
+def _renumbered(faces: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray]:
+    """Return those of ``count`` vertices that faces (m, 3) use, and the faces with their numbers."""
+    used = np.bincount(faces.ravel(), minlength=count) > 0
+    return np.flatnonzero(used), (np.cumsum(used, dtype=np.int32) - 1)[faces]

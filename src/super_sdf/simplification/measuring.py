@@ -17,7 +17,7 @@ from ..topology import row_keys
 from ..truth.solid import Distances, Points, Solid
 
 POINTS_AT_ONCE = 1 << 18
-SIDES = 1.5  # of the unsimplified mesh, between points of the pattern
+SIDES = 2.0  # of the unsimplified mesh, between points of the pattern
 
 
 class Original:
@@ -29,23 +29,26 @@ class Original:
 
     def __init__(self, mesh: Mesh) -> None:
         self.solid = Solid(mesh)
-        corners = self.solid.mesh.vertices[mesh.faces]
-        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        self.step = SIDES * float(sides.mean())
+        self.step = SIDES * mean_side(mesh)
         self.distance = np.zeros(len(mesh.vertices))
         self.near: NDArray[np.intp] = np.full(len(mesh.vertices), -1)  # triangle, or not measured
         self.keys = np.zeros(0, np.uint64)  # of triangles of the simplified mesh, (m,)
         self.back = np.zeros((2, 0))  # their largest distance, nan if not measured; its integral
 
     def beyond(self, result: Mesh, distance: float) -> Points:
-        """Return points, (n, 3), of either mesh that are farther than this from the other."""
+        """Return points, (n, 3), of either mesh that are farther than this from the other.
+
+        Those of the other mesh are looked at only if the vertices of this one are near enough.
+        """
         self._forget_all_but(result)
         tree, vertices = Solid(result), self.solid.mesh.vertices
         stale = np.flatnonzero(self.near < 0)
         self.distance[stale], self.near[stale], _ = tree.nearest(vertices[stale])
         far = self.distance > distance
         self.near[far] = -1
-        return np.concatenate([vertices[far], *self._measure_back(tree.mesh, distance)])
+        if far.any():
+            return vertices[far]
+        return np.concatenate(list(self._measure_back(tree.mesh, distance)))
 
     def deviation(self, result: Mesh) -> tuple[float, float, float, float]:
         """Return how far a simplified mesh and this one lie apart: see ``Deviation``."""
@@ -87,6 +90,12 @@ class Original:
             total += np.bincount(face, found * weights, len(new))
             yield points[found > distance]
         self.back[:, new] = np.where(largest > distance, np.nan, largest), total
+
+
+def mean_side(mesh: Mesh) -> float:
+    """Return the mean length of the first sides of all triangles."""
+    start, end = mesh.vertices.astype(np.float64)[mesh.faces[:, :2].T]
+    return float(np.linalg.norm(end - start, axis=1).mean())
 
 
 def areas(mesh: Mesh) -> Distances:
