@@ -3,15 +3,15 @@
 pyfqmr is fast quadric mesh simplification (Forstmann): an edge is collapsed if the sum of squared
 distances of the new vertex to the planes of the triangles it replaces is under a threshold, which
 rises in every round. It neither bounds the distance of triangles nor keeps every mesh a manifold.
-So where a collapsed mesh is too far from the unsimplified one, or no longer a manifold, the
-triangles around the place are kept, and the rest is collapsed again. Passes over the result follow,
-in which the triangles to keep are larger already.
+So passes are made over the result of each other, and the last one is looked at. Where it is too far
+from the unsimplified mesh, or not a manifold, the triangles around the place are kept in the last
+pass that had it right, and the passes from there on are made anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cached_property
 from threading import Lock
 from typing import Any
 
@@ -26,19 +26,18 @@ from ..topology import OpenEdges, irregular_places, row_keys, vertex_components
 from ..truth.solid import Points, Solid
 from .measuring import Original, mean_side
 
-COLLAPSING_ROUNDS = 8  # in which the threshold rises to its end; from more, meshes get no smaller
-RISE = 5.0  # exponent of the threshold in a round
+ROUNDS, RISE = 30, 3.0  # of the threshold to its end; from more rounds, meshes get no smaller
+LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly as well
+FEW_ROUNDS, STEEP_RISE = 8, 5.0
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
-# of the sum of squares). At 1, 1.4, 2, 2.8 and 4, a part keeps 17, 17, 13, 15 and 20 % of its
-# triangles at 32^3, another one 9, 9, 8, 9 and 12 %.
-PLANE_DISTANCE = 2.0
-FIRST_DISTANCE = 0.5  # in the first pass, after which the others have a tenth of the triangles
-UNMEASURED = 3  # passes before one that is measured: they are seldom too far
+# of the sum of squares). They rise over the passes, since what is collapsed too far early must be
+# found and done anew. The last stands for all passes after: from 1.4 or 2.8, more triangles remain.
+PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0
 MOST_PASSES = 20
 ENOUGH = 0.9  # a pass that leaves more of the triangles is the last one
 LEAST_ERROR = 1e-2  # of a triangle's side: the first of the errors that double
-DOUBLINGS = 20
+DOUBLINGS = 14
 MOST_ROUNDS = 16  # of keeping more triangles, before smaller distances are tried
 HALVINGS = 3
 LEFT = 0.85  # share of the work that is left after a round: a guess
@@ -64,11 +63,17 @@ class Rounds:
 class Passes:
     """Passes of collapsing edges, each of the mesh that the one before made.
 
-    ``too_far`` takes a mesh and returns points, (n, 3), at which it is not accepted.
+    With an original mesh, what they make stays within an error of it.
     """
 
-    def __init__(self, mesh: Mesh, collapse: Collapse, too_far: Callable[[Mesh], Points]) -> None:
-        self.collapse, self.too_far = collapse, too_far
+    def __init__(
+        self,
+        mesh: Mesh,
+        collapse: Collapse,
+        original: Original | None = None,
+        error: float = np.inf,
+    ) -> None:
+        self.collapse, self.original, self.error = collapse, original, error
         self.solids, self.meshes = [Solid(mesh)], [mesh]
         self.kept: list[BoolArray] = []  # triangles of each mesh but the last
         self.places, self.since = ANYWHERE, np.zeros(0, np.intp)  # kept from which mesh on
@@ -85,7 +90,9 @@ class Passes:
             result = self.meshes[-1]
             if not len(result.faces):
                 return None
-            wrong = np.concatenate([self._faults(result), self.too_far(result)])
+            wrong = self._faults(result)
+            if self.original:
+                wrong = np.concatenate([wrong, self.original.beyond(result, self.error)])
             if not len(wrong):
                 same = np.array_equal(euler_numbers(result), self._euler_numbers)
                 return result if same else None
@@ -98,22 +105,25 @@ class Passes:
         """Make the passes anew from one on."""
         del self.meshes[first + 1 :], self.solids[first + 1 :], self.kept[first:]
         for number in range(first, passes):
+            if not len(self.meshes[number].faces):
+                return
             base, near = self.meshes[number], self.places[self.since <= number]
-            chosen = np.zeros(len(base.vertices), bool)
+            chosen: BoolArray = np.zeros(len(base.vertices), bool)
             chosen[base.faces[self.solids[number].nearest_face(near)]] = True
-            self.kept.append(chosen[base.faces].any(1))
+            self.kept.append(np.any(chosen[base.faces], axis=1))
             self.meshes.append(self.collapse(base, self.kept[number], number))
             self.solids.append(Solid(self.meshes[-1]))
 
     def _keep(self, wrong: Points) -> int:
-        """Keep the triangles around points in the last pass, and in those before if they are kept.
+        """Keep the triangles around points, in the last pass or, if these are wrong, in one before.
 
         Return the first pass that changes, -1 if a point is wrong although all are kept there.
         """
         first = len(self.kept)
         while len(wrong) and first:
             first -= 1
-            stuck = self.kept[first][self.solids[first].nearest_face(wrong)]
+            distance, face, _ = self.solids[first].nearest(wrong)
+            stuck = self.kept[first][face] | (distance > self.error)
             self.places = np.concatenate([self.places, wrong[~stuck]])
             self.since = np.append(self.since, np.full(np.count_nonzero(~stuck), first))
             wrong = wrong[stuck]
@@ -148,25 +158,35 @@ def within(
     mesh: Mesh, original: Original, error: float, rounds: Rounds
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh within a distance of the original one, and a warning if it is not simpler."""
-    result = mesh
     for halving in range(HALVINGS):
-        distance = PLANE_DISTANCE * error / 2**halving
-
-        def collapse(base: Mesh, kept: BoolArray, number: int, most: float = distance) -> Mesh:
-            return collapse_within(base, kept, most if number else FIRST_DISTANCE / 2 * most)
-
-        passes = Passes(mesh, collapse, partial(original.beyond, distance=error))
-        for count in range(UNMEASURED + 1, MOST_PASSES):
-            coarser = passes.accepted(count, rounds)
-            if coarser is None or len(coarser.faces) >= len(result.faces):
-                break
-            before, result = passes.meshes[-2], coarser
-            if len(result.faces) > ENOUGH * len(before.faces):
-                break
-        if result is not mesh:
+        result = _in_passes(mesh, original, error, 2.0**-halving, rounds)
+        if result:
             return result, ()
     return mesh, ("the mesh was not simplified: none of its triangles can be spared within the "
                   "error",)  # fmt: skip
+
+
+def _in_passes(
+    mesh: Mesh, original: Original, error: float, share: float, rounds: Rounds
+) -> Mesh | None:
+    """Return a simpler mesh, by passes with a share of the usual distances; None if that fails.
+
+    The first result that is measured is that of several passes.
+    """
+    distances = share * error * np.array(PLANE_DISTANCES)
+
+    def collapse(base: Mesh, kept: BoolArray, number: int) -> Mesh:
+        return collapse_within(base, kept, distances[min(number, len(distances) - 1)])
+
+    passes, result = Passes(mesh, collapse, original, error), None
+    for count in range(len(distances), MOST_PASSES):
+        coarser = passes.accepted(count, rounds)
+        if coarser is None or len(coarser.faces) >= len((result or mesh).faces):
+            break
+        result = coarser
+        if len(result.faces) > ENOUGH * len(passes.meshes[-2].faces):
+            break
+    return result
 
 
 def down_to(
@@ -174,36 +194,42 @@ def down_to(
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning.
 
-    Errors double until there are no more. So flat parts come first, where a collapsed edge costs
-    nothing.
+    Errors double until there are no more, and what the last one made is compared to what is
+    collapsed to the number, whatever the error.
     """
-    result, error = mesh, LEAST_ERROR * mean_side(mesh)
-    for doubling in range(DOUBLINGS):
-        if len(result.faces) <= triangles:
-            return result, ()
-        coarser, _ = within(result, original, error * 2**doubling, rounds)
-        if len(coarser.faces) < triangles:
-            exact = _collapsed_to(result, triangles, rounds)
-            found = [some for some in (exact, coarser) if some and len(some.faces) <= triangles]
-            return min(found, key=lambda some: max(original.deviation(some)[::2])), ()
-        result = coarser
-    return result, (f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of "
-                    f"the same topology: it has {len(result.faces):,}",)  # fmt: skip
+    finer = coarser = mesh
+    for error in LEAST_ERROR * mean_side(mesh) * 2.0 ** np.arange(DOUBLINGS):
+        if len(coarser.faces) <= triangles:
+            break
+        finer, (coarser, _) = coarser, within(coarser, original, error, rounds)
+    exact = _collapsed_to(finer, triangles, rounds)
+    reached = [some for some in (exact, coarser) if len(some.faces) <= triangles]
+    if reached:
+        return min(reached, key=lambda some: max(original.deviation(some)[::2])), ()
+    return exact, (f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of "
+                   f"the same topology: it has {len(exact.faces):,}",)  # fmt: skip
 
 
-def _collapsed_to(mesh: Mesh, triangles: int, rounds: Rounds) -> Mesh | None:
-    """Return a mesh of a number of triangles, at any distance; None if it is no manifold."""
+def _collapsed_to(mesh: Mesh, triangles: int, rounds: Rounds) -> Mesh:
+    """Return a mesh of a number of triangles, at any distance, or the smallest found."""
 
     def collapse(base: Mesh, kept: BoolArray, number: int) -> Mesh:
         return collapse_to(base, kept, triangles)
 
-    return Passes(mesh, collapse, lambda result: ANYWHERE).accepted(1, rounds)
+    passes = Passes(mesh, collapse)
+    for count in range(1, MOST_PASSES):
+        coarser = passes.accepted(count, rounds)
+        if coarser is None or len(coarser.faces) >= len(mesh.faces):
+            break
+        mesh = coarser
+    return mesh
 
 
 def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
-    """Return twice the Euler characteristic of each component, sorted, of a mesh without open edges.
+    """Return twice the Euler characteristics of the components of a closed mesh, sorted.
 
-    That of the whole mesh alone does not change when a ball and a hole are lost. Open edges count.
+    That of the whole mesh alone does not change when a ball and a hole are lost. With open edges,
+    it is a number that changes if the topology does.
     """
     component = vertex_components(mesh.faces, len(mesh.vertices))
     used = np.bincount(mesh.faces.ravel(), minlength=len(component)) > 0
@@ -218,9 +244,10 @@ def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
     That is the root of the sum of squared distances, in world units. The triangles that are
     ``kept``, (m,) bool, stay as they are, with their vertices; open edges stay, too.
     """
-    rising = {"alpha": COLLAPSING_ROUNDS**-RISE, "K": 1, "aggressiveness": RISE}  # to the distance
-    limits = {"target_count": 0, "max_iterations": COLLAPSING_ROUNDS}
-    return _collapse(mesh, kept, distance, {**rising, **limits})
+    few = len(mesh.faces) > LARGE
+    rounds, rise = (FEW_ROUNDS, STEEP_RISE) if few else (ROUNDS, RISE)
+    rising = {"alpha": rounds**-rise, "K": 1, "aggressiveness": rise}  # to the distance
+    return _collapse(mesh, kept, distance, {"target_count": 0, "max_iterations": rounds, **rising})
 
 
 def collapse_to(mesh: Mesh, kept: BoolArray, triangles: int) -> Mesh:
@@ -264,6 +291,6 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
 
 
 def _renumbered(faces: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray]:
-    """Return those of ``count`` vertices that faces (m, 3) use, and the faces with their numbers."""
+    """Return which of ``count`` vertices faces (m, 3) use, and the faces with these numbered."""
     used = np.bincount(faces.ravel(), minlength=count) > 0
     return np.flatnonzero(used), (np.cumsum(used, dtype=np.int32) - 1)[faces]

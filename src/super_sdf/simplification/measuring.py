@@ -28,7 +28,7 @@ class Original:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        self.solid = Solid(mesh)
+        self.mesh, self.solid = mesh, Solid(mesh)
         self.step = SIDES * mean_side(mesh)
         self.distance = np.zeros(len(mesh.vertices))
         self.near: NDArray[np.intp] = np.full(len(mesh.vertices), -1)  # triangle, or not measured
@@ -36,9 +36,9 @@ class Original:
         self.back = np.zeros((2, 0))  # their largest distance, nan if not measured; its integral
 
     def beyond(self, result: Mesh, distance: float) -> Points:
-        """Return points, (n, 3), of either mesh that are farther than this from the other.
+        """Return points of this mesh, (n, 3), where the other one is farther away than this.
 
-        Those of the other mesh are looked at only if the vertices of this one are near enough.
+        They are its vertices, or if these are near enough, what is nearest to points of the other.
         """
         self._forget_all_but(result)
         tree, vertices = Solid(result), self.solid.mesh.vertices
@@ -53,8 +53,8 @@ class Original:
     def deviation(self, result: Mesh) -> tuple[float, float, float, float]:
         """Return how far a simplified mesh and this one lie apart: see ``Deviation``."""
         self.beyond(result, np.inf)
-        area = areas(self.solid.mesh)
-        around = self.distance[self.solid.mesh.faces].mean(1)
+        area = areas(self.mesh)
+        around = self.distance[self.mesh.faces].mean(1)
         mean_back = self.back[1].sum() / areas(Solid(result).mesh).sum()
         return (
             float(self.distance.max()),
@@ -77,18 +77,18 @@ class Original:
         self.keys, self.back = keys, back
 
     def _measure_back(self, result: Mesh, distance: float) -> Iterator[Points]:
-        """Measure triangles that are not yet; yield the points that are farther than a distance."""
+        """Measure triangles that are not yet; yield what is nearest to those farther than this."""
         new = np.flatnonzero(np.isnan(self.back[0]))
         faces = result.faces[new]
         used, corner = np.unique(faces, return_inverse=True)
-        found = self.solid.distance(result.vertices[used])
-        yield result.vertices[used[found > distance]]
+        found, _, feet = self.solid.nearest(result.vertices[used])
+        yield feet[found > distance]
         largest, total = found[corner.reshape(-1, 3)].max(1, initial=0), np.zeros(len(new))
         for points, weights, face in points_within(Mesh(result.vertices, faces), self.step):
-            found = self.solid.distance(points)
+            found, _, feet = self.solid.nearest(points)
             np.maximum.at(largest, face, found)
             total += np.bincount(face, found * weights, len(new))
-            yield points[found > distance]
+            yield feet[found > distance]
         self.back[:, new] = np.where(largest > distance, np.nan, largest), total
 
 
