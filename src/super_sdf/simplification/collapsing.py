@@ -1,17 +1,17 @@
-"""Passes of collapsing edges with pyfqmr: what turned out wrong is kept, the rest collapsed again.
+"""Passes of collapsing edges with pyfqmr: where the result is wrong, they are made anew.
 
 pyfqmr is fast quadric mesh simplification (Forstmann): an edge is collapsed if the sum of squared
 distances of the new vertex to the planes of the triangles it replaces is under a threshold, which
 rises in every round. It neither bounds the distance of triangles nor keeps every mesh a manifold.
-So passes are made over the result of each other, and the last one is looked at. Where it is too far
-from the unsimplified mesh, or not a manifold, the triangles around the place are kept in the last
-pass that had it right, and the passes from there on are made anew.
+So each pass simplifies what the one before made, and what the last one made is looked at. Where it
+is too far from the unsimplified mesh, or not a manifold, the triangles around the place are kept in
+the first pass that got it wrong, and this pass and those after it are made anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from threading import Lock
 from typing import Any
 
@@ -26,25 +26,23 @@ from ..topology import OpenEdges, irregular_places, row_keys, vertex_components
 from ..truth.solid import Points, Solid
 from .measuring import Original, mean_side
 
+ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
+# Edges are collapsed while the new vertex is within this many errors of the planes around it (root
+# of the sum of squares), in each pass. What an early pass gets wrong costs most time, so they rise;
+# with an end of 1.4 or 2.8, more triangles are left.
+PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0
 ROUNDS, RISE = 30, 3.0  # of the threshold to its end; from more rounds, meshes get no smaller
 LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly as well
 FEW_ROUNDS, STEEP_RISE = 8, 5.0
-ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
-# Edges are collapsed while the new vertex is within this many errors of the planes around it (root
-# of the sum of squares). They rise over the passes, since what is collapsed too far early must be
-# found and done anew. The last stands for all passes after: from 1.4 or 2.8, more triangles remain.
-PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0
-MOST_PASSES = 20
-ENOUGH = 0.9  # a pass that leaves more of the triangles is the last one
 LEAST_ERROR = 1e-2  # of a triangle's side: the first of the errors that double
 DOUBLINGS = 14
-MOST_ROUNDS = 16  # of keeping more triangles, before smaller distances are tried
+MOST_REPEATS = 16  # of passes, before smaller distances are tried
 HALVINGS = 3
-LEFT = 0.85  # share of the work that is left after a round: a guess
+LEFT = 0.85  # share of the work that is left after passes: a guess
 ANYWHERE: Points = np.zeros((0, 3))
 
-Collapse = Callable[[Mesh, BoolArray, int], Mesh]
-"""Collapses edges of a mesh, but those of the triangles in a mask, (m,), in a pass of a number."""
+Collapse = Callable[[Mesh, BoolArray], Mesh]
+"""Collapses edges of a mesh, but those of the triangles in a mask, (m,)."""
 
 
 class Rounds:
@@ -63,30 +61,27 @@ class Rounds:
 class Passes:
     """Passes of collapsing edges, each of the mesh that the one before made.
 
-    With an original mesh, what they make stays within an error of it.
+    With an original mesh, the last one ends within an error of it.
     """
 
     def __init__(
         self,
         mesh: Mesh,
-        collapse: Collapse,
+        passes: Sequence[Collapse],
         original: Original | None = None,
         error: float = np.inf,
     ) -> None:
-        self.collapse, self.original, self.error = collapse, original, error
+        self.passes, self.original, self.error = passes, original, error
         self.solids, self.meshes = [Solid(mesh)], [mesh]
         self.kept: list[BoolArray] = []  # triangles of each mesh but the last
-        self.places, self.since = ANYWHERE, np.zeros(0, np.intp)  # kept from which mesh on
+        self.places, self.since = ANYWHERE, np.zeros(0, np.intp)  # and the first pass to keep them
 
-    def accepted(self, passes: int, rounds: Rounds) -> Mesh | None:
-        """Return the mesh after some passes, keeping ever more triangles until nothing is wrong.
-
-        None if that fails.
-        """
-        first = len(self.meshes) - 1
-        for _ in range(MOST_ROUNDS):
+    def result(self, rounds: Rounds) -> Mesh | None:
+        """Return what the last pass makes once nothing is wrong with it, None if that fails."""
+        first = 0
+        for _ in range(MOST_REPEATS):
             rounds.count()
-            self._collapse_from(first, passes)
+            self._collapse_from(first)
             result = self.meshes[-1]
             if not len(result.faces):
                 return None
@@ -94,39 +89,38 @@ class Passes:
             if self.original:
                 wrong = np.concatenate([wrong, self.original.beyond(result, self.error)])
             if not len(wrong):
-                same = np.array_equal(euler_numbers(result), self._euler_numbers)
-                return result if same else None
+                return result if same_topology(result, self.meshes[0]) else None
             first = self._keep(wrong)
             if first < 0:
                 return None
         return None
 
-    def _collapse_from(self, first: int, passes: int) -> None:
-        """Make the passes anew from one on."""
+    def _collapse_from(self, first: int) -> None:
+        """Make the passes from one on."""
         del self.meshes[first + 1 :], self.solids[first + 1 :], self.kept[first:]
-        for number in range(first, passes):
-            if not len(self.meshes[number].faces):
-                return
+        for number, collapse in enumerate(self.passes[first:], first):
             base, near = self.meshes[number], self.places[self.since <= number]
+            if not len(base.faces):
+                return
             chosen: BoolArray = np.zeros(len(base.vertices), bool)
             chosen[base.faces[self.solids[number].nearest_face(near)]] = True
             self.kept.append(np.any(chosen[base.faces], axis=1))
-            self.meshes.append(self.collapse(base, self.kept[number], number))
+            self.meshes.append(collapse(base, self.kept[number]))
             self.solids.append(Solid(self.meshes[-1]))
 
     def _keep(self, wrong: Points) -> int:
-        """Keep the triangles around points, in the last pass or, if these are wrong, in one before.
+        """Keep the triangles around points in the first pass that got them wrong.
 
-        Return the first pass that changes, -1 if a point is wrong although all are kept there.
+        Return the first pass that changes, -1 if a point is wrong although it is kept in all.
         """
         first = len(self.kept)
         while len(wrong) and first:
             first -= 1
             distance, face, _ = self.solids[first].nearest(wrong)
-            stuck = self.kept[first][face] | (distance > self.error)
-            self.places = np.concatenate([self.places, wrong[~stuck]])
-            self.since = np.append(self.since, np.full(np.count_nonzero(~stuck), first))
-            wrong = wrong[stuck]
+            before = self.kept[first][face] | ((distance > self.error) & (first > 0))
+            self.places = np.concatenate([self.places, wrong[~before]])
+            self.since = np.append(self.since, np.full(np.count_nonzero(~before), first))
+            wrong = wrong[before]
         return -1 if len(wrong) else first
 
     def _faults(self, result: Mesh) -> Points:
@@ -146,10 +140,6 @@ class Passes:
         return not len(edges)
 
     @cached_property
-    def _euler_numbers(self) -> NDArray[np.int64]:
-        return euler_numbers(self.meshes[0])
-
-    @cached_property
     def _before(self) -> NDArray[np.float64]:
         return irregular_places(self.meshes[0])
 
@@ -159,34 +149,13 @@ def within(
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh within a distance of the original one, and a warning if it is not simpler."""
     for halving in range(HALVINGS):
-        result = _in_passes(mesh, original, error, 2.0**-halving, rounds)
-        if result:
+        distances = error / 2**halving * np.array(PLANE_DISTANCES)
+        passes = [partial(collapse_within, distance=distance) for distance in distances]
+        result = Passes(mesh, passes, original, error).result(rounds)
+        if result and len(result.faces) < len(mesh.faces):
             return result, ()
     return mesh, ("the mesh was not simplified: none of its triangles can be spared within the "
                   "error",)  # fmt: skip
-
-
-def _in_passes(
-    mesh: Mesh, original: Original, error: float, share: float, rounds: Rounds
-) -> Mesh | None:
-    """Return a simpler mesh, by passes with a share of the usual distances; None if that fails.
-
-    The first result that is measured is that of several passes.
-    """
-    distances = share * error * np.array(PLANE_DISTANCES)
-
-    def collapse(base: Mesh, kept: BoolArray, number: int) -> Mesh:
-        return collapse_within(base, kept, distances[min(number, len(distances) - 1)])
-
-    passes, result = Passes(mesh, collapse, original, error), None
-    for count in range(len(distances), MOST_PASSES):
-        coarser = passes.accepted(count, rounds)
-        if coarser is None or len(coarser.faces) >= len((result or mesh).faces):
-            break
-        result = coarser
-        if len(result.faces) > ENOUGH * len(passes.meshes[-2].faces):
-            break
-    return result
 
 
 def down_to(
@@ -202,40 +171,30 @@ def down_to(
         if len(coarser.faces) <= triangles:
             break
         finer, (coarser, _) = coarser, within(coarser, original, error, rounds)
-    exact = _collapsed_to(finer, triangles, rounds)
+    passes = [partial(collapse_to, triangles=triangles)] * len(PLANE_DISTANCES)
+    exact = Passes(finer, passes).result(rounds) or finer
     reached = [some for some in (exact, coarser) if len(some.faces) <= triangles]
     if reached:
         return min(reached, key=lambda some: max(original.deviation(some)[::2])), ()
-    return exact, (f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of "
-                   f"the same topology: it has {len(exact.faces):,}",)  # fmt: skip
+    least = min(exact, coarser, key=lambda some: len(some.faces))
+    return least, (f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of "
+                   f"the same topology: it has {len(least.faces):,}",)  # fmt: skip
 
 
-def _collapsed_to(mesh: Mesh, triangles: int, rounds: Rounds) -> Mesh:
-    """Return a mesh of a number of triangles, at any distance, or the smallest found."""
+def same_topology(one: Mesh, other: Mesh) -> bool:
+    """Return whether both meshes have as many components with the same Euler characteristics.
 
-    def collapse(base: Mesh, kept: BoolArray, number: int) -> Mesh:
-        return collapse_to(base, kept, triangles)
-
-    passes = Passes(mesh, collapse)
-    for count in range(1, MOST_PASSES):
-        coarser = passes.accepted(count, rounds)
-        if coarser is None or len(coarser.faces) >= len(mesh.faces):
-            break
-        mesh = coarser
-    return mesh
-
-
-def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
-    """Return twice the Euler characteristics of the components of a closed mesh, sorted.
-
-    That of the whole mesh alone does not change when a ball and a hole are lost. With open edges,
-    it is a number that changes if the topology does.
+    That of the whole mesh alone does not change when a ball and a hole are lost. Open edges count.
     """
-    component = vertex_components(mesh.faces, len(mesh.vertices))
-    used = np.bincount(mesh.faces.ravel(), minlength=len(component)) > 0
-    triangles = np.bincount(component[mesh.faces[:, 0]])
-    vertices = np.bincount(component[used])
-    return np.sort((2 * vertices - triangles)[triangles > 0])
+
+    def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
+        component = vertex_components(mesh.faces, len(mesh.vertices))
+        used = np.bincount(mesh.faces.ravel(), minlength=len(component)) > 0
+        triangles = np.bincount(component[mesh.faces[:, 0]])
+        vertices = np.bincount(component[used])
+        return np.sort((2 * vertices - triangles)[triangles > 0])
+
+    return np.array_equal(euler_numbers(one), euler_numbers(other))
 
 
 def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
