@@ -30,7 +30,7 @@ ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
 # of the sum of squares), in each pass. What an early pass gets wrong costs most time, so they rise;
 # with an end of 1.4 or 2.8, more triangles are left.
-PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0
+PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0, 2.0
 ROUNDS, RISE = 30, 3.0  # of the threshold to its end; from more rounds, meshes get no smaller
 LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly as well
 FEW_ROUNDS, STEEP_RISE = 8, 5.0
