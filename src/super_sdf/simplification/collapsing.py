@@ -34,8 +34,8 @@ PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0, 2.0
 ROUNDS, RISE = 30, 3.0  # of the threshold to its end; from more rounds, meshes get no smaller
 LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly as well
 FEW_ROUNDS, STEEP_RISE = 8, 5.0
-LEAST_ERROR = 1e-2  # of a triangle's side: the first of the errors that double
-DOUBLINGS = 14
+# Errors that are tried for a number of triangles, in sides of a triangle.
+RISING_ERRORS = 0.05 * 2 ** np.arange(0, 12, 0.5)
 MOST_REPEATS = 16  # of passes, before smaller distances are tried
 HALVINGS = 3
 LEFT = 0.85  # share of the work that is left after passes: a guess
@@ -163,11 +163,11 @@ def down_to(
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning.
 
-    Errors double until there are no more, and what the last one made is compared to what is
-    collapsed to the number, whatever the error.
+    Errors rise until there are no more, and what the last one made is compared to what is collapsed
+    to the number, whatever the error.
     """
     finer = coarser = mesh
-    for error in LEAST_ERROR * mean_side(mesh) * 2.0 ** np.arange(DOUBLINGS):
+    for error in mean_side(mesh) * RISING_ERRORS:
         if len(coarser.faces) <= triangles:
             break
         finer, (coarser, _) = coarser, within(coarser, original, error, rounds)
