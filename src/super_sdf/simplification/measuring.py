@@ -1,8 +1,8 @@
 """How far two surfaces lie apart: exact distances from points of one to the triangles of the other.
 
 The points are the vertices, and those of a pattern on the triangles of the simplified mesh, so that
-a largest distance is that at these points, not a bound of all others. From the unsimplified mesh
-its vertices are enough: its triangles are small, and the distance to a plane is largest at corners.
+a largest distance is that at these points, not a bound of all others. Of the unsimplified mesh, the
+middles of triangles are points, too, where a corner may not be the farthest point.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ..topology import row_keys
 from ..truth.solid import Distances, Points, Solid
 
 POINTS_AT_ONCE = 1 << 18
-SIDES = 2.0  # of the unsimplified mesh, between points of the pattern
+SIDES = 2 / 3  # of the unsimplified mesh, between points of the pattern
 
 
 class Original:
@@ -30,7 +30,7 @@ class Original:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh, self.solid = mesh, Solid(mesh)
         self.step = SIDES * mean_side(mesh)
-        self.distance = np.zeros(len(mesh.vertices))
+        self.distance, self.largest_middle = np.zeros(len(mesh.vertices)), 0.0
         self.near: NDArray[np.intp] = np.full(len(mesh.vertices), -1)  # triangle, or not measured
         self.keys = np.zeros(0, np.uint64)  # of triangles of the simplified mesh, (m,)
         self.back = np.zeros((2, 0))  # their largest distance, nan if not measured; its integral
@@ -38,7 +38,8 @@ class Original:
     def beyond(self, result: Mesh, distance: float) -> Points:
         """Return points of this mesh, (n, 3), where the other one is farther away than this.
 
-        They are its vertices, or if these are near enough, what is nearest to points of the other.
+        They are its vertices, or if these are near enough, the middles of its triangles, or else
+        what is nearest to points of the other.
         """
         self._forget_all_but(result)
         tree, vertices = Solid(result), self.solid.mesh.vertices
@@ -48,6 +49,11 @@ class Original:
         self.near[far] = -1
         if far.any():
             return vertices[far]
+        middles = vertices[self.mesh.faces[self._is_across()]].mean(1)
+        off = tree.distance(middles)
+        self.largest_middle = float(off.max(initial=0))
+        if self.largest_middle > distance:
+            return middles[off > distance]
         return np.concatenate(list(self._measure_back(tree.mesh, distance)))
 
     def deviation(self, result: Mesh) -> tuple[float, float, float, float]:
@@ -57,11 +63,19 @@ class Original:
         around = self.distance[self.mesh.faces].mean(1)
         mean_back = self.back[1].sum() / areas(Solid(result).mesh).sum()
         return (
-            float(self.distance.max()),
+            max(float(self.distance.max()), self.largest_middle),
             float(around @ area / area.sum()),
             float(self.back[0].max()),
             float(mean_back),
         )
+
+    def _is_across(self) -> NDArray[np.bool_]:
+        """Return which triangles are near several triangles of the other mesh, (m,).
+
+        All others are nowhere farther from it than their corners, as triangles are convex.
+        """
+        near = self.near[self.mesh.faces]
+        return (near[:, :1] != near[:, 1:]).any(1)
 
     def _forget_all_but(self, result: Mesh) -> None:
         """Keep what was measured at triangles that a mesh still has."""

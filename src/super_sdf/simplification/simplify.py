@@ -88,7 +88,7 @@ def simplify_mesh(
         Vertices at the same position must be one vertex.
     error : float, optional
         Largest distance, in world units, between the two surfaces, measured both ways at the
-        vertices and at points of the result less than two edges of ``mesh`` apart.
+        vertices and at points less than an edge of ``mesh`` apart.
     triangles : int, optional
         Largest number of triangles. If it cannot be reached, a warning says how many are left.
     max_memory : int, optional
