@@ -1,17 +1,17 @@
-"""Passes of collapsing edges with pyfqmr: what turned out wrong is kept, the rest collapsed again.
+"""Passes of collapsing edges with pyfqmr: where the result is wrong, they are made anew.
 
 pyfqmr is fast quadric mesh simplification (Forstmann): an edge is collapsed if the sum of squared
 distances of the new vertex to the planes of the triangles it replaces is under a threshold, which
 rises in every round. It neither bounds the distance of triangles nor keeps every mesh a manifold.
-So where a collapsed mesh is too far from the unsimplified one, or no longer a manifold, the
-triangles around the place are kept, and the rest is collapsed again. Passes over the result follow,
-in which the triangles to keep are larger already.
+So each pass simplifies what the one before made, and what the last one made is looked at. Where it
+is too far from the unsimplified mesh, or not a manifold, the triangles around the place are kept in
+the first pass that got it wrong, and this pass and those after it are made anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from threading import Lock
 from typing import Any
 
@@ -22,24 +22,27 @@ from pyfqmr import Simplify
 from ..arrays import BoolArray, IntArray
 from ..mesh import Mesh
 from ..progress import ShareCallback
-from ..topology import irregular_places, row_keys, vertex_components
+from ..topology import OpenEdges, irregular_places, row_keys, vertex_components
 from ..truth.solid import Points, Solid
-from .measuring import Original
+from .measuring import Original, mean_side
 
-COLLAPSING_ROUNDS = 30  # in which the threshold rises to its end; from more, meshes get no smaller
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
-# of the sum of squares). At 1, 1.4, 2, 2.8 and 4, a part keeps 17, 17, 13, 15 and 20 % of its
-# triangles at 32^3, another one 9, 9, 8, 9 and 12 %.
-PLANE_DISTANCE = 2.0
-MOST_PASSES = 20
-ENOUGH = 0.9  # a pass that leaves more of the triangles is the last one
-LEAST_DISTANCE = 1e-3  # of a triangle's side: the first of the distances that double
-DOUBLINGS = 20
-MOST_ROUNDS = 8  # of keeping more triangles, before smaller distances are tried
+# of the sum of squares), in each pass. What an early pass gets wrong costs most time, so they rise;
+# with an end of 1.4 or 2.8, more triangles are left.
+PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0, 2.0
+ROUNDS, RISE = 30, 3.0  # of the threshold to its end; from more rounds, meshes get no smaller
+LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly as well
+FEW_ROUNDS, STEEP_RISE = 8, 5.0
+# Errors that are tried for a number of triangles, in sides of a triangle.
+RISING_ERRORS = 0.05 * 2 ** np.arange(0, 12, 0.5)
+MOST_REPEATS = 16  # of passes, before smaller distances are tried
 HALVINGS = 3
-LEFT = 0.85  # share of the work that is left after a round: a guess
+LEFT = 0.85  # share of the work that is left after passes: a guess
 ANYWHERE: Points = np.zeros((0, 3))
+
+Collapse = Callable[[Mesh, BoolArray], Mesh]
+"""Collapses edges of a mesh, but those of the triangles in a mask, (m,)."""
 
 
 class Rounds:
@@ -55,91 +58,127 @@ class Rounds:
         self.left *= LEFT
 
 
+class Passes:
+    """Passes of collapsing edges, each of the mesh that the one before made.
+
+    With an original mesh, the last one ends within an error of it.
+    """
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        passes: Sequence[Collapse],
+        original: Original | None = None,
+        error: float = np.inf,
+    ) -> None:
+        self.passes, self.original, self.error = passes, original, error
+        self.solids, self.meshes = [Solid(mesh)], [mesh]
+        self.kept: list[BoolArray] = []  # triangles of each mesh but the last
+        self.places, self.since = ANYWHERE, np.zeros(0, np.intp)  # and the first pass to keep them
+
+    def result(self, rounds: Rounds) -> Mesh | None:
+        """Return what the last pass makes once nothing is wrong with it, None if that fails."""
+        first = 0
+        for _ in range(MOST_REPEATS):
+            rounds.count()
+            self._collapse_from(first)
+            result = self.meshes[-1]
+            if not len(result.faces):
+                return None
+            wrong = self._faults(result)
+            if self.original:
+                wrong = np.concatenate([wrong, self.original.beyond(result, self.error)])
+            if not len(wrong):
+                return result if same_topology(result, self.meshes[0]) else None
+            first = self._keep(wrong)
+            if first < 0:
+                return None
+        return None
+
+    def _collapse_from(self, first: int) -> None:
+        """Make the passes from one on."""
+        del self.meshes[first + 1 :], self.solids[first + 1 :], self.kept[first:]
+        for number, collapse in enumerate(self.passes[first:], first):
+            base, near = self.meshes[number], self.places[self.since <= number]
+            if not len(base.faces):
+                return
+            chosen: BoolArray = np.zeros(len(base.vertices), bool)
+            chosen[base.faces[self.solids[number].nearest_face(near)]] = True
+            self.kept.append(np.any(chosen[base.faces], axis=1))
+            self.meshes.append(collapse(base, self.kept[number]))
+            self.solids.append(Solid(self.meshes[-1]))
+
+    def _keep(self, wrong: Points) -> int:
+        """Keep the triangles around points in the first pass that got them wrong.
+
+        Return the first pass that changes, -1 if a point is wrong although it is kept in all.
+        """
+        first = len(self.kept)
+        while len(wrong) and first:
+            first -= 1
+            distance, face, _ = self.solids[first].nearest(wrong)
+            before = self.kept[first][face] | ((distance > self.error) & (first > 0))
+            self.places = np.concatenate([self.places, wrong[~before]])
+            self.since = np.append(self.since, np.full(np.count_nonzero(~before), first))
+            wrong = wrong[before]
+        return -1 if len(wrong) else first
+
+    def _faults(self, result: Mesh) -> Points:
+        """Return points, (n, 3), where a mesh is no manifold and the first one is, or is open."""
+        places = irregular_places(result)
+        if not len(places) and self._is_closed:
+            return ANYWHERE
+        made = places[~np.isin(row_keys(places), row_keys(self._before))]
+        lost = self._before[~np.isin(row_keys(self._before), row_keys(places))]
+        lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
+        return np.concatenate([made, lost]).reshape(-1, 3)
+
+    @cached_property
+    def _is_closed(self) -> bool:
+        edges = OpenEdges()  # much faster than ``irregular_places``
+        edges.add(self.meshes[0].faces)
+        return not len(edges)
+
+    @cached_property
+    def _before(self) -> NDArray[np.float64]:
+        return irregular_places(self.meshes[0])
+
+
 def within(
     mesh: Mesh, original: Original, error: float, rounds: Rounds
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh within a distance of the original one, and a warning if it is not simpler."""
-    result = mesh
-    for _ in range(MOST_PASSES):
-        coarser = None
-        for halving in range(HALVINGS):
-            distance = PLANE_DISTANCE * error / 2**halving
-            collapse = partial(collapse_within, result, distance=distance)
-            coarser = _keeping(result, collapse, rounds, partial(original.beyond, distance=error))
-            if coarser is not None:
-                break
-        if coarser is None or len(coarser.faces) >= len(result.faces):
-            break
-        before, result = len(result.faces), coarser
-        if len(result.faces) > ENOUGH * before:
-            break
-    if result is mesh:
-        return mesh, ("the mesh was not simplified: none of its triangles can be spared within the "
-                      "error",)  # fmt: skip
-    return result, ()
-
-
-def down_to(mesh: Mesh, triangles: int, rounds: Rounds) -> tuple[Mesh, tuple[str, ...]]:
-    """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning."""
-    result = _nearly_to(mesh, triangles, rounds) if len(mesh.faces) > triangles else mesh
-    for _ in range(MOST_PASSES):
-        if len(result.faces) <= triangles:
+    for halving in range(HALVINGS):
+        distances = error / 2**halving * np.array(PLANE_DISTANCES)
+        passes = [partial(collapse_within, distance=distance) for distance in distances]
+        result = Passes(mesh, passes, original, error).result(rounds)
+        if result and len(result.faces) < len(mesh.faces):
             return result, ()
-        coarser = _keeping(result, partial(collapse_to, result, triangles=triangles), rounds)
-        if coarser is None or len(coarser.faces) >= len(result.faces):
-            break
-        result = coarser
-    return result, (f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of "
-                    f"the same topology: it has {len(result.faces):,}",)  # fmt: skip
+    return mesh, ("the mesh was not simplified: none of its triangles can be spared within the "
+                  "error",)  # fmt: skip
 
 
-def _nearly_to(mesh: Mesh, triangles: int, rounds: Rounds) -> Mesh:
-    """Return a mesh with no fewer triangles, by passes with distances that double.
+def down_to(
+    mesh: Mesh, original: Original, triangles: int, rounds: Rounds
+) -> tuple[Mesh, tuple[str, ...]]:
+    """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning.
 
-    So flat parts come first, where a collapsed edge costs nothing.
+    Errors rise until there are no more, and what the last one made is compared to what is collapsed
+    to the number, whatever the error.
     """
-    result, side = mesh, mean_side(mesh)
-    for doubling in range(DOUBLINGS):
-        distance = LEAST_DISTANCE * side * 2**doubling
-        coarser = _keeping(result, partial(collapse_within, result, distance=distance), rounds)
-        if coarser is None or len(coarser.faces) < triangles:
+    finer = coarser = mesh
+    for error in mean_side(mesh) * RISING_ERRORS:
+        if len(coarser.faces) <= triangles:
             break
-        result = coarser
-    return result
-
-
-def _keeping(
-    base: Mesh,
-    collapse: Callable[[BoolArray], Mesh],
-    rounds: Rounds,
-    too_far: Callable[[Mesh], Points] = lambda result: ANYWHERE,
-) -> Mesh | None:
-    """Collapse a mesh, keeping ever more triangles until nothing is wrong; None if that fails.
-
-    ``collapse`` takes a mask of the triangles to keep, (m,); ``too_far`` takes the collapsed mesh
-    and returns points, (n, 3), at which it is not accepted.
-    """
-    before = irregular_places(base)
-    kept: BoolArray = np.zeros(len(base.faces), bool)
-    tree: Solid | None = None
-    for _ in range(MOST_ROUNDS):
-        rounds.count()
-        result = collapse(kept)
-        if not len(result.faces):
-            return None
-        places = irregular_places(result)
-        made = places[~np.isin(row_keys(places), row_keys(before))]
-        lost = before[~np.isin(row_keys(before), row_keys(places))]
-        lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
-        faults = np.concatenate([made, lost]).reshape(-1, 3)
-        wrong = np.concatenate([faults, too_far(result)])
-        if not len(wrong):
-            return result if same_topology(result, base) else None
-        tree = tree or Solid(base)
-        near = np.zeros(len(base.vertices), bool)
-        near[base.faces[tree.nearest_face(wrong)]] = True
-        kept[near[base.faces].any(1)] = True
-    return None
+        finer, (coarser, _) = coarser, within(coarser, original, error, rounds)
+    passes = [partial(collapse_to, triangles=triangles)] * len(PLANE_DISTANCES)
+    exact = Passes(finer, passes).result(rounds) or finer
+    reached = [some for some in (exact, coarser) if len(some.faces) <= triangles]
+    if reached:
+        return min(reached, key=lambda some: max(original.deviation(some)[::2])), ()
+    least = min(exact, coarser, key=lambda some: len(some.faces))
+    return least, (f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of "
+                   f"the same topology: it has {len(least.faces):,}",)  # fmt: skip
 
 
 def same_topology(one: Mesh, other: Mesh) -> bool:
@@ -149,10 +188,11 @@ def same_topology(one: Mesh, other: Mesh) -> bool:
     """
 
     def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
-        used, faces = _renumbered(mesh.faces)
-        _, component = np.unique(vertex_components(faces, len(used)), return_inverse=True)
-        vertices, triangles = np.bincount(component), np.bincount(component[faces[:, 0]])
-        return np.sort(2 * vertices - triangles)
+        component = vertex_components(mesh.faces, len(mesh.vertices))
+        used = np.bincount(mesh.faces.ravel(), minlength=len(component)) > 0
+        triangles = np.bincount(component[mesh.faces[:, 0]])
+        vertices = np.bincount(component[used])
+        return np.sort((2 * vertices - triangles)[triangles > 0])
 
     return np.array_equal(euler_numbers(one), euler_numbers(other))
 
@@ -163,9 +203,10 @@ def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
     That is the root of the sum of squared distances, in world units. The triangles that are
     ``kept``, (m,) bool, stay as they are, with their vertices; open edges stay, too.
     """
-    rising = {"alpha": COLLAPSING_ROUNDS**-3.0, "K": 1, "aggressiveness": 3.0}  # to the distance
-    limits = {"target_count": 0, "max_iterations": COLLAPSING_ROUNDS, "update_rate": 1}
-    return _collapse(mesh, kept, distance, {**rising, **limits})
+    few = len(mesh.faces) > LARGE
+    rounds, rise = (FEW_ROUNDS, STEEP_RISE) if few else (ROUNDS, RISE)
+    rising = {"alpha": rounds**-rise, "K": 1, "aggressiveness": rise}  # to the distance
+    return _collapse(mesh, kept, distance, {"target_count": 0, "max_iterations": rounds, **rising})
 
 
 def collapse_to(mesh: Mesh, kept: BoolArray, triangles: int) -> Mesh:
@@ -177,12 +218,6 @@ def collapse_to(mesh: Mesh, kept: BoolArray, triangles: int) -> Mesh:
     return _collapse(mesh, kept, mean_side(mesh), {"target_count": target, "update_rate": 1})
 
 
-def mean_side(mesh: Mesh) -> float:
-    """Return the mean length of the first sides of all triangles."""
-    ends = mesh.vertices[mesh.faces[:, :2]].astype(np.float64)
-    return float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).mean())
-
-
 def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any]) -> Mesh:
     """Return the mesh with the edges between triangles that are not kept collapsed.
 
@@ -191,7 +226,7 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
     """
     middle = mesh.vertices.mean(0, dtype=np.float64)
     scaled = (mesh.vertices - middle) / unit
-    used, collapsed = _renumbered(mesh.faces[~kept])
+    used, collapsed = _renumbered(mesh.faces[~kept], len(scaled))
     moved = scaled[used]
     if len(collapsed):
         with ONE_AT_A_TIME:
@@ -214,7 +249,7 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
     return Mesh(np.concatenate([vertices, mesh.vertices[extra]]), faces)
 
 
-def _renumbered(faces: IntArray) -> tuple[NDArray[np.intp], IntArray]:
-    """Return the vertices that faces (m, 3) use, and the faces with these numbered from 0."""
-    used, numbers = np.unique(faces.ravel(), return_inverse=True)
-    return used.astype(np.intp), numbers.astype(np.int32).reshape(-1, 3)
+def _renumbered(faces: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray]:
+    """Return which of ``count`` vertices faces (m, 3) use, and the faces with these numbered."""
+    used = np.bincount(faces.ravel(), minlength=count) > 0
+    return np.flatnonzero(used), (np.cumsum(used, dtype=np.int32) - 1)[faces]

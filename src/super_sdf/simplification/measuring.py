@@ -1,75 +1,121 @@
 """How far two surfaces lie apart: exact distances from points of one to the triangles of the other.
 
-The points are the vertices and a pattern on every triangle, so that a largest distance is that at
-these points, not a bound of all others.
+The points are the vertices, and those of a pattern on the triangles of the simplified mesh, so that
+a largest distance is that at these points, not a bound of all others. Of the unsimplified mesh, the
+middles of triangles are points, too, where a corner may not be the farthest point.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..mesh import Mesh
+from ..topology import row_keys
 from ..truth.solid import Distances, Points, Solid
 
 POINTS_AT_ONCE = 1 << 18
-PER_SIDE = 1.5  # points along a triangle's side of mean length
+SIDES = 2 / 3  # of the unsimplified mesh, between points of the pattern
 
 
 class Original:
-    """A mesh before it was simplified, with a search tree, and points all over it."""
+    """A mesh before it was simplified, and how far simplified ones were found to be from it.
+
+    What was measured of one simplified mesh holds for the triangles that the next one still has: to
+    them, the distance of a vertex is no larger, and theirs is the same.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
-        self.solid = Solid(mesh)
-        corners = self.solid.mesh.vertices[mesh.faces]
-        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-        self.step = float(sides.mean()) / PER_SIDE
-
-    @cached_property
-    def points(self) -> tuple[Points, Distances]:
-        """Points of the mesh and their weights: see ``points_on``."""
-        points, weights = zip(*points_on(self.solid.mesh, self.step * PER_SIDE))
-        return np.concatenate(points), np.concatenate(weights)
+        self.mesh, self.solid = mesh, Solid(mesh)
+        self.step = SIDES * mean_side(mesh)
+        self.distance, self.largest_middle = np.zeros(len(mesh.vertices)), 0.0
+        self.near: NDArray[np.intp] = np.full(len(mesh.vertices), -1)  # triangle, or not measured
+        self.keys = np.zeros(0, np.uint64)  # of triangles of the simplified mesh, (m,)
+        self.back = np.zeros((2, 0))  # their largest distance, nan if not measured; its integral
 
     def beyond(self, result: Mesh, distance: float) -> Points:
-        """Return points, (n, 3), of either mesh that are farther than this from the other.
+        """Return points of this mesh, (n, 3), where the other one is farther away than this.
 
-        The points within triangles of this mesh, which are many, are looked at only if all others
-        are near enough.
+        They are its vertices, or if these are near enough, the middles of its triangles, or else
+        what is nearest to points of the other.
         """
+        self._forget_all_but(result)
         tree, vertices = Solid(result), self.solid.mesh.vertices
-        found = [vertices[tree.distance(vertices) > distance]]
-        for points, _ in points_on(result, self.step):
-            found.append(points[self.solid.distance(points) > distance])
-        if not any(map(len, found)):
-            within = self.points[0][len(vertices) :]
-            found.append(within[tree.distance(within) > distance])
-        return np.concatenate(found)
+        stale = np.flatnonzero(self.near < 0)
+        self.distance[stale], self.near[stale], _ = tree.nearest(vertices[stale])
+        far = self.distance > distance
+        self.near[far] = -1
+        if far.any():
+            return vertices[far]
+        middles = vertices[self.mesh.faces[self._is_across()]].mean(1)
+        off = tree.distance(middles)
+        self.largest_middle = float(off.max(initial=0))
+        if self.largest_middle > distance:
+            return middles[off > distance]
+        return np.concatenate(list(self._measure_back(tree.mesh, distance)))
 
     def deviation(self, result: Mesh) -> tuple[float, float, float, float]:
         """Return how far a simplified mesh and this one lie apart: see ``Deviation``."""
-        points, weights = self.points
-        there = Solid(result).distance(points)
-        largest = total = area = 0.0
-        for some, weight in points_on(result, self.step):
-            back = self.solid.distance(some)
-            largest = max(largest, float(back.max(initial=0)))
-            total, area = total + float(back @ weight), area + float(weight.sum())
-        mean = float(there @ weights / weights.sum())
-        return float(there.max()), mean, largest, total / area
+        self.beyond(result, np.inf)
+        area = areas(self.mesh)
+        around = self.distance[self.mesh.faces].mean(1)
+        mean_back = self.back[1].sum() / areas(Solid(result).mesh).sum()
+        return (
+            max(float(self.distance.max()), self.largest_middle),
+            float(around @ area / area.sum()),
+            float(self.back[0].max()),
+            float(mean_back),
+        )
+
+    def _is_across(self) -> NDArray[np.bool_]:
+        """Return which triangles are near several triangles of the other mesh, (m,).
+
+        All others are nowhere farther from it than their corners, as triangles are convex.
+        """
+        near = self.near[self.mesh.faces]
+        return (near[:, :1] != near[:, 1:]).any(1)
+
+    def _forget_all_but(self, result: Mesh) -> None:
+        """Keep what was measured at triangles that a mesh still has."""
+        keys = row_keys(result.vertices.astype(np.float64)[result.faces].reshape(-1, 9))
+        order = np.argsort(keys)
+        at = np.searchsorted(keys, self.keys, sorter=order) if len(keys) else self.keys
+        same = order[np.minimum(at, len(keys) - 1)]
+        stays = keys[same] == self.keys
+        there = np.where(stays, same, -1)
+        back = np.full((2, len(keys)), np.nan)
+        back[:, same[stays]] = self.back[:, stays]
+        self.near = np.append(there, -1)[self.near]
+        self.keys, self.back = keys, back
+
+    def _measure_back(self, result: Mesh, distance: float) -> Iterator[Points]:
+        """Measure triangles that are not yet; yield what is nearest to those farther than this."""
+        new = np.flatnonzero(np.isnan(self.back[0]))
+        faces = result.faces[new]
+        used, corner = np.unique(faces, return_inverse=True)
+        found, _, feet = self.solid.nearest(result.vertices[used])
+        yield feet[found > distance]
+        largest, total = found[corner.reshape(-1, 3)].max(1, initial=0), np.zeros(len(new))
+        for points, weights, face in points_within(Mesh(result.vertices, faces), self.step):
+            found, _, feet = self.solid.nearest(points)
+            np.maximum.at(largest, face, found)
+            total += np.bincount(face, found * weights, len(new))
+            yield feet[found > distance]
+        self.back[:, new] = np.where(largest > distance, np.nan, largest), total
 
 
-def points_on(mesh: Mesh, step: float) -> Iterator[tuple[Points, Distances]]:
-    """Yield points of a mesh, (n, 3), and the area that each stands for, (n,), in chunks.
+def mean_side(mesh: Mesh) -> float:
+    """Return the mean length of the first sides of all triangles."""
+    start, end = mesh.vertices.astype(np.float64)[mesh.faces[:, :2].T]
+    return float(np.linalg.norm(end - start, axis=1).mean())
 
-    They are the vertices, which stand for none, and those of ``points_within``.
-    """
-    yield mesh.vertices.astype(np.float64), np.zeros(len(mesh.vertices))
-    for points, weights, _ in points_within(mesh, step):
-        yield points, weights
+
+def areas(mesh: Mesh) -> Distances:
+    """Return the areas of triangles, (m,)."""
+    a, b, c = mesh.vertices[mesh.faces.T]
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
 def points_within(mesh: Mesh, step: float) -> Iterator[tuple[Points, Distances, NDArray[np.int64]]]:
