@@ -62,6 +62,7 @@ class Task:
     threads: int = 0  # of the network; 0: one per core
     turned: int | None = None  # seed by which the shape is turned at random
     limit: float | None = None  # seconds
+    triangles: tuple[tuple[str, int], ...] = ()  # of methods that were measured before
 
     def network(self, method: str) -> tuple[str, str]:
         """Return model and precision of a method."""
@@ -94,6 +95,8 @@ def measure_task(task: Task, shape: Shape) -> Iterator[tuple[str, Measurement]]:
     except Exception as problem:  # all methods of the task fail; other tasks still count
         yield from ((method, {"error": reason_of(problem)}) for method in task.methods)
         return
+    if case:
+        case.triangles.update(task.triangles)
     for method in task.methods:
         figures = measure_method(shape, case, method, task)
         if case and "faces" in figures:

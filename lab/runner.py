@@ -38,7 +38,10 @@ def complete(
     When a process dies, the methods of its task are measured again, each on its own, so that only
     those that end a process fail. At a time limit all methods of the task fail.
     """
-    left = [replace(task, methods=missing(task, rows)) for task in tasks]
+    left = [
+        replace(task, methods=missing(task, rows), triangles=triangles_of(task, rows))
+        for task in tasks
+    ]
     queue = deque(task for task in sorted(left, key=shape_key) if task.methods)
     done, total, unreadable = 0, len(queue), {}
     results = Pool(queue, worker).results(jobs) if jobs else ((t, measured(t)) for t in queue)
@@ -63,6 +66,12 @@ def complete(
 def missing(task: Task, rows: Rows) -> tuple[str, ...]:
     """Return the methods of a task that have to be measured."""
     return tuple(m for m in task.methods if not rows.is_final(task.key(m), task.limit))
+
+
+def triangles_of(task: Task, rows: Rows) -> tuple[tuple[str, int], ...]:
+    """Return how many triangles the methods made that are measured: others are to have as many."""
+    found = ((method, rows.get(task.key(method)) or {}) for method in task.methods)
+    return tuple((method, row["faces"]) for method, row in found if "faces" in row)
 
 
 def shape_key(task: Task) -> tuple[Path, int]:

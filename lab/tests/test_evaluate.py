@@ -219,6 +219,15 @@ def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(meshes, tmp_pat
     assert seen == [(number, 4, "box") for number in range(1, 5)]
 
 
+def test_as_many_triangles_as_a_method_that_was_measured_before(meshes, tmp_path):
+    rows, methods = Rows(tmp_path / "rows.jsonl"), ("mc", "ours/mc")
+    for some in (methods[:1], methods):
+        task = task_of(meshes / "box.ply", some)
+        assert complete([task], rows, 0) == []
+    measured = [rows.get(task.key(method)) for method in methods]
+    assert measured[1]["error"] is None and measured[1]["faces"] <= measured[0]["faces"]
+
+
 def test_a_process_over_its_limit_is_ended(meshes, tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "worker", stand_in)
     task, rows = task_of(meshes / "box.ply", ("bound", "mc"), limit=0.5), Rows(tmp_path / "rows")
