@@ -234,7 +234,7 @@ def test_what_does_not_fit_in_memory_is_refused_and_nothing_is_written(here, com
         patch.setattr(simplify, "held_memory", lambda: 10**8)
         simplify_mesh(torus(), error=1e-3, max_memory=10**8)
     assert str(error.value) == (
-        "simplifying 9,216 triangles needs 109 MB of memory, since the whole mesh must be held; "
+        "simplifying 9,216 triangles needs 112 MB of memory, since the whole mesh must be held; "
         "100 MB may be used; use a smaller factor, allow more (--max-memory), or do not simplify"
     )
     monkeypatch.setattr(simplify, "BYTES_PER_TRIANGLE", 10**9)

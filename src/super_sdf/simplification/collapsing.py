@@ -35,7 +35,7 @@ ROUNDS, RISE = 30, 3.0  # of the threshold to its end; from more rounds, meshes 
 LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly as well
 FEW_ROUNDS, STEEP_RISE = 8, 5.0
 # Errors that are tried for a number of triangles, in sides of a triangle.
-RISING_ERRORS = 0.05 * 2 ** np.arange(0, 12, 0.5)
+RISING_ERRORS = 0.05 * 2.0 ** np.array([-2, -1, *np.arange(0, 12, 0.5)])
 MOST_REPEATS = 16  # of passes, before smaller distances are tried
 HALVINGS = 3
 LEFT = 0.85  # share of the work that is left after passes: a guess
