@@ -30,8 +30,8 @@ class Deviation:
     Attributes
     ----------
     largest, mean : float
-        From the vertices of the mesh to the simplified one, or at most that; the mean is over the
-        area.
+        From the vertices of the mesh, and middles of its triangles, to the simplified one, or a
+        bound of that; the mean is over the area.
     largest_back, mean_back : float
         From the vertices of the simplified mesh, and points on it, to the mesh.
     """
