@@ -3,9 +3,9 @@
     python -m export.edges --meshes FOLDER_OF_PLY --procedural 0.4 --count 200 --out edges.npz
 
 Shapes for training are sampled on a grid and refined by the shipped network. For every candidate
-of the mesher the two surfaces there, with the vertex on the edge and without it, are compared with
-the true one. The rule is a logistic regression of which is better on the evidence, weighted by by
-how much. The rows are kept in ``--out``; with ``--fit`` alone they are fitted again.
+of the mesher the surfaces there are compared with the true one, with vertices that go some shares
+of the way to the edge. The rule is the linear one of the evidence that loses least in the mean. The
+rows are kept in ``--out``; with ``--fit`` alone they are fitted again.
 """
 
 from __future__ import annotations
@@ -27,35 +27,29 @@ from super_sdf.pipeline import upsample
 from super_sdf.steps.cap import close_at_border
 from super_sdf.steps.field import FineField
 from super_sdf.steps.marching import find_crossings, to_world
-from super_sdf.steps.sharp.features import Candidates, Rule, find_candidates, move_beside
-from super_sdf.steps.sharp.patches import (
-    Patches,
-    Placed,
-    fan_triangles,
-    find_patches,
-    flat_triangles,
-    unfolded,
-)
-from super_sdf.steps.sharp.planes import Planes, planes_at_crossings
+from super_sdf.steps.sharp.features import Rule, find_candidates, placed_by
+from super_sdf.steps.sharp.patches import Placed, Triangles, find_patches, triangles_of
+from super_sdf.steps.sharp.planes import planes_at_crossings
 from super_sdf.truth.solid import Solid
 
 SIZES = (24, 32, 32, 48)  # drawn from, samples along an axis
 FACTOR = 4
-DISTANCE, TURN = 0.01, 0.05  # gains that count alike: coarse voxels, and 1 - cosine of normals
-MOST = 5.0  # such gains that one candidate counts for
-MOST_OF_SHAPE = 2000  # candidates that one shape counts for
+SHARES = np.linspace(0, 1, 5)  # of the way to the edge at which losses are measured
+DISTANCE, TURN = 0.01, 0.05  # losses that count alike: coarse voxels, and 1 - cosine of normals
+MOST = 5.0  # that one candidate may lose beyond the best share
 AT = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6]])  # points of a triangle
-PENALTY = 1.0  # of the squares of the weights of the standardised evidence
-STEPS = 30  # of Newton's method
+MOST_OF_SHAPE = 2000  # candidates that one shape counts for
+PENALTY = 1e-4  # of the squares of the weights of the standardised evidence
+STEPS = 300  # of gradient descent
+RATE = 0.02
+# Shares that lose least are made 0 and 1 from here on: that costs a twentieth of the gain
+# and more edges are whole.
+KNEE = 0.3, 0.7
 
-
-Triangles = tuple[np.ndarray, np.ndarray]
-"""The patch of each triangle, (t,), and its corners in fine spacings, (t, 3, 3)."""
 Rows = dict[str, np.ndarray]
-"""The ``shape`` of each candidate, (n,), its ``evidence``, (n, e), and its ``gain``, (n, 2).
+"""The ``shape`` of each candidate, (n,), its ``evidence``, (n, e), and its ``loss``, (n, s).
 
-A gain is by how much nearer the surface is with a vertex on the edge, in coarse voxels, and by how
-much 1 - cosine of its normals is less.
+The loss is how far the surface there is from the true one, and turned from it, at ``SHARES``.
 """
 
 
@@ -70,44 +64,31 @@ def draw_case(rng: np.random.Generator, paths: list[Path], procedural: float, nu
 
 
 def rows_of(case: Case, network: Network) -> tuple[np.ndarray, np.ndarray]:
-    """Return the evidence (f, e) and the gain (f, 2) of all candidates of a case."""
+    """Return the evidence (f, e) and the losses (f, s) of all candidates of a case."""
     field = close_at_border(upsample(case.grid, network, FACTOR))
     every = np.ones(len(field.voxel_ijk), bool)
     crossings = find_crossings(field, slice(0, len(every)))
     patches, used = find_patches(field, crossings, every)
     own = planes_at_crossings(field, crossings, used)
     candidates = find_candidates(patches, own, every, field)
-    if not len(candidates.patch):
-        return candidates.evidence, np.empty((0, 2))
-    without, with_all = surfaces(patches, own, candidates)
-    before, after = (
-        np.stack(errors_of(case.shape.solid, some, len(patches.row), field, case.grid), 1)
-        for some in (without, with_all)
-    )
-    return candidates.evidence, (before - after)[candidates.patch]
-
-
-def surfaces(patches: Patches, own: Planes, candidates: Candidates) -> tuple[Triangles, Triangles]:
-    """Return the triangles of all candidates without a vertex on the edge, and with one."""
-    chosen = np.zeros(len(patches.row), bool)
-    chosen[candidates.patch] = True
-    patch, corners = flat_triangles(patches, chosen)
-    flat = patch, own.point[corners]
-    moved = move_beside(patches, own, candidates, np.ones(len(candidates.patch), bool))
-    placed = Placed(moved, candidates.planes.normal, candidates.patch, candidates.vertex)
-    placed = unfolded(patches, placed)
-    patches_of, corners_of = zip(*fan_triangles(patches, placed))
-    return flat, (np.concatenate(patches_of), placed.points[np.concatenate(corners_of)])
+    losses = []
+    for way in SHARES:
+        placed = placed_by(patches, own, candidates, np.full(len(candidates.patch), way))
+        made = triangles_of(patches, placed)
+        errors = errors_of(case.shape.solid, made, placed, field, case.grid)
+        losses.append((errors[candidates.patch] / (DISTANCE, TURN)).sum(1))
+    return candidates.evidence, np.stack(losses, 1)
 
 
 def errors_of(
-    solid: Solid, triangles: Triangles, count: int, field: FineField, grid: SdfGrid
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean distance to the true surface of each of ``count`` patches, and 1 - cosine.
+    solid: Solid, triangles: Triangles, placed: Placed, field: FineField, grid: SdfGrid
+) -> np.ndarray:
+    """Return the mean distance to the true surface of each patch, and 1 - cosine, (P, 2).
 
     Distances are in coarse voxels. Patches without triangles have 0.
     """
     patch, corners = triangles
+    corners = placed.points[corners]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     normal /= np.maximum(area, 1e-12)[:, None]
@@ -117,8 +98,9 @@ def errors_of(
     true = face_vectors(solid.mesh)[solid.nearest_face(world)]
     true /= np.maximum(np.linalg.norm(true, axis=1), 1e-15)[:, None]
     turned = 1 - np.einsum("ptd,td->pt", true.reshape(len(AT), -1, 3), normal).mean(0)
-    total = np.maximum(np.bincount(patch, area, count), 1e-12)
-    return tuple(np.bincount(patch, area * error, count) / total for error in (distance, turned))
+    total = np.maximum(np.bincount(patch, area), 1e-12)
+    sums = [np.bincount(patch, area * error) for error in (distance, turned)]
+    return np.stack(sums, 1) / total[:, None]
 
 
 def gather(options: argparse.Namespace) -> Rows:
@@ -130,48 +112,62 @@ def gather(options: argparse.Namespace) -> Rows:
     while (number := len(parts)) < options.count:
         try:
             case = draw_case(rng, paths, options.procedural, number)
-            evidence, gain = rows_of(case, network)
+            evidence, loss = rows_of(case, network)
         except SuperSdfError:
             continue
-        parts.append((np.full(len(evidence), number), evidence, gain))
+        parts.append((np.full(len(evidence), number), evidence, loss))
         print(f"{number + 1} shapes, {len(evidence)} candidates of the last", flush=True)
-    rows = dict(zip(("shape", "evidence", "gain"), map(np.concatenate, zip(*parts))))
+    rows = dict(zip(("shape", "evidence", "loss"), map(np.concatenate, zip(*parts))))
     np.savez(options.out, **rows)
     return rows
 
 
-def fit_rule(rows: Rows, bias: float = 0.0) -> Rule:
-    """Return the logistic regression of which surface is better on the evidence.
-
-    A candidate weighs by how much is gained or lost, and less where its shape has many more than
-    others. ``bias`` is added to the scores: under 0 it keeps marching cubes where both are close.
-    """
-    gain = rows["gain"] @ (1 / np.array([DISTANCE, TURN]))
-    weight = np.minimum(np.abs(gain), MOST)
-    weight *= np.minimum(1, MOST_OF_SHAPE / np.bincount(rows["shape"])[rows["shape"]])
+def fit_rule(rows: Rows) -> Rule:
+    """Return the rule of the least loss, by Adam's descent, made steeper at ``KNEE``."""
     mean, spread = rows["evidence"].mean(0), np.maximum(rows["evidence"].std(0), 1e-9)
-    design = np.c_[np.ones(len(gain)), (rows["evidence"] - mean) / spread]
-    found = np.zeros(design.shape[1])
-    penalty = PENALTY * np.diag(np.r_[0, np.ones(len(mean))])
-    for _ in range(STEPS):
-        likely = 1 / (1 + np.exp(-np.clip(design @ found, -30, 30)))
-        slope = design.T @ (weight * (likely - (gain > 0))) + penalty @ found
-        curve = (design.T * (weight * likely * (1 - likely))) @ design + penalty
-        found -= np.linalg.solve(curve, slope)
-    weights = found[1:] / spread
-    return Rule(float(found[0] - weights @ mean) + bias, tuple(weights.tolist()))
+    design = np.c_[np.ones(len(mean_rows := rows["evidence"])), (mean_rows - mean) / spread]
+    weight, loss = weights_of(rows), capped(rows["loss"])
+    found, first, second = np.zeros((3, design.shape[1]))
+    found[0] = 0.5
+    for step in range(1, STEPS + 1):
+        share = design @ found
+        slope = loss_of(loss, np.clip(share, 0, 1))[1] * ((share > 0) & (share < 1))
+        slope = design.T @ (weight * slope) + PENALTY * found
+        first, second = 0.9 * first + 0.1 * slope, 0.99 * second + 0.01 * slope**2
+        fair = first / (1 - 0.9**step), second / (1 - 0.99**step)
+        found -= RATE * (1 - step / STEPS) * fair[0] / (np.sqrt(fair[1]) + 1e-12)
+    weights, (low, high) = found[1:] / spread, KNEE
+    bias = found[0] - weights @ mean
+    return Rule(float(bias - low) / (high - low), tuple((weights / (high - low)).tolist()))
+
+
+def weights_of(rows: Rows) -> np.ndarray:
+    """Return what candidates count for, (n,): less where their shape has many more than others."""
+    weight = np.minimum(1, MOST_OF_SHAPE / np.bincount(rows["shape"])[rows["shape"]])
+    return weight / weight.sum()
+
+
+def loss_of(loss: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the loss at a share, (n,), between those at ``SHARES``, and its slope."""
+    place = share * (len(SHARES) - 1)
+    low = np.clip(place.astype(int), 0, len(SHARES) - 2)
+    row = np.arange(len(loss))
+    slope = loss[row, low + 1] - loss[row, low]
+    return loss[row, low] + (place - low) * slope, slope * (len(SHARES) - 1)
+
+
+def capped(loss: np.ndarray) -> np.ndarray:
+    """Return losses over that of the best share, (n, s), so that none counts for too much."""
+    return np.minimum(loss - loss.min(1, keepdims=True), MOST)
 
 
 def report(rows: Rows, rule: Rule) -> str:
-    """Return the gains of all candidates, of those that a rule keeps, and of the best ones."""
-    kept = rule.score(rows["evidence"]) > 0
-    best = rows["gain"] @ (1 / np.array([DISTANCE, TURN])) > 0
-    lines = [
-        f"{name}: {which.sum()} candidates, {rows['gain'][which, 0].sum():.0f} voxels nearer, "
-        f"1 - cosine less by {rows['gain'][which, 1].sum():.0f}"
-        for name, which in (("all", kept | True), ("kept", kept), ("best", best))
-    ]
-    return "\n".join(lines)
+    """Return the mean loss with vertices in the middle, by a rule, and on the edge."""
+    share, loss, weight = rule.share(rows["evidence"]), capped(rows["loss"]), weights_of(rows)
+    shares = {"middle": 0 * share, "rule": share, "edge": 0 * share + 1}
+    return "\n".join(
+        f"{name}: {weight @ loss_of(loss, some)[0]:.4f}" for name, some in shares.items()
+    )
 
 
 def main() -> None:
@@ -182,13 +178,12 @@ def main() -> None:
     parser.add_argument("--count", type=at_least(1), default=200, help="shapes to draw")
     parser.add_argument("--out", type=Path, required=True, help="file of the rows, .npz")
     parser.add_argument("--fit", action="store_true", help="fit the rows in --out again")
-    parser.add_argument("--bias", type=float, default=0.0, help="added to the scores")
     parser.add_argument("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
     rows = dict(np.load(options.out)) if options.fit else gather(options)
-    rule = fit_rule(rows, options.bias)
+    rule = fit_rule(rows)
     print(report(rows, rule))
-    print(f"Rule({rule.bias:.3f}, ({', '.join(f'{weight:.3f}' for weight in rule.weights)}))")
+    print(f"Rule({rule.bias:.4f}, ({', '.join(f'{weight:.4f}' for weight in rule.weights)}))")
 
 
 if __name__ == "__main__":

@@ -3,15 +3,27 @@
 import numpy as np
 import pytest
 from conftest import ball, count_fans, trilinear
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_isosurface import dense_field
 
 from lab.methods import sharp_isosurface
 from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
+from super_sdf.certificate.search import self_intersections
 from super_sdf.steps.cell_cases import loop_table, triangle_table
-from super_sdf.steps.sharp.features import Rule
-from super_sdf.steps.sharp.patches import Patches, Placed, triangles_of, unfolded
+from super_sdf.steps.marching import find_crossings
+from super_sdf.steps.sharp.features import Rule, is_sharp
+from super_sdf.steps.sharp.folds import without_folds
+from super_sdf.steps.sharp.patches import (
+    Patches,
+    Placed,
+    find_patches,
+    triangles_of,
+    unfolded,
+    voxels_near_kinks,
+)
+from super_sdf.steps.sharp.planes import planes_at_crossings
+from super_sdf.steps.sharp.triangle_pairs import intersecting
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 
@@ -67,20 +79,103 @@ def test_edges_of_a_box_are_kept_and_most_corners():
     assert np.mean(apart) < 0.02
 
 
-@settings(max_examples=50)
-@given(st.integers(0, 10**6), st.sampled_from([0.05, 0.3, 1.0]))
-def test_any_lattice_gives_a_closed_manifold_with_features_everywhere(seed, least):
-    """With every patch a feature: fans and turned sides, ambiguous faces among them."""
+@pytest.mark.parametrize("factor", [2, 4, 8])
+def test_all_patches_that_turn_are_in_voxels_that_are_looked_at(factor):
+    grid = turned_box(np.array([4.2, 3.1, 2.3]), 14)
+    field = upsample(grid, load_network(), factor)
+    every = slice(0, len(field.voxel_ijk))
+    kinked, crossings = voxels_near_kinks(field, every), find_crossings(field, every)
+    patches, used = find_patches(field, crossings, np.ones(len(kinked), bool))
+    planes = planes_at_crossings(field, crossings, used)
+    sharp = is_sharp(patches, planes.normal, planes.trust)
+    assert sharp.sum() > 100 and kinked[patches.row[sharp]].all() and not kinked.all()
+
+
+@pytest.fixture
+def features_everywhere():
+    """Let every patch be a feature: fans and turned sides, ambiguous faces among them."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (
+            ("SHARP_COSINE", 1.1),
+            ("LEAST_SLOPE_TRUST", 0),
+            ("LEAST_SPHERES", 0),
+            ("RULE", Rule(1.0, ())),
+        ):
+            patch.setattr(f"super_sdf.steps.sharp.features.{name}", value)
+        yield patch
+
+
+def noise(seed, least):
     lattice = np.random.default_rng(seed).normal(size=(9, 9, 7)).astype(np.float32) * least
     lattice[[0, -1]] = lattice[:, [0, -1]] = lattice[:, :, [0, -1]] = 1
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("super_sdf.steps.sharp.features.SHARP_COSINE", 1.1)
-        patch.setattr("super_sdf.steps.sharp.features.LEAST_SLOPE_TRUST", 0)
-        patch.setattr("super_sdf.steps.sharp.features.RULE", Rule(1.0, ()))
-        mesh = extract_sharp(*dense_field(lattice))
+    return dense_field(lattice)
+
+
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.integers(0, 10**6), st.sampled_from([0.05, 0.3, 1.0]))
+def test_any_lattice_gives_a_closed_manifold_with_features_everywhere(
+    features_everywhere, seed, least
+):
+    mesh = extract_sharp(*noise(seed, least))
     if len(mesh.faces):
         assert mesh.open_edges() == 0
         assert (count_fans(mesh.faces) == 1).all()
+
+
+def test_no_triangles_intersect_with_features_everywhere(features_everywhere):
+    """In noise, where marching cubes has none; and there are hundreds if folds are left."""
+    fields = [noise(seed, 1.0) for seed in range(8)]
+    plain = [self_intersections(extract_mesh(*field)) for field in fields]
+    assert plain.count(0) > 4
+    for field, already in zip(fields, plain):
+        assert self_intersections(extract_sharp(*field)) <= already
+    features_everywhere.setattr("super_sdf.steps.sharp.mesher.without_folds", lambda *of: of[1])
+    assert self_intersections(extract_sharp(*fields[0])) > 100
+
+
+def test_a_blade_and_a_gap_do_not_intersect():
+    """Sheets half a fine spacing apart, turned: each of the fans reaches into the other's cells."""
+    for half in ([0.9, 5.1, 4.3], [0.3, 5.1, 4.3], [6.2, 0.15, 0.15]):
+        lattice = turned_box(4 * np.array(half), 49).values.astype(np.float32) / 4
+        for sign in (1, -1):
+            field = sign * (lattice if sign > 0 else np.minimum(lattice, 5.0))
+            mesh = sharp_isosurface(field, 0.25, 0.0)
+            assert self_intersections(mesh) == 0
+
+
+def test_features_of_a_box_along_the_lattice_are_kept(monkeypatch):
+    """Its triangles lie in common planes, and some of its vertices on nodes."""
+    half, kept = np.array([3.0, 2.5, 2.0]), []
+    beyond = np.abs(np.indices((49,) * 3).reshape(3, -1) / 4 - 6.125) - half[:, None]
+    distance = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
+
+    def counting(*of):
+        kept.append((len(of[1].feature), len(without_folds(*of).feature)))
+        return without_folds(*of)
+
+    monkeypatch.setattr("super_sdf.steps.sharp.mesher.without_folds", counting)
+    sharp_isosurface(distance.reshape((49,) * 3).astype(np.float32), 0.25, 0.0)
+    assert kept[0][0] == kept[0][1] > 100
+
+
+# A triangle, and others over it: beside it, through it, flat on it, at a common corner.
+PAIRS = [
+    ([[1.0, 1, -1], [1, 1, 1], [2, 2, 1]], False),
+    ([[0.2, 0.2, -1], [0.2, 0.2, 1], [2, 2, 1]], True),
+    ([[0.1, 0.1, 0.01], [0.9, 0.1, 0.01], [0.1, 0.9, 0.01]], False),
+    ([[0.0, 0, 0], [1, 1, 1], [0.5, 0.5, -1]], True),
+    ([[0.0, 0, 0], [-1, 0, 1], [-1, 0.5, -1]], False),
+    ([[0.0, 0, 0], [-1, 0, 0], [0, -1, 0]], False),
+]
+
+
+@pytest.mark.parametrize("corners, want", PAIRS)
+def test_which_triangles_intersect(corners, want):
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], *corners])
+    second = [0 if not any(corners[0]) else 3, 4, 5]
+    first, _ = intersecting(points, np.array([[0, 1, 2]]), np.array([second]))
+    turned, _ = intersecting(points, np.array([second]), np.array([[0, 1, 2]]))
+    assert len(first) == len(turned) == want
 
 
 def test_the_true_distance_is_meshed_on_its_edges():

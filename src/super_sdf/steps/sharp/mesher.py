@@ -29,7 +29,8 @@ from ..marching import (
     lattice_positions,
     to_world,
 )
-from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, is_sharp, place_features
+from .features import CHAIN_ROUNDS, MOVED_RINGS, RINGS, place_features
+from .folds import REACH, without_folds
 from .patches import (
     Index,
     Patches,
@@ -45,7 +46,7 @@ from .planes import ROUNDS, planes_at_crossings
 
 # Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
 # is the fan beside.
-REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + 5
+REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + REACH + 5
 TEMPORARIES = 16  # numbers per crossing in the computation of its position
 REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
 GROUP_BYTES = 1 << 28  # what the own planes of a group may take
@@ -62,10 +63,10 @@ def extract_pieces(
     kinked = voxels_near_kinks(field, _rows_around(field), threads)
     groups = groups_of_planes(field, kinked, at_once)
     if len(groups) == 1:
-        return extract_group(field, grid, kinked, first_vertex, at_once)
+        return extract_group(field, grid, kinked, first_vertex)
 
     def mesh_of(planes: PlaneRange) -> list[Mesh]:
-        return extract_group(replace(field, planes=planes), grid, kinked, 0, 1)
+        return extract_group(replace(field, planes=planes), grid, kinked)
 
     meshes = list(chain.from_iterable(map_threads(mesh_of, groups, at_once)))
     counts = [len(mesh.vertices) for mesh in meshes]
@@ -83,14 +84,15 @@ def groups_at_once(planes: PlaneRange, shape: tuple[int, ...]) -> int:
 def groups_of_planes(field: FineField, kinked: BoolArray, threads: int) -> list[PlaneRange]:
     """Cut a field's own planes into groups that take about the same memory.
 
-    As many as memory asks for, and one for each thread if the groups are then not thinner than the
-    planes beside them, which are worked on again with every group.
+    As many as memory asks for, and one for each thread if the groups are then at least twice as
+    thick as the planes beside them, which are worked on again with every group. Threads within a
+    group would only wait for each other: its arrays are small.
     """
     first, last = field.planes
     plain, edged = voxel_bytes(field.factor)
     size = plain + edged * _near_kinks(field, kinked)[field.own_rows]
     before = np.cumsum(np.bincount(field.voxel_ijk[field.own_rows, 0] - first, size, last - first))
-    thick = (last - first) // (2 * planes_beside(field.factor))
+    thick = (last - first) // (4 * planes_beside(field.factor))
     count = max(-int(-before[-1] // GROUP_BYTES), min(threads, thick), 1)
     inner = first + np.searchsorted(before, np.arange(1, count) / count * before[-1])
     return list(pairwise(np.unique([first, *inner, last]).tolist()))
@@ -118,7 +120,7 @@ def _near_kinks(field: FineField, chosen: BoolArray) -> BoolArray:
 
 
 def extract_group(
-    field: FineField, grid: SdfGrid, kinked: BoolArray, first_vertex: int = 0, threads: int = 1
+    field: FineField, grid: SdfGrid, kinked: BoolArray, first_vertex: int = 0
 ) -> list[Mesh]:
     """Return the mesh of a field's planes with its edges and corners, as a list of one piece.
 
@@ -127,10 +129,10 @@ def extract_group(
     """
     rows = _rows_around(field)
     before = field.plane_before(rows).start if rows.start < rows.stop else rows.start
-    crossings = find_crossings(field, slice(before, rows.stop), threads)
+    crossings = find_crossings(field, slice(before, rows.stop))
     if not len(crossings.own_row):
         return [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
-    examined = examine(field, crossings, rows, kinked, threads)
+    examined = examine(field, crossings, rows, kinked)
     count, row = len(field.voxel_ijk) + 1, examined.patches.row[examined.placed.feature]
     edges = np.bincount(crossings.own_row, minlength=count)
     peaks = np.bincount(row, minlength=count)
@@ -159,23 +161,17 @@ class Examined:
     placed: Placed  # where the vertices on these crossings and on the features belong
 
 
-def examine(
-    field: FineField, crossings: Crossings, rows: slice, kinked: BoolArray, threads: int = 1
-) -> Examined:
-    """Look for edges and corners in and beside kinked voxels in which a patch turns as at one."""
+def examine(field: FineField, crossings: Crossings, rows: slice, kinked: BoolArray) -> Examined:
+    """Look for edges and corners in kinked voxels and beside them."""
     here = _within(np.arange(len(kinked)), rows)
-    patches, used = find_patches(field, crossings, kinked & here)
-    own = planes_at_crossings(field, crossings, used, threads)
-    turning = np.zeros(len(kinked), bool)
-    turning[patches.row[is_sharp(patches, own.normal, own.trust)]] = True
-
-    voxels = _near_kinks(field, turning) & here
+    voxels = _near_kinks(field, kinked & here) & here
     patches, used = find_patches(field, crossings, voxels)
-    own = planes_at_crossings(field, crossings, used, threads)
-    placed = place_features(patches, own, turning, field, threads)
+    own = planes_at_crossings(field, crossings, used)
+    placed = place_features(patches, own, kinked, field)
     position = _kept_in_grid(placed.position, own.point, field)
     peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, field)
-    return Examined(voxels, patches, used, replace(placed, position=position, peak=peak))
+    kept = replace(placed, position=position, peak=peak)
+    return Examined(voxels, patches, used, without_folds(patches, kept, own.point))
 
 
 def _kept_in_grid(position: Vectors, start: Vectors, field: FineField) -> Vectors:

@@ -1,7 +1,7 @@
 """Voxels that may hold an edge, the patches of the surface in their cells, and their triangles.
 
-On a fine grid almost all of a surface is smooth. Finding that out block by block, by the largest
-and smallest differences along each axis, takes a tenth of the time of looking for edges.
+On a fine grid almost all of a surface is smooth. Finding that out block by block, by the second
+differences along each axis, takes a fraction of the time of looking for edges.
 
 A patch is a piece of the surface in one cell: a loop of crossed lattice edges, from one to the
 next across the faces of the cell. Two cells that share a face share the crossings on it.
@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import BoolArray, FloatArray, IntArray
-from ...machine.resources import chunks_of, map_chunks
+from ...machine.resources import map_chunks
 from ...neighbourhood import CENTRE, STRIDES
 from ..cell_cases import loop_table
 from ..field import FineField
@@ -35,8 +35,8 @@ from ..nodes import block_ijk
 Index = NDArray[np.int64]
 Vectors = NDArray[np.float64]
 Numbers = NDArray[np.float64]
-NEAR_SURFACE = 2.0  # fine spacings: differences between nodes nearer than this count
-TURN = 0.35  # of a component of the gradient, over a voxel and those beside it
+NEAR_SURFACE = 1.0  # fine spacings: slopes count at nodes that are nearer
+BEND = 0.3  # change of the slopes at a node, 1 for a distance, from which there may be an edge
 TEMPORARIES = 8  # numbers per node of a block
 PULL = 0.5  # share of the way to the middle of its crossings that a vertex which folds its fan goes
 
@@ -44,6 +44,14 @@ PULL = 0.5  # share of the way to the middle of its crossings that a vertex whic
 def dot(a: Vectors, b: Vectors) -> Numbers:
     """Return the products of vectors, (n,)."""
     product: Numbers = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    return product
+
+
+def cross(a: Vectors, b: Vectors) -> Vectors:
+    """Return the cross products of vectors, (n, 3)."""
+    product: Vectors = np.empty_like(a)
+    for k in range(3):
+        product[..., k] = a[..., k - 2] * b[..., k - 1] - a[..., k - 1] * b[..., k - 2]
     return product
 
 
@@ -60,40 +68,37 @@ def unit(vectors: Vectors) -> Vectors:
 
 
 def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolArray:
-    """Return the voxels, (D,), of some rows in or beside which the gradient turns by ``TURN``."""
-    chunks = map_chunks(
-        lambda some: _ranges(
-            field.blocks[:, rows.start + some.start : rows.start + some.stop], field.factor
-        ),
-        rows.stop - rows.start,
-        TEMPORARIES * len(field.blocks),
-        threads,
-    )
-    low, high = (np.concatenate(arrays, 1) for arrays in zip(*chunks))
-    for axis in range(3):
-        alone = low.copy(), high.copy()
-        for step in (-int(STRIDES[axis]), int(STRIDES[axis])):
-            other = field.parts.table[CENTRE + step, rows]
-            known = np.flatnonzero((other >= rows.start) & (other < rows.stop))
-            other = other[known] - rows.start
-            low[:, known] = np.fmin(low[:, known], alone[0][:, other])
-            high[:, known] = np.fmax(high[:, known], alone[1][:, other])
+    """Return the voxels, (D,), of some rows in which slopes change at a node as at an edge."""
     near = np.zeros(len(field.voxel_ijk), bool)
-    near[rows] = np.any(high - low > TURN, axis=0)
+
+    def look(some: slice) -> None:
+        here = slice(rows.start + some.start, rows.start + some.stop)
+        near[here] = _largest_bends(field, here) > BEND
+
+    map_chunks(look, rows.stop - rows.start, TEMPORARIES * len(field.blocks), threads)
     return near
 
 
-def _ranges(blocks: FloatArray, factor: int) -> tuple[FloatArray, FloatArray]:
-    """Return the least and largest slopes along each axis, (3, n), near the surface; else NaN."""
-    near = np.abs(blocks) < np.float32(NEAR_SURFACE * 2 / factor)
-    cube = np.where(near, blocks, np.float32(np.nan)).reshape(*(factor + 1,) * 3, -1)
-    low, high = np.empty((2, 3, blocks.shape[1]), np.float32)
+def _largest_bends(field: FineField, rows: slice) -> FloatArray:
+    """Return by how much slopes change at a node near the surface, the length over the axes."""
+    side, unit_slope = field.factor + 1, np.float32(2 / field.factor)
+    cubes, squares = field.blocks.reshape(side, side, side, -1), np.float32(0)
     for axis in range(3):
-        values = np.moveaxis(cube, axis, 0)
-        step = (values[1:] - values[:-1]).reshape(-1, blocks.shape[1])
-        np.fmin.reduce(step, 0, out=low[axis])
-        np.fmax.reduce(step, 0, out=high[axis])
-    return low * np.float32(factor / 2), high * np.float32(factor / 2)
+        cube = np.moveaxis(cubes, axis, 0)
+        mine = cube[..., rows]
+        near = np.abs(mine) < np.float32(NEAR_SURFACE) * unit_slope
+        bends = np.abs(np.diff(mine, n=2, axis=0)) * near[1:-1]
+        largest = bends.reshape(-1, mine.shape[-1]).max(0)
+        for step, beyond, face, within in ((-STRIDES[axis], -2, 0, 1), (STRIDES[axis], 1, -1, -2)):
+            other = field.parts.table[CENTRE + step, rows]
+            there = np.flatnonzero(other >= 0)
+            after = cube[beyond][..., other[there]]
+            bend = np.abs(after + mine[within][..., there] - 2 * mine[face][..., there])
+            bend *= near[face][..., there]
+            largest[there] = np.maximum(largest[there], bend.reshape(side**2, len(there)).max(0))
+        squares = squares + (largest / unit_slope) ** 2
+    length_of: FloatArray = np.sqrt(squares)
+    return length_of
 
 
 def beside(field: FineField, chosen: BoolArray, rings: int) -> BoolArray:
@@ -171,29 +176,14 @@ def _edges_of(field: FineField, crossings: Crossings, voxels: BoolArray) -> tupl
     return slot, edge_table(field, crossings, slot.take, int(listed.sum()), own, others, own)
 
 
-def dilate(patches: Patches, chosen: BoolArray, rings: int, count: int) -> BoolArray:
+def dilate(patches: Patches, chosen: BoolArray | Index, rings: int, count: int) -> BoolArray:
     """Return which of ``count`` crossings lie within some rings of patches round chosen ones."""
-    near: BoolArray = np.zeros(count, bool)
-    there = patches.there
+    near: BoolArray = np.zeros(count + 1, bool)  # the last is of entries that are no crossings
     for _ in range(rings):
-        mine = patches.crossing[chosen]
-        near[mine[mine >= 0]] = True
-        chosen = cast(BoolArray, np.any(near[patches.crossing] & there, axis=1))
-    return near
-
-
-def pairs_in_patches(patches: Patches) -> tuple[Index, Index]:
-    """Return every ordered pair of crossings of a patch; those on a common face come twice."""
-    sides = patches.crossing.shape[1]
-    places = np.nonzero(~np.eye(sides, dtype=bool))
-    empty = np.empty(0, np.int64)
-    parts = [(empty, empty)]
-    for some in chunks_of(len(patches.crossing), 6 * len(places[0])):
-        one, other = (patches.crossing[some, place].ravel() for place in places)
-        both = (one >= 0) & (other >= 0)
-        parts.append((one[both], other[both]))
-    first, second = zip(*parts)
-    return np.concatenate(first), np.concatenate(second)
+        near[patches.crossing[chosen]] = True
+        near[-1] = False
+        chosen = cast(BoolArray, near[patches.crossing].any(1))
+    return near[:-1]
 
 
 def nth_of_row(row: NDArray[Any], counts: NDArray[Any]) -> Index:
@@ -225,7 +215,7 @@ class Placed:
     def facing(self, corners: tuple[Index, Index, Index], crossing: Index) -> Numbers:
         """Return the cosine between triangles, corners (t,) each, and the planes of crossings."""
         a, b, c = (self.points[corner] for corner in corners)
-        return dot(unit(np.cross(b - a, c - a)), self.normal[crossing])
+        return dot(unit(cross(b - a, c - a)), self.normal[crossing])
 
 
 class Sides(NamedTuple):
@@ -254,11 +244,16 @@ def unfolded(patches: Patches, placed: Placed) -> Placed:
     facing = np.maximum(placed.facing(corners, sides.start), placed.facing(corners, sides.end))
     folded = np.zeros(len(placed.feature), bool)
     folded[sides.peak[facing < 0] - len(placed.position)] = True
+    inwards = np.where(folded[:, None], PULL * (middles(patches, placed) - placed.peak), 0)
+    return replace(placed, peak=placed.peak + inwards)
+
+
+def middles(patches: Patches, placed: Placed) -> Vectors:
+    """Return the middles of the crossings of patches with a feature, (f, 3)."""
     mine, count = patches.crossing[placed.feature], patches.sides[placed.feature]
     points = np.where((mine >= 0)[..., None], placed.position[mine], 0)
-    middle = points.sum(1) / count[:, None]
-    inwards = np.where(folded[:, None], PULL * (middle - placed.peak), 0)
-    return replace(placed, peak=placed.peak + inwards)
+    middle: Vectors = points.sum(1) / count[:, None]
+    return middle
 
 
 def triangles_of(patches: Patches, placed: Placed) -> Triangles:

@@ -13,16 +13,16 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import pairwise
+from functools import cached_property, lru_cache
 from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import BoolArray, IntArray
-from ...machine.resources import chunks_of, map_chunks, rows_in_chunk
+from ...machine.resources import chunks_of, map_chunks
 from ...neighbourhood import CENTRE, STRIDES
 from ..field import FineField
 from ..marching import Crossings, edge_ends, lattice_positions
@@ -35,7 +35,6 @@ from .patches import (
     dilate,
     dot,
     length,
-    pairs_in_patches,
     unit,
 )
 
@@ -48,7 +47,7 @@ WEAKENING = 0.7  # of the trust in a plane, from crossing to crossing
 LEAST_TRUST = 1e-4
 SETTLED = 0.3  # trust from which a crossing keeps its own plane, unless ...
 SMOOTHED_RINGS = 1  # ... it lies within these of one that does not
-PAIR_TEMPORARIES = 24  # numbers per pair of crossings in a round
+PAIR_TEMPORARIES = 48  # numbers per crossing of a patch in a round
 TEMPORARIES = 256  # numbers per crossing in the computation of its plane
 
 
@@ -67,10 +66,13 @@ class Planes:
     # (n,), 1 where the field is a distance, less where its slope is not 1, or the ground not flat
     trust: Numbers
 
+    @cached_property
+    def height(self) -> Numbers:
+        """How far each plane lies from node (0, 0, 0), along its normal, (n,)."""
+        return dot(self.point, self.normal)
 
-def planes_at_crossings(
-    field: FineField, crossings: Crossings, chosen: Index, threads: int = 1
-) -> Planes:
+
+def planes_at_crossings(field: FineField, crossings: Crossings, chosen: Index) -> Planes:
     """Return the planes on chosen ones of the crossed edges that voxels own, by the field alone."""
     parts = map_chunks(
         lambda some: _planes_of_chunk(
@@ -78,7 +80,6 @@ def planes_at_crossings(
         ),
         len(chosen),
         TEMPORARIES,
-        threads,
     )
     empty = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
     return Planes(*(np.concatenate(arrays) for arrays in zip(empty, *parts)))
@@ -108,9 +109,12 @@ def _planes_of_chunk(
     return position, unit(np.where(agree[:, None], mean, nearer)), np.maximum(*trust)
 
 
-def square_falloff(off: Numbers) -> Numbers:
-    """Return 1 at 0 and a quarter at 1: rational, so that every system computes the same."""
-    falloff: Numbers = 1 / (1 + off * off) ** 2
+def square_falloff(off: Numbers, other: Numbers | float = 0.0) -> Numbers:
+    """Return 1 at 0 and a quarter at 1: rational, so that every system computes the same.
+
+    Times that of another distance.
+    """
+    falloff: Numbers = 1 / ((1 + off * off) * (1 + other * other)) ** 2
     return falloff
 
 
@@ -169,44 +173,83 @@ def settle_planes(patches: Patches, own: Planes) -> Planes:
     """Return a plane for every crossing: its own, or that of flat ground beside it.
 
     In each round a crossing takes the mean of the planes of those with which it shares a patch,
-    weighted by trust, by how alike the normals are, and by how near it lies to the plane.
+    weighted by trust, by how alike the normals are, and by how near it lies to the plane. Two that
+    share two patches count twice.
     """
-    one, other = pairs_in_patches(patches)
-    rough: Numbers = np.zeros(len(own.trust))  # the largest 1 - cosine in patches
-    for some in chunks_of(len(one), PAIR_TEMPORARIES):
-        turned = 1 - dot(own.normal[one[some]], own.normal[other[some]])
-        np.maximum.at(rough, one[some], turned)
-    trust = own.trust * square_falloff(rough / ROUGH) + LEAST_TRUST
-    planes = Planes(own.point, own.normal, trust)
+    loops = _loops_of(patches)
+    trust = own.trust * square_falloff(_roughness(own, loops) / ROUGH) + LEAST_TRUST
     unsettled = np.any((trust < SETTLED)[patches.crossing] & patches.there, axis=1)
     beside = dilate(patches, cast(BoolArray, unsettled), SMOOTHED_RINGS, len(trust))
-    one, other = one[beside[one]], other[beside[one]]
-    order = np.argsort(one, kind="stable")  # so that all pairs of a crossing are in one chunk
-    one, other = one[order], other[order]
-    step = rows_in_chunk(PAIR_TEMPORARIES)
-    bounds = np.unique([0, *one[step::step].tolist(), len(trust)])
-    starts = np.searchsorted(one, bounds)
+    planes, rows = Planes(own.point, own.normal, trust), np.flatnonzero(beside)
+    chunks = list(_chunks_of_loops([loop[:, beside[loop].any(0)] for loop in loops]))
     for _ in range(ROUNDS):
-        parts = [
-            _settle_once(planes, own, slice(a, b), one[i:j] - a, other[i:j])
-            for (a, b), (i, j) in zip(pairwise(bounds.tolist()), pairwise(starts.tolist()))
-        ]
-        planes = Planes(*(np.concatenate(arrays) for arrays in zip(*parts)))
+        planes = _settle_once(planes, own, chunks, rows)
     return planes
 
 
-def _settle_once(
-    planes: Planes, own: Planes, rows: slice, one: Index, other: Index
-) -> tuple[Vectors, Vectors, Numbers]:
-    """Return the planes of some crossings after one round; ``one`` counts from the first."""
-    point, mine, trust = planes.point[rows], planes.normal[rows], planes.trust[rows]
-    start, count, normal = own.point[rows], len(trust), planes.normal[other]
-    off = dot(start[one] - planes.point[other], normal)
-    turned = (1 - dot(mine[one], normal)) / ALIGNED
-    weight = planes.trust[other] * square_falloff(turned) * square_falloff(off / OFF_PLANE)
-    total = np.bincount(one, weight, count)
-    mean = unit(sums(one, weight[:, None] * normal, count) + trust[:, None] * mine)
-    here = dot(start - point, mine)
-    height = (np.bincount(one, weight * off, count) + trust * here) / (total + trust)
-    passed_on = np.bincount(one, weight * planes.trust[other], count) / (total + 1e-12)
-    return start - height[:, None] * mean, mean, np.maximum(trust, WEAKENING * passed_on)
+def _loops_of(patches: Patches) -> list[Index]:
+    """Return the crossings of the patches with 3 sides, with 4, and so on, (S, p) each."""
+    return [
+        np.ascontiguousarray(patches.crossing[patches.sides == sides, :sides].T)
+        for sides in range(3, patches.crossing.shape[1] + 1)
+    ]
+
+
+def _roughness(own: Planes, loops: list[Index]) -> Numbers:
+    """Return the largest 1 - cosine of a crossing's normal and another's in a patch, (n,)."""
+    rough: Numbers = np.zeros(len(own.trust))
+    for loop in _chunks_of_loops(loops):
+        normal = own.normal.T[:, loop]
+        for turn in range(1, len(loop)):
+            np.maximum.at(rough, loop, 1 - _along(normal, np.roll(normal, turn, axis=1)))
+    return rough
+
+
+def _chunks_of_loops(loops: list[Index]) -> Iterator[Index]:
+    for loop in loops:
+        for some in chunks_of(loop.shape[1], PAIR_TEMPORARIES * len(loop)):
+            yield loop[:, some]
+
+
+def _settle_once(planes: Planes, own: Planes, loops: list[Index], rows: Index) -> Planes:
+    """Return the planes after one round; only those of some rows change."""
+    parts = [_sums_in_loops(planes, own, loop) for loop in loops]
+    crossing, sums = (np.concatenate(arrays, -1) for arrays in zip(*parts))
+    total, off, passed_on, *normal = (
+        np.bincount(crossing, each, len(own.trust))[rows] for each in sums
+    )
+    start, mine, trust = own.point[rows], planes.normal[rows], planes.trust[rows]
+    mean = unit(np.stack(normal, 1) + trust[:, None] * mine)
+    here = dot(start - planes.point[rows], mine)
+    height = (off + trust * here) / (total + trust)
+    point, new, trusted = planes.point.copy(), planes.normal.copy(), planes.trust.copy()
+    point[rows], new[rows] = start - height[:, None] * mean, mean
+    trusted[rows] = np.maximum(trust, WEAKENING * passed_on / (total + 1e-12))
+    return Planes(point, new, trusted)
+
+
+def _sums_in_loops(planes: Planes, own: Planes, loop: Index) -> tuple[Index, Vectors]:
+    """Return crossings of patches (e,), and for each sums over the others of its patch, (6, e).
+
+    Of the weights, and weighted: how far it lies off their planes, their trust, their normals.
+    """
+    sides, sums = len(loop), np.zeros((6, *loop.shape))
+    twice = np.concatenate([loop, loop[:-1]])  # so that the next ones of all follow each other
+    start, normal = own.point.T[:, loop], planes.normal.T[:, twice]
+    height, trust = planes.height[twice], planes.trust[twice]
+    for turn in range(1, sides):
+        here = slice(turn, turn + sides)
+        off = _along(start, normal[:, here]) - height[here]
+        turned = (1 - _along(normal[:, :sides], normal[:, here])) / ALIGNED
+        weight = trust[here] * square_falloff(turned, off / OFF_PLANE)
+        sums[0] += weight
+        sums[1] += weight * off
+        sums[2] += weight * trust[here]
+        sums[3:] += weight * normal[:, here]
+    return loop.T.ravel(), sums.transpose(0, 2, 1).reshape(6, -1)
+
+
+def _along(a: Vectors, b: Vectors) -> Numbers:
+    """Return the products of vectors (3, ...)."""
+    product: Numbers = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product

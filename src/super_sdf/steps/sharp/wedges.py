@@ -117,17 +117,24 @@ def wedges_of(
 
 
 def find_spheres(wedges: Wedges, spheres: SampleSpheres) -> Nearby:
-    """Return the spheres that pass within ``FARTHEST_SPHERE`` of each wedge's edge."""
-    number = spheres.index.find(wedges.voxel[:, None] + AROUND)  # (f, 125)
-    wedge, place = np.nonzero(number >= 0)
-    number = number[wedge, place]
-    distance: Numbers = spheres.distance[number].astype(np.float64) / 2
-    centre = spheres.voxel_ijk[number].astype(np.float64) + 0.5
-    near = Nearby(wedge, centre, distance)
+    """Return the spheres that pass within ``FARTHEST_SPHERE`` of each wedge's edge.
+
+    Wedges of a voxel, which follow each other, have the same samples around.
+    """
+    first = np.append(True, np.any(np.diff(wedges.voxel, axis=0) != 0, axis=1))[: len(wedges.voxel)]
+    number = spheres.index.find(wedges.voxel[first][:, None] + AROUND)  # (v, 125)
+    distance: Numbers = spheres.distance.astype(np.float64) / 2
+    usable = (number >= 0) & (np.abs(np.append(distance, 0)[number]) < LARGEST_RADIUS)
+    voxel = np.cumsum(first) - 1
+    wedge, place = np.nonzero(usable[voxel])
+    number = number[voxel[wedge], place]
+    centre, distance = spheres.voxel_ijk[number] + 0.5, distance[number]
+    away = length(wedges.point[wedge] - centre)
+    close = np.flatnonzero(away < np.hypot(np.abs(distance) + FARTHEST_SPHERE, FARTHEST_ALONG))
+    near = Nearby(wedge[close], centre[close], distance[close])
     contact = contact_of(wedges, near)
-    kept = np.abs(contact.gap) < FARTHEST_SPHERE
-    kept &= (np.abs(contact.along) < FARTHEST_ALONG) & (np.abs(distance) < LARGEST_RADIUS)
-    return Nearby(wedge[kept], centre[kept], distance[kept])
+    kept = (np.abs(contact.gap) < FARTHEST_SPHERE) & (np.abs(contact.along) < FARTHEST_ALONG)
+    return Nearby(near.wedge[kept], near.centre[kept], near.distance[kept])
 
 
 def contact_of(wedges: Wedges, near: Nearby) -> Contact:
