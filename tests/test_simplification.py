@@ -254,7 +254,7 @@ def test_the_command_simplifies_and_says_how_far_off(here, command):
     found, surface = report["simplified"], report["check"]["surface"]
     off = found["deviation"]
     assert code == 0 and report["closed"] and surface["closed"] and surface["manifold"]
-    assert set(found) == {"triangles_before", "triangles", "deviation", "warnings"}
+    assert set(found) == {"voxel_size", "triangles_before", "triangles", "deviation", "warnings"}
     mesh = trimesh.load("a.ply", process=False)
     counts = (found["triangles"], report["triangles"], surface["triangles"])
     assert counts == (len(mesh.faces),) * 3 and found["triangles"] < found["triangles_before"] / 2
@@ -265,9 +265,12 @@ def test_the_command_simplifies_and_says_how_far_off(here, command):
     assert err.splitlines()[-2] == (
         f"Simplified: from {found['triangles_before']:,} to {found['triangles']:,} triangles; "
         f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
-        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}"
+        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}; "
+        f"at most {0.5 * max(off['largest'], off['largest_back']):.4g} in world units"
     )
     assert "simplify: " in err
+    assert command("upsample", "ball.npz", "b.ply", "--tolerance", 0.01, *QUICK)[0] == 0
+    assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
 
 
 def test_the_file_is_the_same_for_any_threads_and_slabs_and_in_the_library(here, command):
@@ -306,6 +309,8 @@ def test_an_open_mesh_is_simplified_too_and_a_count_that_cannot_be_reached_is_a_
 STARTS = (("upsample", "ball.npz", "a.ply"), ("batch", "ball.npz", "--out", "new"))
 REFUSED = {
     "--simplify 0.1 --triangles 5": "--simplify 0.1 and --triangles 5: give only one of them",
+    "--simplify 0.1 --tolerance 5": "--simplify 0.1 and --tolerance 5: give only one of them",
+    "--tolerance 0": "--tolerance is 0: give a number greater than 0",
     "--simplify -1": "--simplify is -1: give a number greater than 0",
     "--triangles 2": "--triangles is 2: give 4 or more, as a closed mesh has",
 }
@@ -322,7 +327,7 @@ def test_wrong_options_are_said_before_the_work(words, start, here, command):
 def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
     monkeypatch.setattr(extras, "missing_modules", lambda modules: ["pyfqmr"])
     line = "needs pyfqmr: pip install -e '.[simplify]' in a clone of super-sdf\n"
-    for name, value in (("--simplify", 0.02), ("--triangles", 50)):
+    for name, value in (("--simplify", 0.02), ("--tolerance", 0.02), ("--triangles", 50)):
         for start in STARTS:
             assert command(*start, name, value)[::2] == (1, f"Error: {name} {line}")
     Path("list.jsonl").write_text('{"in": "ball.npz", "simplify": 0.02}')

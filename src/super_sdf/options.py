@@ -24,8 +24,10 @@ FIELDS = (AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY)
 INSIDE = (AUTO, "negative", "positive")
 AXES = ("xyz", "zyx")
 MARCHING, SHARP = "marching", "sharp"
-MESHERS: tuple[str, ...] = (MARCHING, SHARP)
-DEFAULT_MESHER = MARCHING
+MESHERS: tuple[str, ...] = (AUTO, MARCHING, SHARP)
+DEFAULT_MESHER = AUTO
+GOALS = ("simplify", "tolerance", "triangles")
+"""Of these at most one may be given."""
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
 DEVICES = (AUTO, "cpu", "cuda")
 AUTO_PRECISION, FLOAT32, INT8 = AUTO, "float32", "int8"
@@ -138,21 +140,23 @@ def check_progress(progress: Any) -> None:
         raise OptionTypeError(f"progress is {seen(progress)}: {way_out}")
 
 
-def check_goal(
-    error: Any, triangles: Any, names: tuple[str, str] = ("error", "triangles")
-) -> tuple[float | None, int | None]:
+def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:
     """Return to what a mesh is simplified: within an error, or to a number of triangles.
 
     OptionError unless one of them is given, and only one.
     """
     if error is None and triangles is None:
-        raise OptionError("give {} or {}".format(*names))
-    if error is not None and triangles is not None:
-        raise OptionError(
-            f"{names[0]} {seen(error)} and {names[1]} {seen(triangles)}: give only one of them"
-        )
-    error = OPTIONS["simplify"].check(error, names[0])
-    return error, OPTIONS["triangles"].check(triangles, names[1])
+        raise OptionError("give error or triangles")
+    check_one({"error": error, "triangles": triangles})
+    error = OPTIONS["simplify"].check(error, "error")
+    return error, OPTIONS["triangles"].check(triangles, "triangles")
+
+
+def check_one(options: dict[str, Any]) -> None:
+    """Raise OptionError if more than one is given; the others are None."""
+    given = [f"{name} {seen(value)}" for name, value in options.items() if value is not None]
+    if len(given) > 1:
+        raise OptionError(f"{given[0]} and {given[1]}: give only one of them")
 
 
 def _parse_numbers(counts: tuple[int, ...], way_out: str) -> Callable[[str], tuple[float, ...]]:
@@ -332,7 +336,7 @@ class ConvertOptions(ReadOptions):
     """The options of a conversion; see ``read_grid``, ``reconstruct`` and ``simplify_mesh``.
 
     ``cap`` is True by default, as for the command, and unlike in ``reconstruct``. ``simplify`` is
-    an error in voxels; at most one of it and ``triangles`` may be given.
+    an error in voxels; at most one of it, ``tolerance`` and ``triangles`` may be given.
     """
 
     factor: int = _option(
@@ -357,8 +361,8 @@ class ConvertOptions(ReadOptions):
     )
     mesher: str = _choice(
         DEFAULT_MESHER,
-        "Mesher: marching is marching cubes, which cuts off edges and corners; sharp also "
-        "puts vertices on them and takes longer.",
+        "Mesher: marching is marching cubes, which cuts off edges and corners; sharp also puts "
+        "vertices on them; auto is sharp for distances, and marching for masks and noise.",
         MESHERS,
     )
     simplify: float | None = _option(
@@ -369,6 +373,13 @@ class ConvertOptions(ReadOptions):
         _number("a number greater than 0", above=0, way_out="a number greater than 0"),
         float,
         metavar="ERROR",
+    )
+    tolerance: float | None = _option(
+        None,
+        "Simplify as with --simplify, but within D in world units, such as millimetres.",
+        _number("a number greater than 0", above=0, way_out="a number greater than 0"),
+        float,
+        metavar="D",
     )
     triangles: int | None = _option(
         None,
@@ -381,13 +392,18 @@ class ConvertOptions(ReadOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.simplifies:
-            check_goal(self.simplify, self.triangles, ("simplify", "triangles"))
+        given = self.goals()
+        check_one(given)
+        for name, value in given.items():
+            OPTIONS[name].check(value, name)
 
-    @property
-    def simplifies(self) -> bool:
-        """Whether the mesh is to be simplified."""
-        return self.simplify is not None or self.triangles is not None
+    def goals(self) -> dict[str, Any]:
+        """Return what says how far the mesh is to be simplified, by its name: at most one."""
+        return {name: value for name in GOALS if (value := getattr(self, name)) is not None}
+
+    def error(self, voxel_size: float) -> float | None:
+        """Return the error within which to simplify, in world units."""
+        return self.tolerance if self.simplify is None else self.simplify * voxel_size
 
     def digest(self) -> dict[str, Any]:
         """Return all that the mesh depends on, which the memory is not, for JSON."""
@@ -435,10 +451,10 @@ GRID = tuple(each.name for each in fields(ReadOptions) if each.name != "max_memo
 MESH = ("factor", *GRID, "offset", "cap", "mesher")
 UPSAMPLE = (
     *(*MESH, "quality", "precision", "model", "device", "max_memory", "threads"),
-    *("simplify", "triangles"),
+    *GOALS,
 )
 """What ``upsample``, ``batch`` and ``view`` take, in the order of their help."""
-BATCH_LISTS = (*MESH, "simplify", "triangles")
+BATCH_LISTS = (*MESH, *GOALS)
 """What a line of a batch's list may say."""
 LABELS = ("factor", "spacing", "origin", "direction", "axes", "max_memory")
 """What of ``ConvertOptions`` goes with ``--labels``."""

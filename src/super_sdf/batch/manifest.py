@@ -19,7 +19,7 @@ from typing import Any
 from ..errors import FileError, OptionError
 from ..files.formats import mesh_path
 from ..files.meshes import MESH_SUFFIXES
-from ..options import BATCH_LISTS, OPTIONS, ConvertOptions
+from ..options import BATCH_LISTS, GOALS, OPTIONS, ConvertOptions
 from .job import Job
 
 Entry = dict[str, Any]
@@ -99,8 +99,8 @@ def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
     if unknown:
         raise OptionError(f"{unknown[0]!r} is unknown: give in, out, {', '.join(BATCH_LISTS)}")
     asked = {name: OPTIONS[name].check(value, repr(name)) for name, value in entry.items()}
-    if asked.keys() & {"simplify", "triangles"}:  # one of them replaces the other
-        asked = {"simplify": None, "triangles": None, **asked}
+    if asked.keys() & set(GOALS):  # one of them replaces the others
+        asked = {**dict.fromkeys(GOALS), **asked}
     chosen = replace(options, **asked)
     named = target is not None
     name = _given_target(target) if named else _target_of(source, suffix, chosen.label)

@@ -65,7 +65,7 @@ def _needs_of(jobs: Sequence[Job], settings: Settings) -> Needs:
         modules.update(CERTIFICATE_MODULES)
     if settings.items:
         modules.update(EXTRAS["report"])
-    if any(job.options.simplifies for job in jobs):
+    if any(job.options.goals() for job in jobs):
         modules.update(EXTRAS["simplify"])
     here = modules.difference(missing_modules(tuple(modules)))  # without the others, files fail
     network = settings.model, settings.precision, settings.device

@@ -120,7 +120,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         check_can_check()
     check_cluster(options)
     jobs, unread = find_jobs(sources, suffix, chosen)
-    if any(job.options.simplifies for job in jobs):  # a list may say so
+    if any(job.options.goals() for job in jobs):  # a list may say so
         check_modules("simplify", "simplify")
     items = check_batch_page(page, jobs, folder, force=options["force"]) if page else None
     model = chosen_model(options)

@@ -53,6 +53,7 @@ Examples:
   super-sdf upsample scan.h5:/distance part.ply --spacing 0.5
   super-sdf upsample organs.nii.gz organs.glb --labels all
 """
+MANY = 50_000  # triangles of which simplifying is worth a hint
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 
@@ -239,6 +240,8 @@ class Upsampling:
             for stage, seconds in self.seconds.items():
                 print_stderr(f"{stage}: {seconds:.3f} s")
         print_stderr(f"{self.target}: {_describe_mesh(result, sum(self.seconds.values()))}")
+        if not self.chosen.goals() and result.counts["triangles"] > MANY:
+            print_stderr("For far fewer triangles within 0.02 voxels of these: --simplify 0.02")
         if result.saved_field:
             print_stderr(f"{self.options['save_field']}: {_describe_field(result.saved_field)}")
         if result.simplified:
@@ -331,8 +334,10 @@ def _describe_field(field: dict[str, Any]) -> str:
 def _describe_simplified(simplified: dict[str, Any]) -> str:
     """Describe in one line how much simpler a mesh is and how far from the unsimplified one."""
     off = simplified["deviation"]
+    largest = max(off["largest"], off["largest_back"])
     return (
         f"from {simplified['triangles_before']:,} to {simplified['triangles']:,} triangles; "
         f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
-        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}"
+        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}; "
+        f"at most {largest * simplified['voxel_size']:.4g} in world units"
     )

@@ -235,7 +235,8 @@ def _facts(report: Mapping[str, Any]) -> list[list[str]]:
         off = simplified["deviation"]
         texts["simplified"] = (
             f"from {simplified['triangles_before']:,} triangles; largest distance "
-            f"{off['largest']:.4f} voxels, {off['largest_back']:.4f} back"
+            f"{off['largest']:.4f} voxels, {off['largest_back']:.4f} back; "
+            f"a voxel is {simplified['voxel_size']:.6g}"
         )
     return [[label, str(text)] for label, text in texts.items() if text not in (None, "")]
 

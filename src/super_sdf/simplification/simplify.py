@@ -64,8 +64,12 @@ class Simplified:
     warnings: tuple[str, ...] = ()
 
     def report(self, voxel_size: float) -> dict[str, Any]:
-        """Return the figures as they stand in JSON; distances are in voxels."""
+        """Return the figures as they stand in JSON; distances are in voxels.
+
+        ``voxel_size`` is their length in world units.
+        """
         return {
+            "voxel_size": voxel_size,
             "triangles_before": self.triangles_before,
             "triangles": len(self.mesh.faces),
             "deviation": {name: x / voxel_size for name, x in vars(self.deviation).items()},
