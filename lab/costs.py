@@ -37,7 +37,7 @@ OPTIONS: dict[str, tuple[str, ...]] = {
     "fast": ("--quality", "fast"),
     "best": ("--quality", "best"),
     "float32": ("--precision", "float32"),
-    "sharp": ("--mesher", "sharp"),
+    "marching": ("--mesher", "marching"),
 }
 ORDERS = {"scipy": 3, "trilinear": 1}  # of SciPy's zoom
 MODELS = ("fast", "noisy", "mask", "base")

@@ -45,7 +45,9 @@ FOLDER = Path(__file__).parent / "figures"
 ROWS = "rows.jsonl"
 FEW = 10  # shapes of the smaller figures, spread over all
 BASELINES = ("mc", "mc-lewiner", "trilinear", "bspline")
-NETWORKS = ("ours@fast", "ours@noisy", "ours", "ours@base:float32", "ours@best")
+# Networks are compared by marching cubes of their fields, as the bound is made.
+MODELS = ("@fast", "@noisy", "", "@base:float32", "@best")
+NETWORKS = ("ours", *(f"ours-marching{model}" for model in MODELS))
 LATE, FEW_PARTS = 900.0, 6  # seconds for another method on a part, and parts
 
 
@@ -106,11 +108,11 @@ class Bench:
 
 
 def name_of(method: str) -> str:
-    """Return the word for a method in a figure: "ours" is base, "ours@fast" is fast."""
+    """Return the word for a method in a figure: "ours" is default, "ours-marching" base."""
     name, _, model = method.partition("@")
-    if name != "ours":
-        return name
-    return model.replace(":", "-") or "base"
+    if name == "ours-marching":
+        return model.replace(":", "-") or "base"
+    return "default" if name == "ours" else name
 
 
 # The figures: each takes the bench and returns rows, with words that tell them apart.
@@ -120,7 +122,7 @@ def quality(bench: Bench) -> list[Row]:
     """Measure all methods on all shapes at all sizes."""
     methods = [*BASELINES, *NETWORKS, "bound"]
     if bench.network != DEFAULT_QUALITY:  # the others do not change with it
-        methods = [*BASELINES, "ours", "bound"]
+        methods = [*BASELINES, "ours", "ours-marching", "bound"]
     results = bench.measured("validation", [Setting(n) for n in bench.sizes], methods)
     names = [path.stem for path in bench.shapes]
     rows = []
@@ -140,17 +142,17 @@ def edges(bench: Bench) -> list[Row]:
     """Measure the meshers, on CAD parts and on the validation shapes."""
     rows = []
     small, sizes = bench.small, bench.sizes[:2]
-    both = ("ours", "ours-sharp", "bound", "bound-sharp")
+    both = ("ours-marching", "ours", "bound", "bound-sharp")
     plans = (
-        *(("parts", n, 4, (*both, *(f"ours-sharp/{k}" for k in (4, 16)))) for n in sizes),
-        ("parts", small, 2, ("ours-sharp",)),
+        *(("parts", n, 4, (*both, *(f"ours/{k}" for k in (4, 16)))) for n in sizes),
+        ("parts", small, 2, ("ours",)),
         *(("validation", n, 4, both) for n in sizes),
     )
     for name, size, factor, methods in plans:
         setting = Setting(size, factor)
         results = bench.measured(name, [setting], methods)
         for method in methods:
-            word = method.replace("ours-sharp", "sharp").replace("ours", "marching")
+            word = method.replace("ours-marching", "marching").replace("ours", "sharp")
             word += f"-{factor}" if factor != 4 else ""
             words = {"set": name, "size": size, "method": word}
             rows.append({**words, **summary(results.of(setting, method))})
@@ -160,7 +162,7 @@ def edges(bench: Bench) -> list[Row]:
 def peers(bench: Bench) -> list[Row]:
     """Measure dual contouring of distances, and ours with as many triangles."""
     other = "dual-contouring"
-    methods, setting = (other, f"ours/{other}", f"ours-sharp/{other}"), Setting(bench.small)
+    methods, setting = (other, f"ours-marching/{other}", f"ours/{other}"), Setting(bench.small)
     results = bench.measured("parts", [setting], methods, LATE)
     return [{"method": m, **summary(results.of(setting, m))} for m in methods]
 
@@ -243,11 +245,11 @@ def few_rows(
 def simplify(bench: Bench) -> list[Row]:
     """Measure meshes simplified within .02 voxel."""
     rows, setting = [], Setting(bench.small)
-    methods = ("ours", "ours/within", "ours-sharp", "ours-sharp/within")
+    methods = ("ours-marching", "ours-marching/within", "ours", "ours/within")
     for name in ("parts", "validation"):
         results = bench.measured(name, [setting], methods)
         for method in methods:
-            mesher = "sharp" if "sharp" in method else "marching"
+            mesher = "marching" if "marching" in method else "sharp"
             words = {"set": name, "mesher": mesher, "simplified": "within" in method}
             rows.append({**words, **summary(results.of(setting, method))})
     return rows

@@ -1,7 +1,7 @@
 """The methods that reconstruct a surface from a coarse grid: ours, the baselines, our bound, peers.
 
 Each takes a case and a network, which only ours uses, and returns a surface. The name of a method
-may say more: ``ours-sharp`` is meshed by the mesher sharp, ``ours/4`` is simplified to a quarter
+may say more: ``ours-marching`` is meshed by marching cubes, ``ours/4`` is simplified to a quarter
 of its triangles, ``ours/within`` within .02 voxel, ``ours@base:float32`` uses that network.
 """
 
@@ -19,7 +19,7 @@ from super_sdf.errors import NoSurfaceError, OptionError
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.mesh import Mesh
 from super_sdf.network.decoder import Decoder
-from super_sdf.options import DEFAULT_MESHER, SHARP
+from super_sdf.options import DEFAULT_MESHER, MARCHING, SHARP
 from super_sdf.pipeline import reconstruct, refine
 from super_sdf.simplification.simplify import simplify_mesh
 from super_sdf.slabs.cutting import whole
@@ -65,7 +65,7 @@ def spline_surface(case: Case, network: Decoder, *, order: int) -> Surface:
     return Surface(isosurface(field, case.fine, case.low), lambda: field)
 
 
-def bound_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -> Surface:
+def bound_surface(case: Case, network: Decoder, *, mesher: str = MARCHING) -> Surface:
     """Mesh the true distances at the fine nodes: the bound of all upsampling to them."""
     dense = sharp_isosurface if mesher == SHARP else isosurface
     return Surface(dense(case.truth.copy(), case.fine, case.low))
@@ -153,7 +153,7 @@ METHODS: dict[str, Method] = {
 }
 BY_NAME: dict[str, Method] = {
     **METHODS,
-    f"{OURS}-{SHARP}": partial(our_surface, mesher=SHARP),
+    f"{OURS}-{MARCHING}": partial(our_surface, mesher=MARCHING),
     f"bound-{SHARP}": partial(bound_surface, mesher=SHARP),
     "dual-contouring": dual_contouring,
 }

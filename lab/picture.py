@@ -30,8 +30,8 @@ from .surfaces import isosurface
 EXAMPLE, EXAMPLE_TARGET = Path("examples/part.npz"), Path("examples/part.png")
 PARTS_TARGET = Path("docs/images/sharp.png")
 SEED = 0
-METHODS = {"marching cubes of the grid": "mc", "--mesher marching": "ours",
-           "--mesher sharp": "ours-sharp"}  # fmt: skip
+METHODS = {"marching cubes of the grid": "mc", "super-sdf, --mesher marching": "ours-marching",
+           "super-sdf": "ours"}  # fmt: skip
 PIXELS, LARGE_PIXELS = 340, 440
 COLOURS = 96  # of the palette: a third of the bytes, and no difference to be seen
 MARGIN = 1.06

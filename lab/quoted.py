@@ -23,7 +23,6 @@ from .tables import (
     BY_KEY,
     CD,
     EDGES,
-    EF1,
     F1,
     GAPS,
     NC,
@@ -40,7 +39,6 @@ from .tables import (
 )
 
 UNKNOWN = "(not measured)"
-SHORT = (F1, NC, THERE, BACK, EF1, BY_KEY["field_mae"])
 VOXELS = Column("mean distance", "voxels", 1, 4)
 SECONDS, PEAK = Column("seconds", "seconds", 1, 2), Column("peak MB", "peak_mb", 1, 0)
 EDGE_COLUMNS = (F1, NC, THERE, BACK, *EDGES[:-1])
@@ -57,21 +55,21 @@ COLUMNS = {**BY_KEY, "seconds": SECONDS, "peak_mb": PEAK}  # of numbers in sente
 SUMMARY_LABELS = {
     "mc": "marching cubes",
     "bspline": "B-spline + marching cubes",
-    "fast": "super-sdf, `fast`",
-    "base": "super-sdf, `base` (default)",
-    "best": "super-sdf, `best`",
+    "default": "super-sdf",
+    "base": "super-sdf, `--mesher marching`",
     "bound": "true distance at the same nodes",
 }
 NETWORK_LABELS = {
-    "fast": "`fast`",
-    "noisy": "`noisy`",
-    "base": "`base` (default)",
-    "base-float32": "`base` in float32",
-    "best": "`best`",
+    "default": "super-sdf",
+    "fast": "`fast`, marching cubes",
+    "noisy": "`noisy`, marching cubes",
+    "base": "`base`, marching cubes",
+    "base-float32": "`base` in float32, marching cubes",
+    "best": "`best`, marching cubes",
 }
 MESHER_LABELS = {
     "marching": "marching",
-    "sharp": "**sharp**",
+    "sharp": "**sharp (default)**",
     "sharp/4": "sharp, simplified to 1/4",
     "sharp/16": "sharp, simplified to 1/16",
     "sharp-2": "sharp, factor 2",
@@ -83,7 +81,7 @@ OPTION_LABELS = {
     "fast": "`--quality fast`",
     "best": "`--quality best`",
     "float32": "`--precision float32`",
-    "sharp": "`--mesher sharp`",
+    "marching": "`--mesher marching`",
 }
 CHECK_LABELS = {
     "shapes": "mean residual and mean error, both ways",
@@ -137,13 +135,6 @@ def size_table(rows: Sequence[Row], size: int) -> str:
     return surface_table(pick(rows, size=size, half=""), size, words)
 
 
-def network_table(rows: Sequence[Row]) -> str:
-    """Return the networks at each size."""
-    chosen = (row for row in pick(rows, half="") if row["method"] in NETWORK_LABELS)
-    heads, labels = ["grid", "network"], NETWORK_LABELS
-    return listed(chosen, SHORT, lambda row: [f"{row['size']}^3", labels[row["method"]]], heads)
-
-
 def gap_table(rows: Sequence[Row]) -> str:
     """Return the gap closed by the networks, on all shapes and on each half."""
     halves = {"": "all", "choose": "those that networks were chosen on", "final": "the others"}
@@ -153,7 +144,7 @@ def gap_table(rows: Sequence[Row]) -> str:
         for size in values(rows, "size")
         for half in halves
         for row in pick(rows, size=size, half=half)
-        if row["method"] in ("fast", "base", "best")
+        if row["method"] in ("default", "fast", "base", "best")
     ]  # fmt: skip
     return markdown(["grid", "shapes", "network", *GAPS.values()], body)
 
@@ -255,7 +246,7 @@ def noise_table(rows: Sequence[Row]) -> str:
     """Return F1 by noise, beside the published F1."""
     body = []
     for share in values(rows, "noise"):
-        found = (pick(rows, noise=share, method=m)[0] for m in ("mc", "bspline", "base"))
+        found = (pick(rows, noise=share, method=m)[0] for m in ("mc", "bspline", "default"))
         mc, spline, ours = (row["f1"] for row in found)
         theirs = published.NOISE_F1[share / 100]
         figures = [mc, spline, ours, ours - mc, *theirs, theirs[1] - theirs[0]]
@@ -268,7 +259,7 @@ def setting_table(rows: Sequence[Row], word: str, paper: Mapping[Any, Sequence[f
     """Return the rows of a setting, with the paper's figures where it has some."""
     columns, body = (CD, F1, NC, P2S, BACK), []
     for row in rows:
-        is_ours = row["method"] == "base"
+        is_ours = row["method"] == "default"
         label = "super-sdf" if is_ours else label_of(row["method"])
         gap = percent(row["gap_f1"]) if is_ours else "-"
         line = [f"{row[word]:g}", label, *cells(row, columns), gap]
@@ -314,7 +305,6 @@ def is_unequal(kind: str) -> bool:
 TABLES: dict[str, Callable[[list[Row]], str]] = {
     "quality.summary": summary_table,
     **{f"quality.{n}": partial(size_table, size=n) for n in (32, 64, 128)},
-    "quality.networks": network_table,
     "quality.gaps": gap_table,
     "quality.worse": worse_line,
     **{f"edges.{n}": partial(edge_table, name="parts", size=n) for n in (32, 64)},

@@ -131,12 +131,12 @@ def published_rows(size: int, columns: Sequence[Column]) -> list[list[str]]:
 
 
 def label_of(method: str) -> str:
-    """Return what tables call a method: ``ours-sharp@fast/4`` is super-sdf, sharp, fast, 1/4."""
+    """Return what tables call a method: of ``ours-marching@fast`` super-sdf, marching, fast."""
     name, _, model = method.partition("@")
     name, _, share = name.partition("/")
-    plain = name.removesuffix("-sharp")
-    words = [LABELS.get(name) or LABELS.get(plain, plain)]
-    words += ["sharp"] if name != plain else []
+    plain = name if name in LABELS else name.partition("-")[0]
+    words, mesher = [LABELS.get(plain, plain)], name[len(plain) + 1 :]
+    words += [mesher] if mesher else []
     words += [model.replace(":", ", ")] if model else []
     if share:
         words.append(f"1/{share}" if share.isdigit() else f"as many triangles as {LABELS[share]}")

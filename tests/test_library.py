@@ -114,7 +114,7 @@ OF_OTHER_TYPES = {
     "offset is '1': give a number, in world units": {"offset": "1"},
     f"cap is 'no': {BOOLEAN}": {"cap": "no"},
     f"cap is 1: {BOOLEAN}": {"cap": 1},
-    "mesher is None: give one of marching, sharp": {"mesher": None},
+    "mesher is None: give one of auto, marching, sharp": {"mesher": None},
     "max_memory is 1.5: give a whole number of bytes": {"max_memory": 1.5},
     "progress is True: give a function of (done, total), in thousandths": {"progress": True},
 }
@@ -123,7 +123,7 @@ WRONG = {
         "factor": np.int64(0)
     },
     "offset is -inf: give a finite number, in world units": {"offset": -np.inf},
-    "mesher is 'dual': give one of marching, sharp": {"mesher": "dual"},
+    "mesher is 'dual': give one of auto, marching, sharp": {"mesher": "dual"},
     "max_memory is -5: give a number of bytes greater than 0": {"max_memory": -5},
 }
 
@@ -148,7 +148,7 @@ OTHERS = {
     f"field is {GRID!r:.57}...: give one from upsample(grid, network)": lambda: extract_mesh(
         GRID, GRID
     ),
-    "mesher is 'x': give one of marching, sharp": lambda: extract_mesh(
+    "mesher is 'x': give one of auto, marching, sharp": lambda: extract_mesh(
         upsample(GRID, trilinear), GRID, mesher="x"
     ),
     "inside is 1: give one of auto, negative, positive": lambda: make_grid(VALUES, inside=1),

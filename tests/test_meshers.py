@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_slabs import assert_same, in_pieces, joined, rod
 
-from super_sdf import SdfGrid, extract_mesh, load_network, options, reconstruct, upsample
+from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.machine import resources
 from super_sdf.mesh import join_meshes
 from super_sdf.slabs import cutting
@@ -50,8 +50,32 @@ def test_each_name_gives_its_mesh(network):
     plain, sharp = (extract_mesh(field, grid, mesher=name) for name in ("marching", "sharp"))
     assert_same(plain, join_meshes(extract_pieces(field, grid)))
     assert len(sharp.vertices) > len(plain.vertices)
-    for name, mesh in {"marching": plain, "sharp": sharp}.items():
+    for name, mesh in {"marching": plain, "sharp": sharp, "auto": sharp}.items():
         assert_same(mesh, reconstruct(grid, network, 2, mesher=name))
+        assert_same(mesh, extract_mesh(field, grid, mesher=name))
+
+
+@pytest.mark.parametrize("kind", ["mask", "noisy", "truncated"])
+def test_by_itself_it_is_sharp_where_samples_are_exact(kind, network):
+    values = FIELDS["bar"] < 0 if kind == "mask" else np.clip(FIELDS["bar"], -3, 3)
+    grid = make_grid(
+        values, spacing=1.0, field=kind, inside="positive" if kind == "mask" else "auto"
+    )
+    plain, sharp, auto = (
+        reconstruct(grid, network, 2, mesher=name) for name in ("marching", "sharp", "auto")
+    )
+    assert_same(auto, sharp if kind == "truncated" else plain)
+    assert (len(sharp.vertices) > len(plain.vertices)) == (kind == "truncated")
+
+
+def test_edges_that_a_mask_cannot_show_are_a_note(tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    np.save("mask.npy", FIELDS["bar"] < 0)
+    words = ("--spacing", 1, "--inside", "positive", "--factor", 2, "--force")
+    note = "Note: mask values tell of no edges: the mesh is that of marching cubes\n"
+    for name, count in {"auto": 0, "marching": 0, "sharp": 1}.items():
+        code, _, err = command("upsample", "mask.npy", "a.ply", "--mesher", name, *words)
+        assert code == 0 and err.count(note) == count
 
 
 @pytest.mark.parametrize(
@@ -112,20 +136,20 @@ def test_the_command_takes_a_mesher_and_says_which(tmp_path, monkeypatch, comman
     monkeypatch.chdir(tmp_path)
     np.save("in.npy", FIELDS["bar"])
     words = ("--spacing", 1, "--quality", "fast", "--factor", 2, "--json", "--quiet")
-    asked = {"sharp": ("--mesher", "sharp"), options.DEFAULT_MESHER: ()}
+    asked = {"auto": (), "sharp": ("--mesher", "sharp"), "marching": ("--mesher", "marching")}
     for name, option in asked.items():
         code, out, _ = command("upsample", "in.npy", f"{name}.ply", *option, *words)
         assert code == 0 and json.loads(out)["mesher"] == name
     sizes = [Path(f"{name}.ply").stat().st_size for name in asked]
-    assert sizes[0] > sizes[1]
+    assert sizes[0] == sizes[1] > sizes[2]
     code, out, err = command("upsample", "in.npy", "x.ply", "--mesher", "dual", *words)
     assert code == 2 and not Path("x.ply").exists()
-    assert err.endswith("'--mesher': 'dual' is not one of 'marching', 'sharp'.\n")
+    assert err.endswith("'--mesher': 'dual' is not one of 'auto', 'marching', 'sharp'.\n")
 
 
 @pytest.mark.usefixtures("grid_folder")
 def test_a_batch_with_another_mesher_is_made_again(run_batch):
-    run_batch("in/a.npy")
+    run_batch("in/a.npy", "--mesher", "marching")
     assert "nothing to do" in run_batch("in/a.npy", "--mesher", "marching")[2]
     assert "nothing to do" not in run_batch("in/a.npy", "--mesher", "sharp")[2]
     assert "nothing to do" in run_batch("in/a.npy", "--mesher", "sharp")[2]

@@ -102,12 +102,16 @@ def test_symmetries_of_the_cube_map_the_vertices_along(network, name, monkeypatc
     box = np.abs(ijk - np.array([0.3, -0.2, 0.1])[:, None, None, None])
     values = np.maximum(box[0] - 3.2, np.maximum(box[1] - 2.3, box[2] - 3.6))
     values = np.minimum(values, np.linalg.norm(ijk - 1.4, axis=0) - 2.6)
-    base = reconstruct(SdfGrid(values, (1.0,) * 3, (-5.5,) * 3), answer).vertices
+
+    def vertices_of(values):
+        grid = SdfGrid(values, (1.0,) * 3, (-5.5,) * 3)
+        return reconstruct(grid, answer, mesher="marching").vertices
+
+    base = vertices_of(values)
     for turn in SYMMETRIES:
         source = np.moveaxis(ijk, 0, -1) @ turn + 5.5  # where each sample of the turned grid was
         turned = values[tuple(np.moveaxis(source.astype(int), -1, 0))]
-        moved = reconstruct(SdfGrid(turned, (1.0,) * 3, (-5.5,) * 3), answer).vertices
-        distance = cKDTree(moved).query(base @ turn.T)[0]
+        distance = cKDTree(vertices_of(turned)).query(base @ turn.T)[0]
         assert distance.max() < most + 2 * CLEARANCE
         assert distance.mean() < mean + 2 * CLEARANCE
 

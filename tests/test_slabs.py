@@ -103,9 +103,10 @@ def test_slabs_change_nothing(network, monkeypatch, field, factor, cap):
 def test_slabs_need_all_the_planes_beside_them(network, monkeypatch):
     """With fewer planes the mesh differs, so the tests above can fail."""
     grid = SdfGrid.trusted(FIELDS["clean"], (1.0,) * 3)
-    one = reconstruct(grid, network, 2)
+    options = {"factor": 2, "mesher": "marching"}
+    one = reconstruct(grid, network, **options)
     monkeypatch.setattr(cutting, "REACH_IN_VOXELS", 1)
-    mesh = joined(in_pieces(grid, network, monkeypatch, 4, factor=2))
+    mesh = joined(in_pieces(grid, network, monkeypatch, 4, **options))
     assert not np.array_equal(mesh.vertices, one.vertices)
 
 

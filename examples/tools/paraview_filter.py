@@ -7,7 +7,7 @@ window.
 
 FACTOR = 4  # times finer than the image: 2, 4, 8 or 16
 SCALARS = None  # the name of the array; None for the active one
-MESHER = "marching"  # "sharp" also puts vertices on edges and corners
+MESHER = "auto"  # "marching" takes less time, and cuts off edges and corners
 
 
 def fill_surface(image, surface, scalars=None, factor=4, **options):

@@ -280,7 +280,8 @@ def test_tables_show_means_gaps_and_what_has_no_surface():
     assert "| 0.250 |" in mine and mine.endswith("| 1 of 2 |")
     assert "*PoNQ, published, Thingi30*" in lines
     assert evaluate.odd_meshes(by_method) == ["No surface (a dot stands in), MC: b."]
-    assert tables.label_of("ours-sharp/4@base:float32") == "super-sdf, sharp, base, float32, 1/4"
+    label = tables.label_of("ours-marching/4@base:float32")
+    assert label == "super-sdf, marching, base, float32, 1/4"
 
 
 def test_a_process_is_timed(tmp_path):

@@ -173,12 +173,12 @@ def test_turns_are_rotations_and_favour_no_direction():
 def test_ours_with_fewer_triangles_and_another_mesher():
     shape, case = shape_and_case(cube(), Setting(12))
     task = replace(TASK, model="fast")
-    whole, quarter, sharp, within = (
+    whole, quarter, plain, within = (
         measure_method(shape, case, name, task)
-        for name in ("ours", "ours/4", "ours-sharp@fast:float32", "ours/within")
+        for name in ("ours", "ours/4", "ours-marching@fast:float32", "ours/within")
     )
     assert quarter["faces"] == pytest.approx(whole["faces"] / 4, rel=0.1)
-    assert sharp["efv"] > whole["efv"] and sharp["closed"]
+    assert whole["efv"] > plain["efv"] and whole["closed"]
     assert within["faces"] < whole["faces"] / 3 and within["closed"]
     case.triangles["dual-contouring"] = 300
     assert measure_method(shape, case, "ours/dual-contouring", task)["faces"] <= 300

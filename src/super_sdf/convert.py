@@ -37,7 +37,7 @@ from .machine.extras import check_modules
 from .machine.memory import memory_bound
 from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
-from .options import MASK, SCALED
+from .options import MASK, SCALED, SHARP
 from .options import ConvertOptions as ConvertOptions
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
@@ -143,7 +143,7 @@ def convert(
     if slabs do not meet. Nothing is written then.
     """
     watch = Stopwatch()
-    if options.simplifies:
+    if options.goals():
         check_modules("simplifying", "simplify")
     grid = read_grid(source, **options.reading())
     keeper = Keeper(options.max_memory) if keep else None
@@ -238,7 +238,7 @@ def convert_grid(
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, options.factor)
     expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
-    if options.simplifies:  # imported here, as few conversions need it
+    if options.goals():  # imported here, as few conversions need it
         from .simplification.simplify import check_room, simplify_mesh
 
         least = int(expected.triangles * CERTAIN_SHARE)
@@ -247,12 +247,12 @@ def convert_grid(
         announce(sentence)
     watch.lap("read")
     tally, simplified = Tally(options.cap), None
-    shown = part_of(progress, 0, SHARE_BEFORE) if options.simplifies else progress
+    shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
     meshes = tally.count(make(expected, shown), watch)
-    if options.simplifies:
+    if options.goals():
         simplified = simplify_mesh(
             join_meshes(list(meshes)),
-            error=None if options.simplify is None else options.simplify * grid.voxel_size,
+            error=options.error(grid.voxel_size),
             triangles=options.triangles,
             max_memory=options.max_memory,
             progress=share_of(part_of(progress, SHARE_BEFORE, 1)),
@@ -274,7 +274,7 @@ def convert_grid(
         capped=options.cap and tally.leaves,
         warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
-        notes=(*lattice.notes, *local_origin_note(target, about)),
+        notes=(*lattice.notes, *edges_note(lattice, options), *local_origin_note(target, about)),
         seconds=watch.seconds,
         kept=keeper.kept(grid) if keeper else None,
     )
@@ -382,6 +382,13 @@ def torn(count: int, where: str, *pieces: Piece) -> MeshError:
         way = "use workers with the same processor, NumPy and onnxruntime"
     edges = f"{count:,} open edge{'s' * (count > 1)}"
     return MeshError(f"the mesh is torn, with {edges} {where} {made}: {way}")
+
+
+def edges_note(grid: SdfGrid, options: ConvertOptions) -> list[str]:
+    """Return why no edges are found, if they were asked for."""
+    if options.mesher != SHARP or grid.field.has_exact:
+        return []
+    return [f"{grid.field.kind} values tell of no edges: the mesh is that of marching cubes"]
 
 
 def find_warnings(

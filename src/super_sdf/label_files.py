@@ -26,7 +26,7 @@ from .files.volume import PLACE
 from .labels import ALL, LabelPiece, find_image, label_slabs
 from .mesh import Mesh
 from .network.decoder import Decoder
-from .options import LABELS, OPTIONS, ConvertOptions
+from .options import LABELS, MARCHING, OPTIONS, ConvertOptions
 from .progress import Progress
 from .topology import OpenEdges
 
@@ -151,7 +151,9 @@ def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
 def check_options(options: ConvertOptions, more: Sequence[str] = ()) -> None:
     """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
     others = [name for name in vars(options) if name not in LABELS]
-    given = [name for name in others if getattr(options, name) != OPTIONS[name].default]
+    given = [
+        name for name in others if getattr(options, name) not in (OPTIONS[name].default, MARCHING)
+    ]
     for name in (*given, *more):
         value = f" {seen(getattr(options, name))}" if name in given else ""
         text = "open" if name == "cap" else f"{name.replace('_', '-')}{value}"

@@ -34,7 +34,7 @@ from .steps.bounds import keep_within_bounds
 from .steps.cap import check_can_close, close, seen_octants
 from .steps.debris import count_between, drop_debris
 from .steps.field import FineField, SampleSpheres
-from .steps.meshers import extract_pieces, find_mesher
+from .steps.meshers import extract_pieces
 from .steps.spheres import fit_to_spheres, spheres_of_band
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
@@ -176,7 +176,7 @@ def reconstruct(
         be joined. A surface leaves the grid where samples on the border are inside.
     mesher : str
         "marching" for marching cubes, which cuts off edges and corners; "sharp" also puts vertices
-        on them.
+        on them; "auto" is "sharp" for distances and "marching" for masks and noise.
     max_memory : int, optional
         Bytes that the process may hold in all, besides the mesh; by default a share of the free
         memory.
@@ -228,11 +228,11 @@ def reconstruct_slabs(
         options.check_distance(offset),
         options.check_cap(cap),
     )
-    mesh_with, bound = find_mesher(mesher), options.check_max_memory(max_memory)
+    mesher, bound = options.check_mesher(mesher), options.check_max_memory(max_memory)
     check_can_close(grid, cap=cap)
 
     def pieces() -> Iterator[Piece]:
-        run = prepare(grid, network, factor, offset, bound, StepCounter(progress), mesh_with)
+        run = prepare(grid, network, factor, offset, bound, StepCounter(progress), mesher)
         if look:
             look(run.band)
         seen: set[bool] = set()
@@ -267,7 +267,7 @@ def reconstruct_planes(
     ``whole`` is of the band of the whole grid, see ``look_at_band``.
     """
     part, steps = (planes, whole), StepCounter(progress)
-    run = prepare(grid, network, factor, offset, max_memory, steps, find_mesher(mesher), part=part)
+    run = prepare(grid, network, factor, offset, max_memory, steps, mesher, part=part)
     own = run.band.rows(*planes)
     counts = {"band_voxels": own.stop - own.start, "noisy_voxels": run.band.count_noisy(own)}
     for piece in _mesh_slabs(run, cap, None):

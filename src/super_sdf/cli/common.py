@@ -16,7 +16,7 @@ from click.core import ParameterSource
 
 from ..errors import OptionError, SuperSdfError, seen
 from ..machine.extras import check_modules
-from ..options import OPTIONS, UPSAMPLE, ConvertOptions, Option, parse_labels
+from ..options import MARCHING, OPTIONS, UPSAMPLE, ConvertOptions, Option, parse_labels
 from .interrupts import describe_interrupt, exit_code
 
 if TYPE_CHECKING:
@@ -252,10 +252,14 @@ def load_chosen(options: dict[str, Any], meanwhile: Callable[[], None] = lambda:
     with ThreadPoolExecutor(1) as pool:
         loading = pool.submit(load_network, chosen_model(options), **chosen)
         from .. import convert  # noqa: F401  # onnxruntime needs no interpreter while it loads
-        from ..steps.cell_cases import triangle_table
+        from ..steps.cell_cases import loop_table, triangle_table
 
         meanwhile()
         triangle_table()  # it is kept
+        if options.get("mesher") != MARCHING:
+            from ..steps.sharp import mesher  # noqa: F401
+
+            loop_table()
         return loading.result()
 
 
@@ -263,7 +267,6 @@ def make_options(options: dict[str, Any]) -> ConvertOptions:
     """Return the conversion's options, picked from all options of a command."""
     taken = [name for name in UPSAMPLE if hasattr(ConvertOptions, name)]
     chosen = ConvertOptions(**{name: options[name] for name in taken})
-    if chosen.simplifies:
-        word = "--simplify" if chosen.triangles is None else "--triangles"
-        check_modules(word, "simplify")
+    for name in chosen.goals():
+        check_modules(f"--{name}", "simplify")
     return chosen

@@ -80,6 +80,11 @@ class Field:
     evidence: dict[str, Any] = field(default_factory=dict)  # what the samples show, for ``--json``
     unseen: SampleArray | None = None  # which may hide the surface: it ends there, and stays open
 
+    @property
+    def has_exact(self) -> bool:
+        """Whether some samples may be exact distances."""
+        return self.exact[0] < self.exact[1]
+
     def report(self) -> dict[str, Any]:
         """Return kind and evidence as a dictionary that can be written as JSON."""
         return {"kind": self.kind, "given": self.given, **self.evidence}

@@ -26,7 +26,7 @@ from ..machine import resources as limits
 from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
 from ..machine.resources import CHUNK, Resources, rows_in_chunk
 from ..network.decoder import NETWORK_BYTES
-from ..options import DEFAULT_MESHER, SHARP
+from ..options import MARCHING, SHARP
 from ..steps import bounds, debris, spheres
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.meshers import BY_NAME, Mesher
@@ -40,7 +40,7 @@ from ..steps.survey import (
     plan_reading,
 )
 
-DEFAULT = BY_NAME[DEFAULT_MESHER]
+DEFAULT = BY_NAME[MARCHING]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
 SEEN_AGAIN = 1.15  # voxels that slabs see in all, over those of one slab, if they take no more time
 LARGE = 250_000  # voxels of a slab below which smaller slabs save little memory
@@ -244,7 +244,7 @@ def slab_bytes(
     factor: int,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     threads: int = 1,
-    mesher: str = DEFAULT_MESHER,
+    mesher: str = MARCHING,
 ) -> int:
     """Return the peak memory of the work on a ``Slab``, in bytes beyond what is held already.
 

@@ -13,12 +13,13 @@ from ..machine.resources import Resources, allot
 from ..mesh import Mesh, vertex_type
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import network_for
+from ..options import MARCHING
 from ..progress import StepCounter
 from ..steps.band import BandSummary
 from ..steps.field import FineField, border_is_crossed
-from ..steps.meshers import Mesher
+from ..steps.meshers import Mesher, find_mesher
 from ..steps.survey import Band, BandTooLargeError, no_surface, survey
-from .cutting import DEFAULT, Slab, peak_bytes, plan_slabs, planes_needed, refuse_band
+from .cutting import Slab, peak_bytes, plan_slabs, planes_needed, refuse_band
 
 Plan: TypeAlias = tuple[int, int | None, Resources, tuple[float, float], Mesher]
 """The factor, the receptive field, the resources, the network's bytes, the mesher."""
@@ -47,7 +48,7 @@ def prepare(
     offset: float,
     max_memory: int | None,
     steps: StepCounter,
-    mesher: Mesher = DEFAULT,
+    mesher: str = MARCHING,
     *,
     at_once: bool = False,
     part: tuple[tuple[int, int], BandSummary] | None = None,
@@ -59,7 +60,8 @@ def prepare(
     chosen = adapt(network_for(network, grid.field.kind))
     resources = allot(chosen.threads, max_memory)
     lattice, reach = cubic_grid(grid, offset), None if at_once else chosen.receptive_field
-    plan: Plan = factor, reach, resources, chosen.memory_bytes, mesher
+    mesh_with = find_mesher(mesher, exact=lattice.field.has_exact)
+    plan: Plan = factor, reach, resources, chosen.memory_bytes, mesh_with
     if part is None:
         band = _find_surface(lattice, offset, plan)
         slabs = plan_slabs(band, *plan)
@@ -70,15 +72,15 @@ def prepare(
         )
     else:
         (first, last), whole = part
-        more = planes_needed(reach, mesher, factor)
+        more = planes_needed(reach, mesh_with, factor)
         among = max(first - more, 0), min(last + more, grid.shape[0])
         band = survey(lattice, offset, resources, among, whole)
         slabs = plan_slabs(band, *plan, (first, last))
     threads = resources.threads
-    planned = peak_bytes(band, slabs, factor, chosen.memory_bytes, threads, mesher)
+    planned = peak_bytes(band, slabs, factor, chosen.memory_bytes, threads, mesh_with)
     steps.divide(len(slabs))
     steps.finish("band")
-    return Run(lattice, offset, chosen, factor, mesher, band, slabs, planned, threads, steps)
+    return Run(lattice, offset, chosen, factor, mesh_with, band, slabs, planned, threads, steps)
 
 
 def _find_surface(grid: SdfGrid, offset: float, plan: Plan) -> Band:

@@ -13,7 +13,7 @@ from ..errors import OptionTypeError, seen
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid, check_grid
 from ..mesh import Mesh, join_meshes
-from ..options import DEFAULT_MESHER, MARCHING, SHARP, check_cap, check_mesher
+from ..options import AUTO, DEFAULT_MESHER, MARCHING, SHARP, check_cap, check_mesher
 from . import marching
 from .cap import check_can_close, close
 from .field import FineField
@@ -26,7 +26,7 @@ Extract = Callable[[FineField, SdfGrid, int, int], list[Mesh]]
 class Mesher:
     """A way to make triangles of a field."""
 
-    name: str  # one of ``options.MESHERS``
+    name: str  # "marching" or "sharp"
     extract: Extract  # returns the mesh of a field's own planes, in one or more pieces
     # takes the factor; returns how many coarse planes to either side of a slab must have final
     # values, since its mesh depends on them
@@ -51,9 +51,13 @@ BY_NAME = {
 }
 
 
-def find_mesher(name: Any) -> Mesher:
-    """Return the mesher with a name."""
-    return BY_NAME[check_mesher(name)]
+def find_mesher(name: Any, *, exact: bool) -> Mesher:
+    """Return the mesher with a name; by itself ``sharp`` if samples are exact distances.
+
+    Without such samples it finds no edges, and its mesh is that of marching cubes.
+    """
+    automatic = SHARP if exact else MARCHING
+    return BY_NAME[automatic if check_mesher(name) == AUTO else name]
 
 
 def extract_mesh(
@@ -66,8 +70,7 @@ def extract_mesh(
 ) -> Mesh:
     """Return the zero level of a field as triangles in world coordinates.
 
-    A node with value 0 is inside. Marching cubes places vertices on lattice edges, by linear
-    interpolation.
+    A node with value 0 is inside.
 
     Parameters
     ----------
@@ -80,7 +83,7 @@ def extract_mesh(
         The number of the first vertex, for a field of a slab: the number of vertices in the slabs
         before. Faces may also refer to vertices of the slab before.
     mesher : str
-        "marching" for marching cubes; "sharp" also puts vertices on edges and corners.
+        As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
     cap : bool
         Close a surface that leaves the grid, as in ``reconstruct``.
 
@@ -96,7 +99,8 @@ def extract_mesh(
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
     grid = field.placed if grid is None else grid
     check_grid(grid)
-    chosen = find_mesher(mesher)
+    samples = field.spheres
+    chosen = find_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
     check_can_close(grid, cap=cap)
     whole = close(field, cap=check_cap(cap), beside=chosen.planes_beside(field.factor))
     return join_meshes(extract_pieces(whole, cubic_grid(grid), first_vertex, 1, chosen))
