@@ -240,8 +240,6 @@ class Upsampling:
             for stage, seconds in self.seconds.items():
                 print_stderr(f"{stage}: {seconds:.3f} s")
         print_stderr(f"{self.target}: {_describe_mesh(result, sum(self.seconds.values()))}")
-        if not self.chosen.goals() and result.counts["triangles"] > MANY:
-            print_stderr("For far fewer triangles within 0.02 voxels of these: --simplify 0.02")
         if result.saved_field:
             print_stderr(f"{self.options['save_field']}: {_describe_field(result.saved_field)}")
         if result.simplified:
@@ -319,9 +317,11 @@ def _describe_mesh(result: Conversion, seconds: float) -> str:
     counts = result.counts
     low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in result.bounds)
     closed = "closed" if result.closed else "open"
+    is_large = not result.simplified and counts["triangles"] > MANY
+    hint = "; far fewer triangles within 0.02 voxels of these: --simplify 0.02" if is_large else ""
     return (
         f"{counts['vertices']:,} vertices, {counts['triangles']:,} triangles, {closed}, "
-        f"from {low} to {high}, {seconds:.1f} s"
+        f"from {low} to {high}, {seconds:.1f} s{hint}"
     )
 
 
