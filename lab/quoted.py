@@ -22,6 +22,7 @@ from .tables import (
     BACK,
     BY_KEY,
     CD,
+    EF1,
     EDGES,
     F1,
     GAPS,
@@ -39,6 +40,7 @@ from .tables import (
 )
 
 UNKNOWN = "(not measured)"
+SHORT = (F1, NC, THERE, BACK, EF1, BY_KEY["field_mae"])
 VOXELS = Column("mean distance", "voxels", 1, 4)
 SECONDS, PEAK = Column("seconds", "seconds", 1, 2), Column("peak MB", "peak_mb", 1, 0)
 EDGE_COLUMNS = (F1, NC, THERE, BACK, *EDGES[:-1])
@@ -59,13 +61,17 @@ SUMMARY_LABELS = {
     "base": "super-sdf, `--mesher marching`",
     "bound": "true distance at the same nodes",
 }
+MODEL_LABELS = {
+    "fast": "`fast`",
+    "noisy": "`noisy`",
+    "base": "`base` (default)",
+    "base-float32": "`base` in float32",
+    "best": "`best`",
+}
 NETWORK_LABELS = {
     "default": "super-sdf",
-    "fast": "`fast`, marching cubes",
-    "noisy": "`noisy`, marching cubes",
+    **{name: f"{label}, marching cubes" for name, label in MODEL_LABELS.items()},
     "base": "`base`, marching cubes",
-    "base-float32": "`base` in float32, marching cubes",
-    "best": "`best`, marching cubes",
 }
 MESHER_LABELS = {
     "marching": "marching",
@@ -133,6 +139,13 @@ def size_table(rows: Sequence[Row], size: int) -> str:
         return [NETWORK_LABELS.get(row["method"]) or label_of(row["method"])]
 
     return surface_table(pick(rows, size=size, half=""), size, words)
+
+
+def network_table(rows: Sequence[Row]) -> str:
+    """Return the networks at each size, meshed by marching cubes."""
+    chosen = (row for row in pick(rows, half="") if row["method"] in MODEL_LABELS)
+    heads, labels = ["grid", "network"], MODEL_LABELS
+    return listed(chosen, SHORT, lambda row: [f"{row['size']}^3", labels[row["method"]]], heads)
 
 
 def gap_table(rows: Sequence[Row]) -> str:
@@ -304,6 +317,7 @@ def is_unequal(kind: str) -> bool:
 
 TABLES: dict[str, Callable[[list[Row]], str]] = {
     "quality.summary": summary_table,
+    "quality.networks": network_table,
     **{f"quality.{n}": partial(size_table, size=n) for n in (32, 64, 128)},
     "quality.gaps": gap_table,
     "quality.worse": worse_line,
