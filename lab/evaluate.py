@@ -30,7 +30,8 @@ from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY, PRECISIONS
 
 from . import parser_of
 from .measuring import NO_SETTING, Task, network_of
-from .methods import FLOOR, METHODS, OURS, make_surface
+from .methods import BY_NAME, FLOOR, METHODS, OURS, make_surface
+from .ndc import add_ndc
 from .plots import draw_plots
 from .processes import describe_machine
 from .rows import Row, Rows
@@ -311,7 +312,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder for the report")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64, 128])
     parser.add_argument("--factor", type=int, default=4)
-    parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--methods", nargs="+", choices=BY_NAME, default=list(METHODS))
     parser.add_argument("--limit", type=int, help="use only this many meshes, spread over the list")
     parser.add_argument("--half", choices=("all", *HALVES), default="all",
                         help="networks are chosen on one half of the meshes")  # fmt: skip
@@ -322,6 +323,7 @@ def main() -> int:
     parser.add_argument("--no-pictures", action="store_true")
     parser.add_argument("--quiet", action="store_true", help="print errors only")
     add_jobs(parser)
+    add_ndc(parser)
     words = parser.parse_args()
     if words.turned is not None and words.turned < 0:
         raise OptionError(f"turned is {seen(words.turned)}: give a seed of 0 or more")
@@ -334,7 +336,7 @@ def main() -> int:
     for setting in settings:
         setting.check()
     network_of(words.model, words.precision, 1)  # raises before anything is measured
-    methods = tuple(name for name in METHODS if name in words.methods)
+    methods = tuple(name for name in BY_NAME if name in words.methods)
     threads = max(1, count_cores() // max(words.jobs, 1))
     like = Task(paths[0], settings[0], methods, words.model, words.precision, threads, words.turned)
     check_folder(words.out)

@@ -36,6 +36,7 @@ from .evaluate import Results, add_jobs, progress_lines, results_of, tasks_of
 from .kinds import KINDS
 from .measuring import Task, digest_of_ours
 from .methods import FLOOR, ON
+from .ndc import add_ndc
 from .processes import describe_machine, machine
 from .rows import Row, Rows
 from .shapes import Setting, draw_halves, find_meshes, spread
@@ -160,11 +161,18 @@ def edges(bench: Bench) -> list[Row]:
 
 
 def peers(bench: Bench) -> list[Row]:
-    """Measure dual contouring of distances, and ours with as many triangles."""
+    """Measure dual contouring of distances and NDC, and ours with as many triangles."""
     other = "dual-contouring"
     methods, setting = (other, f"ours-marching/{other}", f"ours/{other}"), Setting(bench.small)
     results = bench.measured("parts", [setting], methods, LATE)
-    return [{"method": m, **summary(results.of(setting, m))} for m in methods]
+    rows: list[Row] = [{"method": m, **summary(results.of(setting, m))} for m in methods]
+    settings = [Setting(size) for size in bench.sizes[:2]]
+    methods = "ndc", "ours-marching/ndc", "ours/ndc"
+    results = bench.measured("parts", settings, methods)
+    for setting in settings:
+        for m in methods:
+            rows.append({"method": m, "size": setting.size, **summary(results.of(setting, m))})
+    return rows
 
 
 def kinds(bench: Bench) -> list[Row]:
@@ -324,6 +332,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, help="use only this many shapes, spread over all")
     parser.add_argument("--runs", type=int, default=5, help="timed runs of each")
     add_jobs(parser)
+    add_ndc(parser)
     words = parser.parse_args()
     if words.network != DEFAULT_QUALITY and words.out == FOLDER:
         raise OptionError("--network measures another network: give it its own folder, --out")

@@ -44,7 +44,7 @@ VOXEL_NUMBERS = ("efv", "edge_distance", "angle_near", "angle_beyond")
 # Methods whose results do not depend on the code and the networks of this package.
 OF_OTHERS = (
     *("mc", "mc-lewiner", "mc-distances", "trilinear", "bspline", "bound"),
-    *(FLOOR, "dual-contouring"),
+    *(FLOOR, "dual-contouring", "ndc"),
 )
 # Folders of the package whose code does not change any surface.
 NOT_THE_METHOD = {"batch", "certificate", "cli", "cluster", "pages"}

@@ -31,6 +31,7 @@ from super_sdf.steps.survey import survey
 from super_sdf.truth.sampling import grid_points
 
 from .kinds import BY_METHOD, KINDS
+from .ndc import neural_dual_contouring
 from .shapes import Case
 from .surfaces import EMPTY, Surface, interpolate_spline, isosurface
 
@@ -50,6 +51,7 @@ LABELS = {
     "bound": "bound: true distance at the nodes",
     FLOOR: "floor: the reference against itself",
     "dual-contouring": "dual contouring of distances",
+    "ndc": "neural dual contouring",
 }
 
 
@@ -156,6 +158,7 @@ BY_NAME: dict[str, Method] = {
     f"{OURS}-{MARCHING}": partial(our_surface, mesher=MARCHING),
     f"bound-{SHARP}": partial(bound_surface, mesher=SHARP),
     "dual-contouring": dual_contouring,
+    "ndc": neural_dual_contouring,
 }
 
 

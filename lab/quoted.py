@@ -44,6 +44,7 @@ SHORT = (F1, NC, THERE, BACK, EF1, BY_KEY["field_mae"])
 VOXELS = Column("mean distance", "voxels", 1, 4)
 SECONDS, PEAK = Column("seconds", "seconds", 1, 2), Column("peak MB", "peak_mb", 1, 0)
 EDGE_COLUMNS = (F1, NC, THERE, BACK, *EDGES[:-1])
+PEER_COLUMNS = (*EDGE_COLUMNS, Column("mean s", "seconds", 1, 1))
 DENSE = (SECONDS, PEAK, Column("time over ours", "over_seconds", 1, 1),
          Column("memory over ours", "over_peak_mb", 1, 1))  # fmt: skip
 LARGE = (Column("slabs", "slabs", 1, 0), Column("band voxels", "band_voxels", 1, 0),
@@ -305,9 +306,16 @@ def check_table(rows: Sequence[Row]) -> str:
 
 
 def peer_table(rows: Sequence[Row]) -> str:
-    """Return another method, and ours with as many triangles."""
-    columns = (*EDGE_COLUMNS, Column("mean s", "seconds", 1, 1))
-    return listed(rows, columns, heads=[""])
+    """Return dual contouring of distances, and ours with as many triangles."""
+    return listed([row for row in rows if "size" not in row], PEER_COLUMNS, heads=[""])
+
+
+def ndc_table(rows: Sequence[Row]) -> str:
+    """Return neural dual contouring, and ours with as many triangles, at each size."""
+    chosen = [row for row in rows if "size" in row]
+    return listed(
+        chosen, PEER_COLUMNS, lambda row: [f"{row['size']}^3, {label_of(row['method'])}"], [""]
+    )
 
 
 def is_unequal(kind: str) -> bool:
@@ -324,6 +332,7 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
     **{f"edges.{n}": partial(edge_table, name="parts", size=n) for n in (32, 64)},
     "edges.validation": partial(edge_table, name="validation"),
     "peers.table": peer_table,
+    "peers.ndc": ndc_table,
     "kinds.distances": lambda rows: kind_table(rows, lambda k: k != "mask" and not is_unequal(k)),
     "kinds.masks": lambda rows: kind_table(rows, lambda kind: kind == "mask"),
     "kinds.unequal": lambda rows: kind_table(rows, is_unequal),

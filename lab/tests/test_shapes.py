@@ -77,6 +77,17 @@ def test_every_method_finds_the_torus_where_it_is(method):
     assert row["seconds"] > 0
 
 
+def test_a_peer_without_its_checkout_says_what_to_give(monkeypatch, tmp_path):
+    case = shape_and_case(torus(), Setting(12))
+    for folder in (None, str(tmp_path)):
+        monkeypatch.delenv("NDC_FOLDER", raising=False)
+        if folder:
+            monkeypatch.setenv("NDC_FOLDER", folder)
+        path = Path(folder or "", "model.py")
+        error = measure_method(*case, "ndc", TASK)["error"]
+        assert error == f"{path} is missing: give a checkout of NDC at c036901 (--ndc FOLDER)"
+
+
 def test_the_bound_is_better_than_ours_and_ours_than_the_coarse_grid():
     shape, case = shape_and_case(cube(), Setting(20))
     rows = {name: measure_method(shape, case, name, TASK) for name in ("mc", "ours", "bound")}
