@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 from collections import Counter
 from pathlib import Path
 
@@ -217,10 +218,14 @@ def test_the_triangles_that_a_file_states_are_read_from_its_head(tmp_path):
 
 def test_limits(ball_mesh):
     found, names = check_mesh(moved(ball_mesh, 0.15 * H), GRID), list(LIMITS)
-    assert exceeded(found, dict(zip(names, (0.2, 0.1, 0.5)))) == []
-    largest, mean, share = exceeded(found, dict(zip(names, (0.1, 0.05, 0.01))))
+    assert exceeded(found, dict(zip(names, (0.2, 0.2 * H, 0.1, 0.5)))) == []
+    largest, world, mean, share = exceeded(found, dict(zip(names, (0.1, 0.1 * H, 0.05, 0.01))))
     assert largest.startswith("the largest residual is 0.1")
     assert largest.endswith(" voxels, --max-residual is 0.1")
+    worst = found.touching.summary()["largest"] * H
+    assert world == (
+        f"the largest residual is {worst:.4g} in world units, --tolerance is {0.1 * H:g}"
+    )
     assert mean.startswith("the mean residual is 0.07") and share.endswith(", --max-share is 0.01")
 
 
@@ -241,6 +246,7 @@ def test_the_command_prints_figures(here, command):
     assert lines[0].startswith("mesh: 10,242 vertices, 20,480 triangles, 1 component, volume 0.26")
     assert lines[1].endswith(" cut off and 0 noisy left out")
     assert lines[2].startswith("residual in voxels: mean 0.001")
+    assert re.search(r"\), 0\.000\d+ in world units$", lines[2]), lines[2]
     assert lines[3] == "above 0.1 voxel: 0.00% of the samples (0.00% not touching, 0.00% pierced)"
     assert lines[4] == "faults: none (closed, oriented, manifold, no self-intersections)"
     code, out, _ = command("check", "ball.ply", "ball.npz", "--skip-intersections")
@@ -306,7 +312,8 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals_whole_or_not_there(here, com
         ("ball.ply ball.npz --out ball.ply --force", 1, "ball.ply is the same file as ball.ply:"),
         ("ball.ply ball.npz --max-share 2", 2, "--max-share is 2: give a share from 0 to 1"),
         ("ball.ply ball.npz --max-mean nan", 2, "--max-mean is nan: give "),
-        ("ball.ply ball.npz --max-residual -1", 2, "--max-residual is -1: give "),
+        ("ball.ply ball.npz --max-residual -1", 2, "--max-residual is -1: give a number from 0 on"),
+        ("ball.ply ball.npz --tolerance inf", 2, "--tolerance is inf: give a number from 0 on"),
         ("ball.ply ball.npz --offset nan", 2, "--offset is nan: give a finite number, in world"),
         ("ball.ply ball.npz --offset 9", 1, "no surface at 9: the values go from "),
         ("ball.ply none.npz --max-memory 9M", 1, "of memory, 9 MB may be taken in all; "),

@@ -4,6 +4,7 @@ import os
 import tracemalloc
 from pathlib import Path
 from unittest.mock import Mock
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
@@ -197,3 +198,39 @@ def test_normals_of_stl_look_out_at_every_scale(tmp_path, mesh):
         normal = np.cross(b - a, c - a)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         np.testing.assert_allclose(rows["normal"], normal, atol=2e-3)
+
+
+def test_a_unit_is_stated_and_glb_is_in_metres(folder, mesh):
+    for name, unit, metres in (("millimeter", "mm", 1e-3), ("inch", "in", 0.0254)):
+        write_mesh(mesh, "out.3mf", force=True, unit=unit)
+        with ZipFile("out.3mf") as archive:
+            assert f'<model unit="{name}" ' in archive.read("3D/3dmodel.model").decode()
+        assert read("out.3mf").volume() == pytest.approx(mesh.volume(), rel=1e-5)
+        for shift in (0.0, 1e6):
+            far = Mesh(mesh.vertices.astype(np.float64) + shift, mesh.faces)
+            write_mesh(far, "out.glb", force=True, unit=unit)
+            bounds = trimesh.load("out.glb").bounds
+            want = [far.vertices.min(0), far.vertices.max(0)]
+            np.testing.assert_allclose(bounds, metres * np.array(want), rtol=1e-6)
+
+
+def test_the_unit_of_a_conversion(folder, command):
+    place(0.5, 3.0)
+    plain = "upsample in.npz plain.glb", "upsample in.npz out.glb --unit mm"
+    assert [command(*words.split(), "-q")[0] for words in plain] == [0, 0]
+    small, large = (trimesh.load(f"{name}.glb").bounds for name in ("out", "plain"))
+    np.testing.assert_allclose(1000 * small, large, rtol=1e-7)
+    code, out, err = command("check", "out.glb", "in.npz", "--unit", "mm", "--no-faults")
+    assert (code, err) == (0, "") and "faults: none" in out
+    code, _, err = command("upsample", "in.npz", "out.ply", "--unit", "mm")
+    assert (code, err) == (
+        2,
+        "Error: --unit is mm: out.ply can state none, give .glb or .3mf, or no unit\n",
+    )
+    code, _, err = command("batch", "in.npz", "--out", "meshes", "--unit", "mm")
+    assert (code, err) == (
+        2,
+        "Error: --unit is mm: *.ply can state none, give .glb or .3mf, or no unit\n",
+    )
+    assert not Path("meshes").exists()
+    assert command("batch", "in.npz", "--out", "meshes", "--unit", "mm", "--format", "3mf")[0] == 0

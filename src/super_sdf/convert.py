@@ -234,7 +234,7 @@ def convert_grid(
     watch = watch or Stopwatch()
     check_can_close(grid, cap=options.cap)
     check_apart(target, files_of(source))
-    check_target(target, force=force)
+    check_target(target, force=force, unit=options.unit)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, options.factor)
     expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
@@ -261,7 +261,9 @@ def convert_grid(
         tally.replace(simplified.mesh)
         watch.lap("simplify")
     meshes = keeper.copies(meshes) if keeper else meshes
-    write_pieces(meshes, target, force=force, about=about, before_rename=before_rename)
+    write_pieces(
+        meshes, target, force=force, unit=options.unit, about=about, before_rename=before_rename
+    )
     watch.lap("write")
     counts = {name: tally.counts[name] for name in COUNTS}
     counts |= {"expected_triangles": expected.triangles, "expected_bytes": expected.size}

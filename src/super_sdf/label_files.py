@@ -105,7 +105,7 @@ def convert_labels(
     """
     options = options or ConvertOptions()
     check_options(options)
-    check_mesh_suffix(Path(target))
+    check_mesh_suffix(Path(target), options.unit)
     given = options.reading()
     place, bound = {name: given[name] for name in PLACE}, options.max_memory
     image = find_image(source, labels, place, options.axes, bound)
@@ -127,7 +127,7 @@ def convert_labels(
         files: dict[Path, dict[str, Iterator[Mesh]]] = {path: {} for path in paths}
         for label, mesh in meshes.items():
             files[mesh.path][f"label {label}"] = mesh.pieces()
-        write_together(files, force=force, about=about)
+        write_together(files, force=force, unit=options.unit, about=about)
     return {
         **describe_place(grid),
         "labels": [mesh.report() for mesh in meshes.values()],

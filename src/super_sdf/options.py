@@ -29,6 +29,8 @@ DEFAULT_MESHER = AUTO
 GOALS = ("simplify", "tolerance", "triangles")
 """Of these at most one may be given."""
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
+LENGTHS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
+"""Units that mesh files state, in metres."""
 DEVICES = (AUTO, "cpu", "cuda")
 AUTO_PRECISION, FLOAT32, INT8 = AUTO, "float32", "int8"
 PRECISIONS = (AUTO_PRECISION, FLOAT32, INT8)
@@ -389,6 +391,12 @@ class ConvertOptions(ReadOptions):
         int,
         metavar="N",
     )
+    unit: str | None = _choice(
+        None,
+        "Unit of the world, which .3mf and .glb state, so that other programs show the true size. "
+        "Default: a .3mf says millimetres, a .glb metres. Coordinates stay as they are.",
+        LENGTHS,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -452,15 +460,17 @@ MESH = ("factor", *GRID, "offset", "cap", "mesher")
 UPSAMPLE = (
     *(*MESH, "quality", "precision", "model", "device", "max_memory", "threads"),
     *GOALS,
+    "unit",
 )
 """What ``upsample``, ``batch`` and ``view`` take, in the order of their help."""
-BATCH_LISTS = (*MESH, *GOALS)
+BATCH_LISTS = (*MESH, *GOALS, "unit")
 """What a line of a batch's list may say."""
-LABELS = ("factor", "spacing", "origin", "direction", "axes", "max_memory")
+LABELS = ("factor", "spacing", "origin", "direction", "axes", "max_memory", "unit")
 """What of ``ConvertOptions`` goes with ``--labels``."""
 
 check_distance = OPTIONS["offset"].check
 check_cap = OPTIONS["cap"].check
 check_mesher = OPTIONS["mesher"].check
 check_max_memory = OPTIONS["max_memory"].check
+check_unit = OPTIONS["unit"].check
 check_threads = OPTIONS["threads"].check

@@ -42,8 +42,8 @@ def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) ->
     """
     search = _Search(suffix, options)
     jobs = _each_once([job for argument in arguments for job in search.expand(argument)])
-    for kind in {PurePath(job.target).suffix for job in jobs}:
-        check_mesh_suffix(Path(f"*{kind}"))
+    for kind, unit in {(PurePath(job.target).suffix, job.options.unit) for job in jobs}:
+        check_mesh_suffix(Path(f"*{kind}"), unit)
     for job in jobs:
         if PurePath(job.target).parts[0].casefold() in (LOCK_NAME, NAME, STARTED_NAME):
             raise OptionError(

@@ -27,7 +27,7 @@ from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words, memory_bound
 from ..machine.resources import allot, useful_threads
 from ..mesh import Mesh
-from ..options import ConvertOptions, check_distance, check_max_memory
+from ..options import LENGTHS, ConvertOptions, check_distance, check_max_memory
 from ..steps.survey import Band, no_surface, survey
 from ..truth.mesh_files import merged, read_mesh
 from .search import search
@@ -112,7 +112,8 @@ class Certificate:
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
             lines += [
                 f"residual in voxels: mean {figures['mean']:.4f}, 99th percentile "
-                f"{figures['p99']:.4f}, largest {figures['largest_signed']:+.4f} at ({at})",
+                f"{figures['p99']:.4f}, largest {figures['largest_signed']:+.4f} at ({at}), "
+                f"{figures['largest'] * self.voxel_size:.4g} in world units",
                 f"above {NOTICEABLE:g} voxel: {figures['share_above_tenth']:.2%} of the samples "
                 f"({figures['share_not_touching']:.2%} not touching, "
                 f"{figures['share_pierced']:.2%} pierced)",
@@ -151,6 +152,7 @@ class Certificate:
 
 LIMITS = {
     "max_residual": ("largest", "the largest residual is", "voxels"),
+    "tolerance": ("largest", "the largest residual is", "in world units"),
     "max_mean": ("mean", "the mean residual is", "voxels"),
     "max_share": ("share_above_tenth", "above 0.1 voxel is", ""),
 }
@@ -162,7 +164,7 @@ def check_limits(limits: Mapping[str, float | None]) -> None:
     for name in LIMITS:
         limit, option = limits[name], f"--{name.replace('_', '-')}"
         if limit is not None and not 0 <= limit < float("inf"):
-            raise OptionError(f"{option} is {limit:g}: give 0 {LIMITS[name][2] or '1'} or more")
+            raise OptionError(f"{option} is {limit:g}: give a number from 0 on")
     if (share := limits["max_share"]) is not None and share > 1:
         raise OptionError(f"--max-share is {share:g}: give a share from 0 to 1")
 
@@ -175,8 +177,9 @@ def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> li
     figures, found = certificate.touching.summary() if asked else {}, []
     for name in asked:
         (key, words, unit), limit = LIMITS[name], limits[name] or 0.0
-        if figures[key] > limit:
-            value = f"{figures[key]:.4g} {unit}".rstrip()
+        figure = figures[key] * (certificate.voxel_size if name == "tolerance" else 1)
+        if figure > limit:
+            value = f"{figure:.4g} {unit}".rstrip()
             found.append(f"{words} {value}, --{name.replace('_', '-')} is {limit:g}")
     return found
 
@@ -206,8 +209,10 @@ def read_for_check(
     if kept:
         return Kept(kept.grid, merged(kept.mesh), kept.band)
     check_room(stated_triangles(check_regular_file(mesh)), 0, options.max_memory)
-    samples = read_grid(grid, **options.reading())
-    return Kept(samples, read_mesh(mesh, options.max_memory))
+    samples, read = read_grid(grid, **options.reading()), read_mesh(mesh, options.max_memory)
+    if options.unit and Path(mesh).suffix.lower() == ".glb":  # it is in metres
+        read = Mesh(read.vertices / LENGTHS[options.unit], read.faces)
+    return Kept(samples, read)
 
 
 def check_mesh(

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from ..machine.extras import check_modules
-from ..options import GRID, ConvertOptions, parse_size
+from ..options import GRID, LENGTHS, ConvertOptions, parse_size
 from .common import (
     CHECK_MODULES,
     CONTEXT,
@@ -52,6 +52,12 @@ Examples:
     help="Fail if the largest residual of a sample is above this.",
 )
 @click.option(
+    "--tolerance",
+    type=float,
+    metavar="D",
+    help="The same in world units: fail if the largest residual is above D.",
+)
+@click.option(
     "--max-mean", type=float, metavar="VOXELS", help="Fail if the mean residual is above this."
 )
 @click.option(
@@ -80,6 +86,9 @@ Examples:
     show_default=True,
     metavar="D",
     help="The --offset that the mesh was made with.",
+)
+@click.option(
+    "--unit", type=click.Choice(list(LENGTHS)), help="The --unit that a .glb was made with."
 )
 @click.option(
     "--max-memory",
@@ -130,7 +139,9 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     if options["out"]:
         check_coloured(options["out"], force=options["force"])
         check_apart(options["out"], [mesh, *files_of(grid)])
-    given = ConvertOptions(**{name: options[name] for name in (*GRID, "offset", "max_memory")})
+    given = ConvertOptions(
+        **{name: options[name] for name in (*GRID, "offset", "max_memory", "unit")}
+    )
     count = not options["skip_intersections"]
     certificate = check_files(mesh, grid, given, intersections=count, processes=0)
     if options["out"]:

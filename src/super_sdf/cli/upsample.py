@@ -133,7 +133,7 @@ class Upsampling:
         from ..files.regular import files_of
 
         options, force = self.options, self.options["force"]
-        check_target(self.target, force=force)
+        check_target(self.target, force=force, unit=self.chosen.unit)
         outputs: list[str] = [self.target]
         if options["save_field"] is not None:
             from ..fields.writing import check_field_target

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray, Triple
 from ..errors import FileError
 from ..mesh import Mesh
+from ..options import LENGTHS
 from .output import append_spool, little_endian, replacing, spool_beside
 
 CHUNK = 1 << 18  # rows written at a time
@@ -249,21 +250,27 @@ RELATIONS = (
 )
 COMPRESSION = 1  # the fastest level: higher ones save a tenth and take three times as long
 BEFORE = (
-    '<model unit="millimeter" xml:lang="en-US" '
+    '<model unit="{}" xml:lang="en-US" '
     'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">\n<resources>'
 )
+UNITS = {"um": "micron", "mm": "millimeter", "cm": "centimeter", "m": "meter", "in": "inch",
+         "ft": "foot"}  # fmt: skip
 OBJECT = '<object id="{}"{} type="model"><mesh><vertices>\n'
 
 
 def write_glb(
-    parts: Mapping[str, Iterable[Mesh]], path: Path, about: Triple = (0.0, 0.0, 0.0)
+    parts: Mapping[str, Iterable[Mesh]],
+    path: Path,
+    unit: str | None = None,
+    about: Triple = (0.0, 0.0, 0.0),
 ) -> None:
     """Write meshes by their names as binary glTF; its header, of fixed length, is written last.
 
-    Vertices are float32, relative to the point ``about``, the translation of the nodes. Raises
-    FileError if a mesh has no triangle, which glTF does not allow, or the file exceeds 4.29 GB.
+    Vertices are float32, relative to the point ``about``. The nodes move them there, and scale
+    them from the unit to metres, those of glTF. Raises FileError if a mesh has no triangle, which
+    glTF does not allow, or the file exceeds 4.29 GB.
     """
-    scene, size = _Scene(about), JSON_BYTES * len(parts)
+    scene, size = _Scene(about, LENGTHS[unit or "m"]), JSON_BYTES * len(parts)
     with path.open("wb") as file:
         file.write(bytes(HEADER_BYTES + size))
         for name, pieces in parts.items():
@@ -304,8 +311,9 @@ def _unsigned(faces: NDArray[Any]) -> bytes:
 class _Scene:
     """The scene: a node and a mesh for each part, and the layout of the buffer."""
 
-    def __init__(self, about: Triple) -> None:
-        self.place = {"translation": list(about)} if any(about) else {}
+    def __init__(self, about: Triple, metres: float) -> None:
+        scale = {"scale": [metres] * 3} if metres != 1 else {}
+        self.place = {"translation": [metres * x for x in about], **scale} if any(about) else scale
         self.described: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": "super-sdf"},
             "scene": 0,
@@ -336,8 +344,8 @@ class _Scene:
             buffer["byteLength"] += size
 
 
-def write_3mf(parts: Mapping[str, Iterable[Mesh]], path: Path) -> None:
-    """Write meshes by their names as 3MF in the format's default unit, the millimetre.
+def write_3mf(parts: Mapping[str, Iterable[Mesh]], path: Path, unit: str | None = None) -> None:
+    """Write meshes by their names as 3MF, in a unit or the format's default, the millimetre.
 
     Members opened by name have no date, so the same mesh always gives the same file. Triangles
     wait as binary numbers, which take half as much as text.
@@ -349,7 +357,7 @@ def write_3mf(parts: Mapping[str, Iterable[Mesh]], path: Path) -> None:
             with archive.open(name, "w") as file:
                 file.write((HEAD + text).encode("ascii"))
         with archive.open("3D/3dmodel.model", "w", force_zip64=True) as file:
-            file.write((HEAD + BEFORE).encode("ascii"))
+            file.write((HEAD + BEFORE.format(UNITS[unit or "mm"])).encode("ascii"))
             for number, (name, pieces) in enumerate(parts.items(), 1):
                 named = f' name="{name}"' if name else ""
                 file.write(OBJECT.format(number, named).encode("ascii"))

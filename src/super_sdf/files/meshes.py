@@ -29,7 +29,7 @@ from ..grid.planes import in_blocks, over_planes
 from ..grid.sdf_grid import SdfGrid, negated
 from ..machine.memory import in_words
 from ..mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
-from ..options import check_path
+from ..options import check_path, check_unit
 from .mesh_writers import write_3mf, write_glb, write_obj, write_off, write_ply, write_stl
 from .output import check_free, free_space, replacing
 from .volume import triple
@@ -46,14 +46,16 @@ class MeshFormat(NamedTuple):
     single_precision: bool = False  # whether coordinates are float32
     local_origin: bool = False  # whether coordinates may be relative to a point
     has_parts: bool = False
+    has_unit: bool = False
 
     def write_named(
-        self, named: Mapping[str, Iterable[Mesh]], path: Path, about: Triple = WORLD_ORIGIN
+        self, named: Mapping[str, Iterable[Mesh]], path: Path, unit: str | None, about: Triple
     ) -> None:
         """Write meshes in pieces by their names, one if the format has no parts."""
+        stated = (unit,) if self.has_unit else ()
         origin = (about,) if self.local_origin else ()
         for pieces in [named] if self.has_parts else named.values():
-            self.write(pieces, path, *origin)
+            self.write(pieces, path, *stated, *origin)
 
 
 FORMATS = {
@@ -61,8 +63,10 @@ FORMATS = {
     ".stl": MeshFormat(write_stl, 50, single_precision=True),
     ".obj": MeshFormat(write_obj, 40),
     ".off": MeshFormat(write_off, 39),
-    ".glb": MeshFormat(write_glb, 18, single_precision=True, local_origin=True, has_parts=True),
-    ".3mf": MeshFormat(write_3mf, 13, has_parts=True),
+    ".glb": MeshFormat(
+        write_glb, 18, single_precision=True, local_origin=True, has_parts=True, has_unit=True
+    ),
+    ".3mf": MeshFormat(write_3mf, 13, has_parts=True, has_unit=True),
 }
 MESH_SUFFIXES = tuple(FORMATS)
 
@@ -72,19 +76,24 @@ def format_of(path: str | Path) -> MeshFormat:
     return FORMATS[Path(path).suffix.lower()]
 
 
-def check_target(path: str | Path, *, force: bool = False) -> Path:
+def check_target(path: str | Path, *, force: bool = False, unit: str | None = None) -> Path:
     """Return the path if a mesh file can be written there; called before the work starts."""
-    check_mesh_suffix(Path(path))
+    check_mesh_suffix(Path(path), unit)
     return check_free(Path(path), force=force)
 
 
-def check_mesh_suffix(path: Path) -> None:
-    """Raise OptionError if the suffix is not that of a mesh format."""
+def check_mesh_suffix(path: Path, unit: str | None = None) -> None:
+    """Raise OptionError if the suffix is not that of a mesh format, or of none that has a unit."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
+    if unit and not format_of(path).has_unit:
+        stating = " or ".join(suffix for suffix, kind in FORMATS.items() if kind.has_unit)
+        raise OptionError(f"unit is {unit}: {path} can state none, give {stating}, or no unit")
 
 
-def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
+def write_mesh(
+    mesh: Mesh, path: str | Path, *, force: bool = False, unit: str | None = None
+) -> None:
     """Write a mesh to a file, in the format of its suffix.
 
     ``.glb`` has float32 coordinates: a float64 mesh is written relative to the middle of its
@@ -98,22 +107,25 @@ def write_mesh(mesh: Mesh, path: str | Path, *, force: bool = False) -> None:
         The file: .ply, .stl, .obj, .off, .glb or .3mf.
     force : bool
         Replace an existing file.
+    unit : str, optional
+        Unit of the world, which .3mf and .glb state: um, mm, cm, m, in or ft. Default: a .3mf says
+        mm, a .glb m.
 
     Raises
     ------
     OptionError
-        If the suffix is unknown.
+        If the suffix is unknown, or that of a format that states no unit.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; or if the format cannot
         hold the mesh: a coordinate is not finite, or corners of a triangle would coincide.
     """
     check_mesh(mesh)
-    path = check_target(check_path(path, "path"), force=force)
+    path = check_target(check_path(path, "path"), force=force, unit=check_unit(unit))
     about = WORLD_ORIGIN
     if format_of(path).local_origin and mesh.vertices.dtype == np.float64 and len(mesh.vertices):
         about = triple(mesh.vertices.min(0) / 2 + mesh.vertices.max(0) / 2)
     _check_mesh_holds(mesh, path, about)
-    write_pieces([mesh], path, force=force, about=about)
+    write_pieces([mesh], path, force=force, unit=unit, about=about)
 
 
 def write_pieces(
@@ -121,6 +133,7 @@ def write_pieces(
     path: str | Path,
     *,
     force: bool = False,
+    unit: str | None = None,
     about: Triple = WORLD_ORIGIN,
     before_rename: Callable[[Path], None] | None = None,
 ) -> None:
@@ -129,22 +142,23 @@ def write_pieces(
     ``check_format_holds`` says whether the format can hold it, and ``about``, its local origin.
     ``before_rename`` is called with the path of the complete file.
     """
-    path = check_target(path, force=force)
+    path = check_target(path, force=force, unit=unit)
     with replacing(path, force=force, before_rename=before_rename) as part:
-        format_of(path).write_named({"": pieces}, part, about)
+        format_of(path).write_named({"": pieces}, part, unit, about)
 
 
 def write_together(
     meshes: Mapping[Path, Mapping[str, Iterable[Mesh]]],
     *,
     force: bool = False,
+    unit: str | None = None,
     about: Triple = WORLD_ORIGIN,
 ) -> None:
     """Write files of meshes in pieces, by path and name: all of them, or none."""
     with ExitStack() as files:
         for path, named in meshes.items():
             part = files.enter_context(replacing(check_target(path, force=force), force=force))
-            format_of(path).write_named(named, part, about)
+            format_of(path).write_named(named, part, unit, about)
         for path in meshes:
             check_target(path, force=force)  # before the first of them appears
 
