@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 __all__ = [
+    "DistanceFunction",
     "FineField",
     "Mesh",
     "SdfGrid",

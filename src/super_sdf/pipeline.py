@@ -17,8 +17,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from . import options
+from .functions import Function, as_function, sampled
 from .grid.sdf_grid import SdfGrid, check_grid
 from .machine.memory import give_back
 from .mesh import Mesh, join_meshes
@@ -38,6 +40,7 @@ from .steps.meshers import extract_pieces
 from .steps.spheres import fit_to_spheres, spheres_of_band
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
+from .steps.zero import put_on_zero
 
 
 def refine(
@@ -152,24 +155,34 @@ def upsample(
 
 
 def reconstruct(
-    grid: SdfGrid,
+    grid: SdfGrid | None = None,
     network: Decoder | None = None,
     factor: int = 4,
     *,
+    function: Function | None = None,
+    bounds: ArrayLike | None = None,
+    spacing: ArrayLike | None = None,
     offset: float = 0.0,
     cap: bool = False,
     mesher: str = options.DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
-    """Turn a coarse grid into a fine mesh.
+    """Turn a coarse grid, or a function, into a fine mesh.
 
     Parameters and errors are those of ``upsample``, except for these:
 
     Parameters
     ----------
+    grid : SdfGrid, optional
+        Coarse signed distances. Without a grid the function is sampled.
     network : Network, optional
         By default the shipped network ``base``.
+    function : callable or DistanceFunction, optional
+        What the grid has samples of; vertices are then put where it is 0. See
+        ``DistanceFunction``.
+    bounds, spacing : optional
+        The box and the distance of the samples, without a grid; see ``DistanceFunction.sample``.
     cap : bool
         Close a surface that leaves the grid along the grid's border, as the command does unless it
         gets ``--open``. By default it is left open there, so that meshes of neighbouring grids can
@@ -186,7 +199,8 @@ def reconstruct(
     Mesh
         In world units; closed, unless the surface leaves the grid and ``cap`` is False.
     """
-    check_grid(grid)
+    exact = None if function is None else as_function(function)
+    grid = sampled(grid, exact, bounds, spacing)
     network = load_network() if network is None else network
     pieces = reconstruct_slabs(
         grid,
@@ -198,7 +212,8 @@ def reconstruct(
         max_memory=max_memory,
         progress=progress,
     )
-    return join_meshes([mesh for piece in pieces for mesh in piece.meshes])
+    mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
+    return mesh if exact is None else put_on_zero(mesh, exact, grid, factor, offset)
 
 
 def reconstruct_slabs(

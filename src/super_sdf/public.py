@@ -6,6 +6,7 @@ from .fields.writing import write_field as write_field
 from .files.grids import grid_from_image as grid_from_image
 from .files.grids import read_grid as read_grid
 from .files.meshes import write_mesh as write_mesh
+from .functions import DistanceFunction as DistanceFunction
 from .grid.sdf_grid import SdfGrid as SdfGrid
 from .grid.sdf_grid import make_grid as make_grid
 from .labels import reconstruct_labels as reconstruct_labels

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Triple
+from ..arrays import Triple, without_device
 from ..errors import GridError, seen
 from ..machine.memory import check_fits
 from .planes import SampleArray, SamplePlanes
@@ -224,8 +224,8 @@ def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
     if isinstance(values, SamplePlanes):
         return values
     try:
-        samples = np.asanyarray(values)
-    except (TypeError, ValueError, RuntimeError):  # ragged lists, tensors on a GPU
+        samples = np.asanyarray(without_device(values))
+    except (TypeError, ValueError, RuntimeError):  # ragged lists
         raise GridError(f"values are {seen(values)}: give an array of three axes") from None
     return _unmasked(samples) if hasattr(samples, "mask") else samples  # to name it takes 7 ms
 

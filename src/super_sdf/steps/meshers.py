@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import OptionTypeError, seen
+from ..functions import Function, as_function
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid, check_grid
 from ..mesh import Mesh, join_meshes
@@ -67,6 +68,7 @@ def extract_mesh(
     *,
     mesher: str = DEFAULT_MESHER,
     cap: bool = False,
+    function: Function | None = None,
 ) -> Mesh:
     """Return the zero level of a field as triangles in world coordinates.
 
@@ -86,6 +88,8 @@ def extract_mesh(
         As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
     cap : bool
         Close a surface that leaves the grid, as in ``reconstruct``.
+    function : callable or DistanceFunction, optional
+        What the grid has samples of; vertices are then put where it is 0, as in ``reconstruct``.
 
     Raises
     ------
@@ -103,7 +107,12 @@ def extract_mesh(
     chosen = find_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
     check_can_close(grid, cap=cap)
     whole = close(field, cap=check_cap(cap), beside=chosen.planes_beside(field.factor))
-    return join_meshes(extract_pieces(whole, cubic_grid(grid), first_vertex, 1, chosen))
+    mesh = join_meshes(extract_pieces(whole, cubic_grid(grid), first_vertex, 1, chosen))
+    if function is None:
+        return mesh
+    from .zero import put_on_zero  # imported here, as few call it
+
+    return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)
 
 
 def extract_pieces(

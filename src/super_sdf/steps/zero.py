@@ -1,0 +1,205 @@
+"""Vertices put where a function is 0, and onto its edges.
+
+1. A vertex goes along its normal: a Newton step, then a secant step.
+2. Where that does not lead to the surface, it goes down the gradient, which changes at an edge.
+3. Where triangles turn, the vertex goes to where the planes of the surface beside it meet.
+
+The lattice says how the surface is joined, so triangles stay as they are: a vertex moves by at most
+half a fine spacing, and only if it finds the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray
+from ..errors import OptionError
+from ..functions import DistanceFunction
+from ..grid.sdf_grid import SdfGrid
+from ..mesh import Mesh
+from .sharp.triangle_pairs import intersecting, overlapping_boxes
+
+Vectors: TypeAlias = NDArray[np.float64]  # (n, 3)
+Numbers: TypeAlias = NDArray[np.float64]  # (n,)
+Value: TypeAlias = Callable[[Vectors], Numbers]
+
+REACH = 0.5  # fine spacings that a vertex may move
+STEP = 0.02  # fine spacings in which slopes are measured
+GOOD = 1e-4  # fine spacings from the surface at which a vertex needs no other step
+HALF_WAY, BACK_ROUNDS = 3, 8  # rounds in which what folds goes half way back, and all
+ONE_WAY = 0.8  # cosine by which a triangle has turned that may fold the surface
+ROUNDS = 4  # of steps along the gradient
+LEAST_SLOPE = 1e-9
+REACHED = 0.25  # of the value at the start, above which the surface is not in reach
+TURNED = 0.866  # cosine of 30 degrees
+LEAST_AREA = 0.02  # of triangles whose normals count, in squared fine spacings
+STAY = 1e-3  # weight of the vertex itself beside that of a plane, in least squares
+NEAR = 0.05  # fine spacings from the surface at which the planes' point is taken
+
+
+def put_on_zero(
+    mesh: Mesh, function: DistanceFunction, grid: SdfGrid, factor: int, offset: float = 0.0
+) -> Mesh:
+    """Return a mesh with the vertices moved to where a function is 0, or has an ``offset``.
+
+    On the border of the grid vertices stay. OptionError if there is an offset, but no distance.
+    """
+    if offset and not grid.field.has_exact:
+        raise OptionError(f"offset is {offset:g}: the function is no distance, leave it out")
+    fine, sign = grid.voxel_size / factor, -1.0 if grid.positive_inside else 1.0
+    middle = grid.to_world((np.array(grid.shape) - 1) / 2)
+
+    def value(points: Vectors) -> Numbers:
+        """Return values at points, both in fine spacings, so that slopes are those of a unit."""
+        return (function(middle + fine * points) - sign * offset) / fine
+
+    before_all = (mesh.vertices.astype(np.float64) - middle) / fine
+    points = before_all.copy()
+    free = _is_within(grid, mesh.vertices, REACH / factor)
+    rows, normals = np.flatnonzero(free), vertex_normals(points, mesh.faces)
+    start, before = points[rows], value(points[rows])
+    slope = np.full(len(rows), sign)
+    if not grid.field.has_exact:
+        slope = (value(start + STEP * normals[rows]) - before) / STEP
+    found, off = step_along(value, start, before, normals[rows], slope)
+    left = np.flatnonzero(np.abs(off) > GOOD * np.abs(slope))
+    found[left], off[left] = step_down(value, start[left], before[left])
+    reached = np.abs(off) <= REACHED * np.abs(before)
+    points[rows[reached]] = found[reached]
+    points = put_on_edges(value, points, mesh.faces, free)
+    points = without_folds(points, before_all, mesh.faces)
+    return Mesh((middle + fine * points).astype(mesh.vertices.dtype), mesh.faces)
+
+
+def _is_within(grid: SdfGrid, points: NDArray[Any], margin: float) -> BoolArray:
+    """Return which points, (n,), are this far inside the grid's border, in spacings."""
+    index = grid.to_index(points)
+    last = np.array(grid.shape) - 0.5
+    within: BoolArray = np.all((index > margin - 0.5) & (index < last - margin), axis=1)
+    return within
+
+
+def step_along(
+    value: Value, start: Vectors, before: Numbers, direction: Vectors, slope: Numbers
+) -> tuple[Vectors, Numbers]:
+    """Return points (n, 3) nearer to 0 along directions, and the values there, (n,).
+
+    ``before`` are the values at the start. A Newton step with a ``slope`` along the direction, then
+    a secant step from both values.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        way = np.clip(np.nan_to_num(-before / slope), -REACH, REACH)
+        after = value(start + way[:, None] * direction)
+        second = np.clip(np.nan_to_num(way - after * way / (after - before)), -REACH, REACH)
+    again = np.flatnonzero(np.abs(after) > GOOD * np.abs(slope))
+    last = value(start[again] + second[again, None] * direction[again])
+    closer = np.abs(last) < np.abs(after[again])
+    way[again[closer]], after[again[closer]] = second[again[closer]], last[closer]
+    return start + way[:, None] * direction, after
+
+
+def step_down(value: Value, start: Vectors, before: Numbers) -> tuple[Vectors, Numbers]:
+    """Return points (n, 3) nearer to 0, and the values there, (n,), by steps along the gradient.
+
+    Outside an edge that is the gradient of one face, then of the other.
+    """
+    at, now = start.copy(), before.copy()
+    for _ in range(ROUNDS):
+        slope, direction = length_and_unit(gradient(value, at, now))
+        way = np.clip(-now / np.maximum(slope, LEAST_SLOPE), -REACH, REACH)
+        length, shift = length_and_unit(at + way[:, None] * direction - start)
+        new = start + np.minimum(length, REACH)[:, None] * shift
+        there = value(new)
+        closer = np.abs(there) < np.abs(now)
+        at[closer], now[closer] = new[closer], there[closer]
+    return at, now
+
+
+def put_on_edges(value: Value, points: Vectors, faces: NDArray[Any], free: BoolArray) -> Vectors:
+    """Return points (n, 3), ``free`` ones of edges where the planes of points beside them meet."""
+    edges = is_on_edge(points, faces)
+    one, other = faces.ravel(), np.roll(faces, -1, 1).ravel()
+    one, other = np.concatenate([one, other]), np.concatenate([other, one])
+    pairs = edges[one] & free[one] & free[other] & ~edges[other]
+    rows, at = np.unique(one[pairs], return_inverse=True)
+    known, beside = np.unique(other[pairs], return_inverse=True)
+    normals = length_and_unit(gradient(value, points[known], value(points[known])))[1][beside]
+    heights = (normals * (points[known][beside] - points[rows][at])).sum(1)
+    matrix = np.zeros((len(rows), 3, 3)) + STAY * np.eye(3)
+    np.add.at(matrix, at, normals[:, :, None] * normals[:, None])
+    vector = np.zeros((len(rows), 3))
+    np.add.at(vector, at, heights[:, None] * normals)
+    shift = np.linalg.solve(matrix, vector[..., None])[..., 0]
+    moved = points[rows] + shift
+    better = (np.abs(value(moved)) < NEAR) & (np.abs(shift).max(1) < REACH)
+    points = points.copy()
+    points[rows[better]] = moved[better]
+    return points
+
+
+def is_on_edge(points: Vectors, faces: NDArray[Any]) -> BoolArray:
+    """Return at which points, (n,), triangles turn by 30 degrees."""
+    area, normals = length_and_unit(face_normals(points, faces))
+    large = area > 2 * LEAST_AREA
+    corners, normals = faces[large].ravel(), np.repeat(normals[large], 3, axis=0)
+    mean = length_and_unit(sums_at(corners, normals, len(points)))[1]
+    # Two that turn by an angle are at most half of it from their mean.
+    least = np.ones(len(points))
+    np.minimum.at(least, corners, (normals * mean[corners]).sum(1))
+    turned: BoolArray = least < np.sqrt((1 + TURNED) / 2)
+    return turned
+
+
+def without_folds(points: Vectors, before: Vectors, faces: NDArray[Any]) -> Vectors:
+    """Return points (n, 3), some back where they were before, so that no triangles intersect.
+
+    Triangles that fold the surface have turned, or one beside them has.
+    """
+    points, back = points.copy(), np.zeros(0, np.int64)
+    original = length_and_unit(face_normals(before, faces))[1]
+    for turn in range(BACK_ROUNDS):
+        cosine = (length_and_unit(face_normals(points, faces))[1] * original).sum(1)
+        suspect = np.zeros(len(points), bool)
+        suspect[faces[cosine < ONE_WAY]] = True
+        suspect[back] = True
+        pairs = np.stack(overlapping_boxes(points, faces, suspect))
+        pairs = np.concatenate(intersecting(points, *faces[pairs]), axis=1)
+        back = np.unique(np.concatenate([pairs.ravel(), faces[cosine < 0].ravel()]))
+        back = back[(points[back] != before[back]).any(1)]
+        if not len(back):
+            break
+        way = 0.5 if turn < HALF_WAY else 1.0
+        points[back] += way * (before[back] - points[back])
+    return points
+
+
+def gradient(value: Value, points: Vectors, values: Numbers) -> Vectors:
+    """Return the gradient at points (n, 3) with values (n,), by forward differences."""
+    return np.stack([(value(points + STEP * axis) - values) / STEP for axis in np.eye(3)], 1)
+
+
+def face_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
+    """Return normals of triangles (m, 3), as long as twice their areas."""
+    a, b, c = (points[corner] for corner in faces.T)
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def vertex_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
+    """Return unit normals at points (n, 3), means of the triangles' weighted by their areas."""
+    normals = np.repeat(face_normals(points, faces), 3, axis=0)
+    return length_and_unit(sums_at(faces.ravel(), normals, len(points)))[1]
+
+
+def sums_at(place: NDArray[Any], vectors: Vectors, count: int) -> Vectors:
+    """Return the sums of vectors (m, 3) at each of ``count`` places, (count, 3)."""
+    return np.stack([np.bincount(place, component, count) for component in vectors.T], 1)
+
+
+def length_and_unit(vectors: NDArray[Any]) -> tuple[Numbers, Vectors]:
+    """Return lengths (n,) and unit vectors (n, 3)."""
+    length = np.linalg.norm(vectors, axis=1)
+    return length, vectors / np.maximum(length, np.finfo(np.float64).tiny)[:, None]

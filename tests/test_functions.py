@@ -1,0 +1,225 @@
+"""A function in, a mesh out: vertices lie where it is 0, and on its edges."""
+
+import numpy as np
+import pytest
+from conftest import refusal, trilinear
+
+from super_sdf import DistanceFunction, extract_mesh, functions, make_grid, reconstruct, upsample
+from super_sdf.certificate.check import check_mesh
+from super_sdf.errors import GridError, OptionError, OptionTypeError
+from super_sdf.steps import zero
+
+H = 2 / 19
+BOX = (-1.0, 1.0)
+TURNED = np.linalg.qr(np.array([[1.0, 0.4, -0.3], [0.2, 1.0, 0.5], [-0.6, 0.1, 1.0]]))[0]
+SIDES = np.array([0.55, 0.4, 0.45])
+
+
+def torus(points):
+    return np.hypot(np.hypot(*points[:, :2].T) - 0.55, points[:, 2]) - 0.25
+
+
+def block(points):
+    beyond = np.abs(points @ TURNED) - SIDES
+    outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
+    return outside + np.minimum(beyond.max(1), 0)
+
+
+def off(function, mesh):
+    """Return how far a mesh's vertices are from a surface, in voxels."""
+    return np.abs(function(mesh.vertices.astype(np.float64))) / H
+
+
+def is_on(function, mesh):
+    """Whether vertices lie on a surface, but for a few that would have folded the mesh."""
+    far = off(function, mesh)
+    return np.quantile(far, 0.97) < 3e-5 and far.mean() < 5e-4
+
+
+def test_vertices_lie_where_the_function_is_0():
+    asked = DistanceFunction(torus)
+    mesh = reconstruct(function=asked, bounds=BOX, spacing=H)
+    plain = reconstruct(make_grid(torus_samples(), spacing=H, origin=-1.0))
+    np.testing.assert_array_equal(mesh.faces, plain.faces)
+    assert off(torus, plain).mean() > 1e-3
+    assert is_on(torus, mesh)
+    assert mesh.is_closed()
+    assert 20**3 + 2 * len(mesh.vertices) <= asked.evaluations < 20**3 + 2.3 * len(mesh.vertices)
+    nodes = 4**3 * upsample(asked.sample(BOX, H), trilinear).band_voxels
+    assert asked.evaluations - 20**3 < 1.5 * nodes
+
+
+def torus_samples():
+    axis = -1 + H * np.arange(20)
+    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), 3).reshape(-1, 3)
+    return torus(points).reshape((20,) * 3).astype(np.float32)
+
+
+def test_the_mesh_of_a_field_and_of_a_grid_is_the_same():
+    grid = DistanceFunction(torus).sample(BOX, H)
+    np.testing.assert_allclose(grid.values, torus_samples(), atol=1e-6)
+    assert grid.origin == (-1, -1, -1) and grid.shape == (20, 20, 20)
+    one = reconstruct(grid, trilinear, function=torus)
+    other = extract_mesh(upsample(grid, trilinear), function=torus)
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    assert is_on(torus, one)
+
+
+def test_edges_and_corners_are_those_of_the_function():
+    plain = reconstruct(DistanceFunction(block).sample(BOX, H))
+    mesh = reconstruct(function=block, bounds=BOX, spacing=H)
+    ends = np.array(np.meshgrid(*[[-1, 1]] * 3)).reshape(3, -1).T * SIDES
+    near, far = (
+        np.linalg.norm(one.vertices[:, None] - ends @ TURNED.T, axis=2).min(0) / H
+        for one in (mesh, plain)
+    )
+    assert np.median(near) < 1e-4 < 1e-2 < np.median(far)
+    assert near.max() < 0.05
+    inside = np.abs(mesh.vertices @ TURNED) - SIDES
+    on_edges = (np.abs(inside) < 2e-3 * H).sum(1) >= 2
+    assert on_edges.sum() > 12 * 0.9 / H  # at least as many as the coarse lattice has cells there
+    assert 4 * off(block, mesh).mean() < off(block, plain).mean()
+    assert mesh.is_closed()
+    assert check_mesh(mesh, DistanceFunction(block).sample(BOX, H)).surface.faults() == []
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_any_function_that_changes_sign_there_will_do(sign):
+    def occupancy(points):
+        return sign * (0.5 - 1 / (1 + np.exp(-12 * torus(points))))[:, None]
+
+    mesh = reconstruct(None, trilinear, function=occupancy, bounds=BOX, spacing=H)
+    assert off(torus, mesh).mean() < 1e-4
+    assert mesh.is_closed() and mesh.volume() > 0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_an_offset_is_where_the_function_has_it(sign):
+    mesh = reconstruct(
+        None, trilinear, function=lambda p: sign * torus(p), bounds=BOX, spacing=H, offset=0.1
+    )
+    assert is_on(lambda points: torus(points) - 0.1, mesh)
+
+
+def test_on_the_border_vertices_stay():
+    def pillar(points):
+        return np.hypot(*points[:, :2].T) - 0.5
+
+    grid = DistanceFunction(pillar).sample(BOX, H)
+    plain = reconstruct(grid, trilinear, cap=True)
+    mesh = reconstruct(grid, trilinear, function=pillar, cap=True)
+    border = np.abs(plain.vertices[:, 2]) > 1 + H / 2 - H / 10
+    np.testing.assert_array_equal(mesh.vertices[border], plain.vertices[border])
+    inner = np.abs(plain.vertices[:, 2]) < 1
+    assert np.abs(pillar(mesh.vertices[inner])).max() < 3e-5
+    assert mesh.is_closed()
+
+
+def test_batches_do_not_change_the_mesh(monkeypatch):
+    most = []
+
+    def watched(points):
+        most.append(len(points))
+        return torus(points)
+
+    want = reconstruct(None, trilinear, function=torus, bounds=BOX, spacing=H)
+    monkeypatch.setattr(functions, "BATCH", 1000)
+    found = reconstruct(None, trilinear, function=watched, bounds=BOX, spacing=H)
+    np.testing.assert_array_equal(found.vertices, want.vertices)
+    assert max(most) == 1000
+
+
+class Tensor:
+    """What PyTorch's tensors do: NumPy takes one only without gradients, from the CPU."""
+
+    def __init__(self, values, steps=("detach", "cpu")):
+        self.values, self.steps = values, steps
+        self.dtype = "torch.float32"
+
+    def detach(self):
+        return Tensor(self.values, [step for step in self.steps if step != "detach"])
+
+    def cpu(self):
+        return Tensor(self.values, [step for step in self.steps if step != "cpu"])
+
+    def __array__(self, dtype=None, copy=None):
+        if self.steps:
+            raise TypeError(f"call {self.steps[0]}")
+        return np.array(self.values, dtype)
+
+
+def test_tensors_are_taken():
+    mesh = reconstruct(None, trilinear, function=lambda p: Tensor(torus(p)), bounds=BOX, spacing=H)
+    assert is_on(torus, mesh)
+    grid = make_grid(Tensor(torus_samples()), spacing=H)
+    np.testing.assert_array_equal(grid.values, torus_samples())
+
+
+GRID = make_grid(torus_samples(), spacing=H)
+
+
+@pytest.mark.parametrize(
+    ("given", "kind", "message"),
+    [
+        ({"function": 3}, OptionTypeError, "function is 3: give a function of points (n, 3)"),
+        ({}, OptionTypeError, "grid is None: make one with make_grid(values, spacing=...) or "
+         "read_grid(path)"),
+        ({"function": torus}, OptionError,
+         "a function needs bounds and spacing, or a grid of its samples"),
+        ({"grid": GRID, "bounds": BOX}, OptionError,
+         "bounds and spacing are for a function: the grid has its own"),
+        ({"function": torus, "bounds": (1, -1), "spacing": H}, OptionError,
+         "bounds are (1, -1): the box is empty, give (lowest, highest)"),
+        ({"function": torus, "bounds": 3, "spacing": H}, OptionError,
+         "bounds are 3: give (lowest, highest), numbers or points"),
+        ({"function": torus, "bounds": BOX, "spacing": 1e-4}, OptionError,
+         "spacing is 0.0001: the box takes more than 2^31 samples"),
+        ({"function": torus, "bounds": BOX, "spacing": 0}, GridError,
+         "spacing is 0, 0, 0: it must be greater than 0"),
+        ({"function": lambda p: p, "bounds": BOX, "spacing": H}, OptionTypeError,
+         "the function returns an array of shape (8000, 3) for 8000 points: return one number for "
+         "each"),
+        ({"function": lambda p: None, "bounds": BOX, "spacing": H}, OptionTypeError,
+         "the function returns None: return numbers"),
+        ({"function": lambda p: np.tanh(8 * torus(p)), "bounds": BOX, "spacing": H, "offset": 0.01},
+         OptionError, "offset is 0.01: the function is no distance, leave it out"),
+        ({"function": lambda p: p[:, 0] + 9, "bounds": BOX, "spacing": H}, GridError,
+         "no value is below 0 (the smallest is 8)"),
+    ],
+)  # fmt: skip
+def test_errors(given, kind, message):
+    said = refusal(kind, reconstruct, network=trilinear, **given)
+    assert said.startswith(message), said
+
+
+def test_a_vertex_that_finds_no_surface_stays():
+    grid = DistanceFunction(torus).sample(BOX, H)
+    plain = reconstruct(grid, trilinear)
+    far = reconstruct(grid, trilinear, function=lambda points: torus(points) + 1)
+    np.testing.assert_array_equal(far.vertices, plain.vertices)
+    flat = reconstruct(grid, trilinear, function=lambda points: np.ones(len(points)))
+    np.testing.assert_array_equal(flat.vertices, plain.vertices)
+
+
+def test_what_would_fold_goes_back():
+    """Of a flat patch, a vertex pushed across the opposite edge turns a triangle over."""
+    flat = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
+    faces = np.array([[0, 1, 2], [1, 3, 2]])
+    moved = flat.copy()
+    moved[3] = 0.3, 0.3, 0
+    moved[0] = -0.1, 0, 0.05
+    found = zero.without_folds(moved, flat, faces)
+    np.testing.assert_allclose(found[3], [0.65, 0.65, 0])  # half of the way does
+    np.testing.assert_array_equal(found[0], moved[0])
+
+
+def test_steps_down_go_round_an_edge():
+    """Of a maximum of planes, the gradient is that of one plane at a time."""
+
+    def ridge(points):
+        return np.maximum(points[:, 0], points[:, 1])
+
+    start = np.array([[0.3, 0.1, 0.0]])
+    at, now = zero.step_down(ridge, start, ridge(start))
+    np.testing.assert_allclose(at[0], 0, atol=1e-9)
+    assert now == pytest.approx(0, abs=1e-9)
