@@ -109,7 +109,17 @@ def test_version_help_info_and_usage_errors(command):
     facts = json.loads(command("info", "--json")[1])
     assert facts["models"]["base"]["format_version"] == 1
     assert command("upsample")[0] == 2
-    assert command("nonsense") == (2, "", "Error: No such command 'nonsense'.\n")
+    assert command("upsampel") == (
+        2, "", "Error: there is no command 'upsampel': did you mean upsample?\n"
+    )  # fmt: skip
+    assert command("nonsense") == (
+        2,
+        "",
+        "Error: there is no command 'nonsense': give one of upsample, batch, check, sample, view, "
+        "info\n",
+    )
+    code, out, err = command()
+    assert (code, err) == (0, "") and out == command("--help")[1]
 
 
 def test_every_option_has_help_and_is_in_the_table_once():

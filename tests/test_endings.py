@@ -149,6 +149,22 @@ def test_streams_that_are_closed_or_full_cost_no_mesh():
     assert run("--help", shell=">&-") == (1, "", want)
 
 
+@pytest.mark.parametrize(
+    ("words", "code"), [("info", 141), ("info --json", 141), ("", 141), ("upsample --help", 1)]
+)
+def test_a_reader_that_has_seen_enough_is_no_error(words, code):
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-m", "super_sdf", *words.split()],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        restore_signals=False,
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (code, b"")
+
+
 @pytest.mark.parametrize("handles", [7, 20])
 def test_few_file_handles_end_in_a_line_or_a_mesh(handles):
     def limit():

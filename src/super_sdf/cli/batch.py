@@ -16,6 +16,7 @@ from ..options import MESH_FORMATS
 from .batch_report import print_plan, print_summary, progress_line, sentence
 from .common import (
     CONTEXT,
+    GroupedCommand,
     InterruptedCommand,
     check_can_check,
     check_cluster,
@@ -56,6 +57,7 @@ Examples:
 
 @click.command(
     "batch",
+    cls=GroupedCommand,
     context_settings=CONTEXT,
     epilog=EXAMPLES,
     short_help="Convert many grids; can be stopped and resumed.",

@@ -23,11 +23,41 @@ if TYPE_CHECKING:
     from ..network.network import Network
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+PIPE_CLOSED = 141  # exit code of programs whose reader has ended: 128 and SIGPIPE
 PAGES = (".html", ".htm")
 CHECK_MODULES = ("igl",)  # of the extra report, for certificates
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 """Adds options to a command."""
+
+
+GROUPS = {
+    "The grid": ("spacing", "origin", "direction", "axes"),
+    "Its values": ("inside", "field", "label", "labels", "level", "scale"),
+    "The mesh": ("factor", "offset", "cap", "mesher", "simplify", "tolerance", "triangles", "unit"),
+    "The work": (
+        *("quality", "precision", "model", "device", "max_memory", "threads"),
+        *("cluster", "jobs", "fail_fast", "retry", "dry_run"),
+    ),
+}
+"""Options by what they are about; the others are about output."""
+
+
+class GroupedCommand(click.Command):
+    """A command with many options: its help lists them under headings."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, each under its heading."""
+        rows: dict[str, list[tuple[str, str]]] = {heading: [] for heading in (*GROUPS, "Output")}
+        for option in self.get_params(ctx):
+            if not isinstance(option, click.Option):
+                continue
+            among = (heading for heading, names in GROUPS.items() if option.name in names)
+            if row := option.get_help_record(ctx):
+                rows[next(among, "Output")].append(row)
+        for heading, some in rows.items():
+            with formatter.section(heading):
+                formatter.write_dl(some)
 
 
 class Parsed(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2
@@ -191,14 +221,18 @@ def print_stderr(line: str) -> None:
         click.echo(line.replace("\n", " "), err=True)
 
 
-def print_stdout(text: str, kept: str) -> None:
-    """Print the result that the user asked for; ``kept`` says which output exists if that fails."""
+def print_stdout(text: str, kept: str = "") -> None:
+    """Print the result that the user asked for; ``kept`` says which output exists if that fails.
+
+    A reader that has seen enough, such as ``head``, is no error.
+    """
     try:
         click.echo(text)
+    except BrokenPipeError:
+        raise click.exceptions.Exit(PIPE_CLOSED) from None
     except OSError as error:
-        raise click.ClickException(
-            f"stdout cannot be written: {error.strerror or error}; {kept}"
-        ) from error
+        said = f"stdout cannot be written: {error.strerror or error}"
+        raise click.ClickException(f"{said}; {kept}" if kept else said) from error
 
 
 def check_page(option: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:

@@ -12,7 +12,7 @@ import click
 from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..options import DEVICES, FLOAT32, MESHERS
-from .common import CONTEXT, one_line_errors
+from .common import CONTEXT, one_line_errors, print_stdout
 
 EXAMPLES = """\b
 Examples:
@@ -63,13 +63,13 @@ def print_grid(source: str, as_json: bool) -> None:
 
     found = describe_grid_file(source)
     if as_json:
-        click.echo(json.dumps(found, indent=2))
+        print_stdout(json.dumps(found, indent=2))
         return
     notes = found.pop("notes", ())
     for key, value in found.items():
-        click.echo(f"{key}: {_in_words(value)}")
+        print_stdout(f"{key}: {_in_words(value)}")
     for note in notes:
-        click.echo(f"note: {note}")
+        print_stdout(f"note: {note}")
 
 
 def _in_words(value: Any) -> str:
@@ -88,15 +88,15 @@ def print_checks(device: str, as_json: bool) -> bool:
     for finding in run_checks(device):
         findings.append(finding)
         if not as_json:
-            click.echo(f"{finding.state:<8} {finding.what}: {finding.says}")
+            print_stdout(f"{finding.state:<8} {finding.what}: {finding.says}")
     failed = sum(finding.state == FAILED for finding in findings)
     if as_json:
         report = {"works": not failed, "findings": [asdict(finding) for finding in findings]}
-        click.echo(json.dumps(report, indent=2))
+        print_stdout(json.dumps(report, indent=2))
     elif failed:
-        click.echo(f"{failed} of {len(findings)} checks failed")
+        print_stdout(f"{failed} of {len(findings)} checks failed")
     else:
-        click.echo("What is installed works.")
+        print_stdout("What is installed works.")
     return not failed
 
 
@@ -104,18 +104,18 @@ def print_facts(as_json: bool) -> bool:
     """Print versions, devices and the networks' cards; return whether all networks load."""
     facts = gather_facts()
     if as_json:
-        click.echo(json.dumps(facts, indent=2))
+        print_stdout(json.dumps(facts, indent=2))
     else:
         for key in ("super-sdf", "python", "onnxruntime"):
-            click.echo(f"{key} {facts[key]}")
+            print_stdout(f"{key} {facts[key]}")
         for key in ("devices", "meshers"):
-            click.echo(f"{key}: {', '.join(facts[key])}")
+            print_stdout(f"{key}: {', '.join(facts[key])}")
         for name, card in facts["models"].items():
-            click.echo(f"model {name}")
+            print_stdout(f"model {name}")
             for key, value in sorted(card.items()):
-                click.echo(f"  {key.replace('_', ' ')}: {value}")
+                print_stdout(f"  {key.replace('_', ' ')}: {value}")
         if not facts["models"]:
-            click.echo(f"models: {facts['fault']}")
+            print_stdout(f"models: {facts['fault']}")
     return "fault" not in facts and not any("fault" in card for card in facts["models"].values())
 
 

@@ -5,12 +5,13 @@ Only click is imported at the top, so that ``super-sdf --help`` is quick.
 
 from __future__ import annotations
 
+import difflib
 import sys
 
 import click
 
 from .. import __version__
-from .common import CONTEXT, InterruptedCommand, print_stderr
+from .common import CONTEXT, PIPE_CLOSED, InterruptedCommand, print_stderr, print_stdout
 
 COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
 
@@ -26,26 +27,50 @@ class LazyGroup(click.Group):
         """Return a command, None if there is none of this name."""
         match cmd_name:
             case "upsample":
-                from .upsample import upsample_command as command
+                from .upsample import upsample_command
+
+                return upsample_command
             case "batch":
-                from .batch import batch_command as command
+                from .batch import batch_command
+
+                return batch_command
             case "check":
-                from .check import check_command as command
+                from .check import check_command
+
+                return check_command
             case "sample":
-                from .sample import sample_command as command
+                from .sample import sample_command
+
+                return sample_command
             case "view":
-                from .view import view_command as command
+                from .view import view_command
+
+                return view_command
             case "info":
-                from .info import info_command as command
-            case _:
-                return None
-        return command
+                from .info import info_command
+
+                return info_command
+        return None
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command that is meant; for a name that is none, name the nearest."""
+        name = args[0]
+        if name not in COMMANDS and not name.startswith("-"):
+            near = difflib.get_close_matches(name, COMMANDS, 1)
+            way_out = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}"
+            ctx.fail(f"there is no command {name!r}: {way_out}")
+        return super().resolve_command(ctx, args)
 
 
-@click.group(cls=LazyGroup, context_settings=CONTEXT)
+@click.group(cls=LazyGroup, context_settings=CONTEXT, invoke_without_command=True)
 @click.version_option(__version__, prog_name="super-sdf")
-def cli() -> None:
+@click.pass_context
+def cli(context: click.Context) -> None:
     """Turn coarse signed distance grids into fine meshes."""
+    if context.invoked_subcommand is None:
+        print_stdout(context.get_help())
 
 
 def main() -> None:
@@ -57,7 +82,7 @@ def main() -> None:
 def run() -> int:
     """Run a command; return the exit code."""
     try:
-        cli.main(standalone_mode=False)
+        code = cli.main(standalone_mode=False)  # a number if a command ended early
     except click.ClickException as error:
         print_stderr(f"Error: {error.format_message()}")
         return error.exit_code
@@ -68,6 +93,8 @@ def run() -> int:
         print_stderr("Error: interrupted")
         return 130
     except OSError as error:  # outside of a command's work, while help is printed
+        if isinstance(error, BrokenPipeError):
+            return PIPE_CLOSED
         print_stderr(f"Error: stdout cannot be written: {error.strerror or error}")
         return 1
-    return 0
+    return code if isinstance(code, int) else 0

@@ -16,6 +16,7 @@ from ..options import MESH_FORMATS, QUALITIES, ConvertOptions
 from ..progress import Progress, Stopwatch
 from .common import (
     CONTEXT,
+    GroupedCommand,
     check_can_check,
     check_cluster,
     check_option,
@@ -59,6 +60,7 @@ NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 @click.command(
     "upsample",
+    cls=GroupedCommand,
     context_settings=CONTEXT,
     epilog=EXAMPLES,
     short_help="Refine a grid and write its surface as a mesh.",
