@@ -22,6 +22,7 @@ from .files.grids import read_grid
 from .files.meshes import (
     CERTAIN_SHARE,
     Expectation,
+    World,
     check_format_holds,
     check_target,
     expect,
@@ -262,7 +263,12 @@ def convert_grid(
         watch.lap("simplify")
     meshes = keeper.copies(meshes) if keeper else meshes
     write_pieces(
-        meshes, target, force=force, unit=options.unit, about=about, before_rename=before_rename
+        meshes,
+        target,
+        force=force,
+        world=World(options.unit, grid.space),
+        about=about,
+        before_rename=before_rename,
     )
     watch.lap("write")
     counts = {name: tally.counts[name] for name in COUNTS}

@@ -13,6 +13,7 @@ import numpy as np
 from .convert import describe_place
 from .errors import MeshError, OptionError, seen
 from .files.meshes import (
+    World,
     check_format_holds,
     check_mesh_suffix,
     check_target,
@@ -108,7 +109,7 @@ def convert_labels(
     check_mesh_suffix(Path(target), options.unit)
     given = options.reading()
     place, bound = {name: given[name] for name in PLACE}, options.max_memory
-    image = find_image(source, labels, place, options.axes, bound)
+    image = find_image(source, labels, place, options.axes, bound, options.space)
     grid, paths = image.grid, label_paths(target, image.names())
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
@@ -127,7 +128,7 @@ def convert_labels(
         files: dict[Path, dict[str, Iterator[Mesh]]] = {path: {} for path in paths}
         for label, mesh in meshes.items():
             files[mesh.path][f"label {label}"] = mesh.pieces()
-        write_together(files, force=force, unit=options.unit, about=about)
+        write_together(files, force=force, world=World(options.unit, grid.space), about=about)
     return {
         **describe_place(grid),
         "labels": [mesh.report() for mesh in meshes.values()],

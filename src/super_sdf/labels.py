@@ -26,7 +26,7 @@ from .grid.interpret import as_sample, labelled
 from .grid.placement import as_samples, check_kind, check_spacing, is_cubic, placed
 from .grid.planes import NoPlanes, SampleArray, SamplePlanes, changed
 from .grid.refusals import named
-from .grid.sdf_grid import SdfGrid
+from .grid.sdf_grid import SdfGrid, with_fields
 from .machine.memory import advised, give_back, held_memory, in_words
 from .machine.resources import Resources, allot, check_count
 from .mesh import Mesh, join_meshes, vertex_type
@@ -206,11 +206,12 @@ def find_image(
     place: dict[str, Any],
     axes: str | None,
     max_memory: int | None,
+    space: str | None = None,
 ) -> LabelImage:
     """Return the label image of an array or a file; ``place`` has spacing, origin and direction."""
     wanted, notes = check_labels(labels), []
     if isinstance(values, (str, PathLike)):
-        place = read_array(values, place, axes, max_memory)
+        place = read_array(values, place, axes, space, max_memory)
         values, notes = place["values"], list(place["notes"])
     elif axes is not None:
         raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
@@ -245,6 +246,7 @@ def find_image(
         extremes=extremes_of_masks(min(steps)),
         field=Field(MASK, True, NONE_EXACT, on_lattice=not is_cubic(steps)),
     )
+    grid = with_fields(grid, space=place.get("space"))
     return LabelImage(samples, np.array(list(boxes), samples.dtype), around, grid)
 
 

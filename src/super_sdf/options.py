@@ -23,6 +23,8 @@ EXACT, TRUNCATED, MASK, SCALED, NOISY = "exact", "truncated", "mask", "scaled", 
 FIELDS = (AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY)
 INSIDE = (AUTO, "negative", "positive")
 AXES = ("xyz", "zyx")
+RAS, LPS = SPACES = ("RAS", "LPS")
+"""Right, anterior, superior; left, posterior, superior."""
 MARCHING, SHARP = "marching", "sharp"
 MESHERS: tuple[str, ...] = (AUTO, MARCHING, SHARP)
 DEFAULT_MESHER = AUTO
@@ -270,6 +272,12 @@ class ReadOptions:
         "state it.",
         AXES,
     )
+    space: str | None = _choice(
+        None,
+        "Anatomical space of the mesh, for files that state theirs, as medical images do. Default: "
+        "that of the file, which .ply, .stl and .obj name in their header.",
+        SPACES,
+    )
     inside: str = _choice(
         AUTO,
         "Sign of the values inside the solid; auto takes the border of the grid as outside.",
@@ -465,12 +473,12 @@ UPSAMPLE = (
 """What ``upsample``, ``batch`` and ``view`` take, in the order of their help."""
 BATCH_LISTS = (*MESH, *GOALS, "unit")
 """What a line of a batch's list may say."""
-LABELS = ("factor", "spacing", "origin", "direction", "axes", "max_memory", "unit")
+LABELS = ("factor", "spacing", "origin", "direction", "axes", "space", "max_memory", "unit")
 """What of ``ConvertOptions`` goes with ``--labels``."""
 
 check_distance = OPTIONS["offset"].check
 check_cap = OPTIONS["cap"].check
 check_mesher = OPTIONS["mesher"].check
 check_max_memory = OPTIONS["max_memory"].check
-check_unit = OPTIONS["unit"].check
+check_space, check_unit = OPTIONS["space"].check, OPTIONS["unit"].check
 check_threads = OPTIONS["threads"].check

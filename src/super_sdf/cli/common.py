@@ -32,7 +32,7 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 GROUPS = {
-    "The grid": ("spacing", "origin", "direction", "axes"),
+    "The grid": ("spacing", "origin", "direction", "axes", "space"),
     "Its values": ("inside", "field", "label", "labels", "level", "scale"),
     "The mesh": ("factor", "offset", "cap", "mesher", "simplify", "tolerance", "triangles", "unit"),
     "The work": (

@@ -182,6 +182,10 @@ def _in_order(crew: Crew, tasks: list[Any]) -> Iterator[Any]:
 def check_can_brick(source: str, options: ConvertOptions, save_field: Any = None) -> None:
     """Raise OptionError if a grid cannot be converted brick by brick with some options."""
     check_source(Source(source, options.axes))
+    if options.space is not None:
+        raise OptionError(
+            f"space is {options.space}: {source} states neither RAS nor LPS, leave it out"
+        )
     if save_field is not None:
         raise OptionError(f"--save-field writes one file from the first plane on: {WAY_OUT}")
 

@@ -16,7 +16,7 @@ import numpy as np
 from ..errors import FileError, OptionError, SuperSdfError
 from ..grid.placement import STRAIGHT
 from ..grid.planes import InputFile, check_planes
-from ..grid.sdf_grid import SdfGrid, make_grid
+from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
 from ..options import ReadOptions, Values, check_path
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
@@ -39,6 +39,7 @@ def read_grid(
     origin: Any = None,
     direction: Any = None,
     axes: str | None = None,
+    space: str | None = None,
     max_memory: int | None = None,
     **values: Unpack[Values],
 ) -> SdfGrid:
@@ -61,6 +62,8 @@ def read_grid(
     axes : {"xyz", "zyx"}, optional
         The axis order of an array whose file does not state one. Default: x, y, z in ``.npy`` and
         ``.npz``, else z, y, x.
+    space : {"RAS", "LPS"}, optional
+        The anatomical space of the grid's world; for files that state theirs. Default: that one.
     inside : {"auto", "negative", "positive"}
         Sign of the values inside the solid; see ``make_grid``.
     field, label, level, scale
@@ -79,30 +82,35 @@ def read_grid(
         If its values are not a signed distance grid, or its axes are not at right angles.
     OptionError
         If the suffix, ``axes``, ``inside`` or ``field`` is unknown; if a direction is given, but
-        files of the format state it.
+        files of the format state it; if a space is given, but the file states none.
     """
-    ReadOptions(**values)  # checks them
+    ReadOptions(space=space, **values)  # checks them
     given = {"spacing": spacing, "origin": origin, "direction": direction}
-    arrays = read_array(path, given, axes, max_memory)
-    notes = arrays.pop("notes")
-    return make_grid(**arrays, **values).noted(notes)
+    arrays = read_array(path, given, axes, space, max_memory)
+    notes, space = arrays.pop("notes"), arrays.pop("space")
+    return with_fields(make_grid(**arrays, **values).noted(notes), space=space)
 
 
 def read_array(
-    path: Any, given: dict[str, Any], axes: str | None, max_memory: int | None
+    path: Any,
+    given: dict[str, Any],
+    axes: str | None,
+    space: str | None,
+    max_memory: int | None,
 ) -> dict[str, Any]:
-    """Return values, place (``PLACE``, unless ``given``) and notes of a file: see ``read_grid``."""
+    """Return values, place (``PLACE``, unless ``given``), space and notes: see ``read_grid``."""
     path = check_path(path, "path")
     format_ = find_format(path)
     order = choose_axes(format_, axes, given["direction"])
     room, bound = unpacking_room(max_memory), memory_bound(max_memory)
     left = None if bound is None else bound - (held_memory() or 0)
     with open_volume(path, format_, order, (room, left)) as volume:
+        volume = volume.in_space(space, str(path))
         if given["direction"] is not None:
             volume = volume.turned(order)
         arrays = take(volume, str(path), room, given, left)
     check_planes(arrays["values"], bound)
-    return arrays | {"notes": volume.notes}
+    return arrays | {"notes": volume.notes, "space": volume.space}
 
 
 @contextmanager
@@ -234,6 +242,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
         "bytes": int(np.prod(shape, dtype=object)) * volume.dtype.itemsize,
         "axes in the file": "".join("xyz"[w] for w in placement.world_axes),
         **{key: _listed(place[key]) for key in PLACE},
+        **({"space": volume.space} if volume.space else {}),
         **({"chunks": list(volume.chunks)} if volume.chunks else {}),
         **volume.about,
         "notes": list(volume.notes),

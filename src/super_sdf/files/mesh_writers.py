@@ -70,8 +70,8 @@ def _write_in_chunks(
 # PLY
 
 
-def write_ply(pieces: Iterable[Mesh], path: Path) -> None:
-    """Write binary little-endian PLY."""
+def write_ply(pieces: Iterable[Mesh], path: Path, note: str = "") -> None:
+    """Write binary little-endian PLY, with a note in its header."""
     with path.open("wb") as file, spool_beside(path) as waiting:
         file.write(bytes(PLY_HEADER_BYTES))
         written = write_split(pieces, (file, waiting), (little_endian, _ply_rows))
@@ -79,7 +79,8 @@ def write_ply(pieces: Iterable[Mesh], path: Path) -> None:
         number = "double" if written.dtype == np.float64 else "float"
         axes = [f"{number} {axis}" for axis in "xyz"]
         file.seek(0)
-        file.write(_ply_header(written.vertices, written.faces, axes, size=PLY_HEADER_BYTES))
+        counts, notes = (written.vertices, written.faces), [note] * bool(note)
+        file.write(_ply_header(*counts, axes, *notes, size=PLY_HEADER_BYTES))
 
 
 def write_coloured_ply(
@@ -131,8 +132,10 @@ def _ply_rows(faces: NDArray[Any]) -> bytes:
 # STL
 
 
-def write_stl(pieces: Iterable[Mesh], path: Path) -> None:
+def write_stl(pieces: Iterable[Mesh], path: Path, note: str = "") -> None:
     """Write binary STL: each triangle stores the positions of its corners, in float32.
+
+    A note stands in its header.
 
     A triangle may use vertices of earlier pieces, so all vertices so far are kept in a temporary
     file, which is read back through a memory map.
@@ -142,18 +145,18 @@ def write_stl(pieces: Iterable[Mesh], path: Path) -> None:
         path.open("wb") as file,
         tempfile.TemporaryFile(dir=path.parent, prefix=f"{path.name}.") as waiting,
     ):
-        file.write(_stl_header(0))
+        file.write(_stl_header(0, note))
         for piece in pieces:
             positions = piece.vertices.astype(np.float32, copy=False)
             _write_in_chunks(waiting, positions, little_endian)
             vertices, faces = vertices + len(positions), faces + len(piece.faces)
             _write_triangles(file, waiting, vertices, piece.faces)
         file.seek(0)
-        file.write(_stl_header(faces))
+        file.write(_stl_header(faces, note))
 
 
-def _stl_header(faces: int) -> bytes:
-    return b"made by super-sdf".ljust(80) + struct.pack("<I", faces)
+def _stl_header(faces: int, note: str) -> bytes:
+    return f"made by super-sdf {note}".ljust(80).encode("ascii") + struct.pack("<I", faces)
 
 
 def _write_triangles(
@@ -186,10 +189,10 @@ def _stl_rows(corners: NDArray[Any]) -> bytes:
 # Text, with enough digits to read back the same numbers
 
 
-def write_obj(pieces: Iterable[Mesh], path: Path) -> None:
-    """Write Wavefront OBJ, whose vertex indices start at 1."""
+def write_obj(pieces: Iterable[Mesh], path: Path, note: str = "") -> None:
+    """Write Wavefront OBJ, whose vertex indices start at 1, with a note in its first line."""
     with path.open("wb") as file, spool_beside(path) as waiting:
-        file.write(b"# made by super-sdf\n")
+        file.write(f"# made by super-sdf {note}".rstrip().encode("ascii") + b"\n")
         rows = _number_lines("v %s %s %s\n"), _index_lines("f %d %d %d\n", first=1)
         write_split(pieces, (file, waiting), rows, TEXT_CHUNK)
         append_spool(waiting, file)

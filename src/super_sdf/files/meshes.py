@@ -29,13 +29,23 @@ from ..grid.planes import in_blocks, over_planes
 from ..grid.sdf_grid import SdfGrid, negated
 from ..machine.memory import in_words
 from ..mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
-from ..options import check_path, check_unit
+from ..options import check_path, check_space, check_unit
 from .mesh_writers import write_3mf, write_glb, write_obj, write_off, write_ply, write_stl
 from .output import check_free, free_space, replacing
 from .volume import triple
 
 WORLD_ORIGIN = (0.0, 0.0, 0.0)
 CHUNK = 1 << 16  # triangles checked at a time
+
+
+class World(NamedTuple):
+    """What the coordinates of a mesh are: their unit, and the anatomical space, if known."""
+
+    unit: str | None = None
+    space: str | None = None
+
+
+AS_IT_IS = World()
 
 
 class MeshFormat(NamedTuple):
@@ -47,21 +57,23 @@ class MeshFormat(NamedTuple):
     local_origin: bool = False  # whether coordinates may be relative to a point
     has_parts: bool = False
     has_unit: bool = False
+    has_note: bool = False  # whether 3D Slicer looks in the header for the space
 
     def write_named(
-        self, named: Mapping[str, Iterable[Mesh]], path: Path, unit: str | None, about: Triple
+        self, named: Mapping[str, Iterable[Mesh]], path: Path, world: World, about: Triple
     ) -> None:
         """Write meshes in pieces by their names, one if the format has no parts."""
-        stated = (unit,) if self.has_unit else ()
-        origin = (about,) if self.local_origin else ()
+        stated: list[Any] = [world.unit] if self.has_unit else []
+        stated += [about] if self.local_origin else []
+        stated += [f"SPACE={world.space}"] if self.has_note and world.space else []
         for pieces in [named] if self.has_parts else named.values():
-            self.write(pieces, path, *stated, *origin)
+            self.write(pieces, path, *stated)
 
 
 FORMATS = {
-    ".ply": MeshFormat(write_ply, 19),
-    ".stl": MeshFormat(write_stl, 50, single_precision=True),
-    ".obj": MeshFormat(write_obj, 40),
+    ".ply": MeshFormat(write_ply, 19, has_note=True),
+    ".stl": MeshFormat(write_stl, 50, single_precision=True, has_note=True),
+    ".obj": MeshFormat(write_obj, 40, has_note=True),
     ".off": MeshFormat(write_off, 39),
     ".glb": MeshFormat(
         write_glb, 18, single_precision=True, local_origin=True, has_parts=True, has_unit=True
@@ -92,7 +104,12 @@ def check_mesh_suffix(path: Path, unit: str | None = None) -> None:
 
 
 def write_mesh(
-    mesh: Mesh, path: str | Path, *, force: bool = False, unit: str | None = None
+    mesh: Mesh,
+    path: str | Path,
+    *,
+    force: bool = False,
+    unit: str | None = None,
+    space: str | None = None,
 ) -> None:
     """Write a mesh to a file, in the format of its suffix.
 
@@ -110,6 +127,9 @@ def write_mesh(
     unit : str, optional
         Unit of the world, which .3mf and .glb state: um, mm, cm, m, in or ft. Default: a .3mf says
         mm, a .glb m.
+    space : str, optional
+        The anatomical space of the coordinates, "RAS" or "LPS", such as that of the grid. A .ply,
+        .stl or .obj names it in its header, where 3D Slicer looks for it.
 
     Raises
     ------
@@ -125,7 +145,7 @@ def write_mesh(
     if format_of(path).local_origin and mesh.vertices.dtype == np.float64 and len(mesh.vertices):
         about = triple(mesh.vertices.min(0) / 2 + mesh.vertices.max(0) / 2)
     _check_mesh_holds(mesh, path, about)
-    write_pieces([mesh], path, force=force, unit=unit, about=about)
+    write_pieces([mesh], path, force=force, world=World(unit, check_space(space)), about=about)
 
 
 def write_pieces(
@@ -133,7 +153,7 @@ def write_pieces(
     path: str | Path,
     *,
     force: bool = False,
-    unit: str | None = None,
+    world: World = AS_IT_IS,
     about: Triple = WORLD_ORIGIN,
     before_rename: Callable[[Path], None] | None = None,
 ) -> None:
@@ -142,23 +162,23 @@ def write_pieces(
     ``check_format_holds`` says whether the format can hold it, and ``about``, its local origin.
     ``before_rename`` is called with the path of the complete file.
     """
-    path = check_target(path, force=force, unit=unit)
+    path = check_target(path, force=force, unit=world.unit)
     with replacing(path, force=force, before_rename=before_rename) as part:
-        format_of(path).write_named({"": pieces}, part, unit, about)
+        format_of(path).write_named({"": pieces}, part, world, about)
 
 
 def write_together(
     meshes: Mapping[Path, Mapping[str, Iterable[Mesh]]],
     *,
     force: bool = False,
-    unit: str | None = None,
+    world: World = AS_IT_IS,
     about: Triple = WORLD_ORIGIN,
 ) -> None:
     """Write files of meshes in pieces, by path and name: all of them, or none."""
     with ExitStack() as files:
         for path, named in meshes.items():
             part = files.enter_context(replacing(check_target(path, force=force), force=force))
-            format_of(path).write_named(named, part, unit, about)
+            format_of(path).write_named(named, part, world, about)
         for path in meshes:
             check_target(path, force=force)  # before the first of them appears
 

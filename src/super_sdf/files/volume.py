@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Triple
-from ..errors import FileError, GridError, OutOfMemoryError
+from ..errors import FileError, GridError, OptionError, OutOfMemoryError
 from ..grid.placement import Direction, as_direction, check_direction
 from ..grid.planes import SampleArray
 from ..machine.memory import in_words
@@ -105,11 +105,26 @@ class Volume:
     axes: str | None = None  # order of x, y and z along the array, if the file or user names it
     # spacing, origin, direction of x, y, z as the file has them, unchecked, instead of those above
     place: dict[str, Any] = field(default_factory=dict)
+    space: str | None = None  # "RAS" or "LPS", if the file states one of them
     part: str = ""  # follows the name of the file in messages, such as "[values]"
 
     def turned(self, axes: str) -> Volume:
         """Return it without its direction, for a user who gives that of x, y and z."""
         return replace(self, direction=axes_direction(self.axes or axes))
+
+    def in_space(self, space: str | None, name: str) -> Volume:
+        """Return it in an anatomical space, its own if None; OptionError if it states none."""
+        if space in (None, self.space):
+            return self
+        if self.space is None:
+            raise OptionError(f"space is {space}: {name} states neither RAS nor LPS, leave it out")
+        turn = np.array([-1.0, -1.0, 1.0])  # between the two
+        return replace(
+            self,
+            origin=None if self.origin is None else triple(turn * self.origin),
+            direction=turn[:, None] * (XYZ if self.direction is None else self.direction),
+            space=space,
+        )
 
     @property
     def unit(self) -> tuple[int, ...]:

@@ -66,6 +66,8 @@ class SdfGrid:
         Sentences that say what was inferred rather than given.
     field : Field
         What the values are, and which of them can be exact.
+    space : str or None
+        The anatomical space of the world, "RAS" or "LPS", if a file states one.
 
     Raises
     ------
@@ -85,6 +87,7 @@ class SdfGrid:
     low: float
     high: float
     field: Field
+    space: str | None
 
     def __init__(
         self,
@@ -140,6 +143,7 @@ class SdfGrid:
             low=-high if positive_inside else low,
             high=-low if positive_inside else high,
             field=field or Field(),
+            space=None,
         )
         return grid
 

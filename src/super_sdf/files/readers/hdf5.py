@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError
+from ...options import LPS
 from ..regular import check_beside
 from ..volume import PLACE, Box, Request, Volume, reversed_axes
 from .axes import Axes, along, placed, unscaled, without_gaps
@@ -50,6 +51,7 @@ def read_hdf5(request: Request) -> Volume:
         spacing, direction = reversed_axes(image["Spacing"][:], image["Directions"][:].T)
         origin = tuple(image["Origin"][:].tolist())
         place: dict[str, Any] = {"spacing": spacing, "origin": origin, "direction": direction}
+        place["space"] = LPS
         _check_stored(values, request)
     else:
         values = file[request.choose(names, "3D dataset")]

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
+from ...options import LPS, RAS
 from ..regular import check_beside
 from ..unpacking import PIECE
 from ..volume import XYZ, Request, Volume, from_affine, in_words_of, reversed_axes
@@ -62,7 +63,7 @@ def read_mgh(request: Request) -> Volume:
 
     stream = _opened(request, request.path)
     header = MGHHeader(stream.read(HEADER_MGH))
-    return _proxied(request.path, stream, header, from_affine(header.get_affine()))
+    return _proxied(request.path, stream, header, from_affine(header.get_affine()), (), RAS)
 
 
 def read_analyze(request: Request) -> Volume:
@@ -88,7 +89,12 @@ def _opened(request: Request, path: Path) -> Any:
 
 
 def _proxied(
-    path: Path, stream: Any, header: Any, place: Any, notes: tuple[str, ...] = ()
+    path: Path,
+    stream: Any,
+    header: Any,
+    place: Any,
+    notes: tuple[str, ...] = (),
+    space: str | None = None,
 ) -> Volume:
     from nibabel.arrayproxy import ArrayProxy
 
@@ -117,11 +123,12 @@ def _proxied(
         *(shape[2::-1], read(0, 1).dtype, read, spacing, origin, direction),
         packed=size if is_packed else None,
         notes=notes,
+        space=space,
     )
 
 
-def _place_of(header: Any) -> tuple[Any, tuple[str, ...]]:
-    """Return spacing, origin and direction of the axes x, y, z, and notes on what was chosen."""
+def _place_of(header: Any) -> tuple[Any, tuple[str, ...], str | None]:
+    """Return the place of the axes x, y, z, notes on what was chosen, and the space if known."""
     unit = UNITS.get(int(header["xyzt_units"]) & 7)
     notes: tuple[str, ...] = ()
     if unit:
@@ -132,7 +139,7 @@ def _place_of(header: Any) -> tuple[Any, tuple[str, ...]]:
             "it states no place (sform_code and qform_code are 0): its axes are taken as x, y and "
             "z, as ITK does; nibabel would mirror x"
         )
-        return (np.abs(header.get_zooms()[:3]), None, XYZ), (*notes, said)
+        return (np.abs(header.get_zooms()[:3]), None, XYZ), (*notes, said), None
     if min(codes) > 0:
         sizes = header.get_data_shape()[:3]
         corners = np.array(list(product(*((0, size - 1) for size in sizes), [1])))
@@ -144,7 +151,7 @@ def _place_of(header: Any) -> tuple[Any, tuple[str, ...]]:
                 f"its sform (code {codes[0]}) and qform (code {codes[1]}) place a corner {off:.3g} "
                 "apart: the sform is taken, as nibabel does; ITK may take the qform",
             )
-    return from_affine(header.get_best_affine()), notes
+    return from_affine(header.get_best_affine()), notes, RAS
 
 
 # DICOM
@@ -190,7 +197,7 @@ def read_dicom(request: Request) -> Volume:
     row, column = first.across
     direction = np.column_stack([_normal(first), column, row])
     shape, origin = (len(slices), *first.shape), tuple(first.corner.tolist())
-    return Volume(shape, dtype, read, (step, *first.spacing), origin, direction)
+    return Volume(shape, dtype, read, (step, *first.spacing), origin, direction, space=LPS)
 
 
 def _series_in(folder: Path) -> dict[str, list[tuple[Path, Any]]]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
+from ...options import LPS, RAS
 from ..regular import check_beside
 from ..streams import TextValues, planes_behind
 from ..volume import (
@@ -37,6 +38,7 @@ CENTERING = (
 )
 TEXT = ("ascii", "text", "txt")
 IN_SPACE = ("domain", "space", "???", "none")  # kinds of axes; others are lists, vectors, time
+SPACES = {"right-anterior-superior": RAS, "ras": RAS, "left-posterior-superior": LPS, "lps": LPS}
 CODECS = {"gzip": "gzip", "gz": "gzip", "bzip2": "bz2", "bz2": "bz2"}
 # Fields in one spelling of those that the format allows
 SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
@@ -74,7 +76,8 @@ def read_nrrd(request: Request) -> Volume:
         return planes
 
     place, notes = _place(header, space)
-    return Volume(tuple(shape), dtype, read, *place, packed=packed, notes=notes)
+    stated = SPACES.get(str(header.get("space", "")).lower())
+    return Volume(tuple(shape), dtype, read, *place, packed=packed, notes=notes, space=stated)
 
 
 def _axes(header: dict[str, Any]) -> Axes:

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from ...arrays import Triple
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
+from ...options import LPS
 from ..regular import check_beside
 from ..streams import (
     CODECS,
@@ -84,7 +85,9 @@ def read_metaimage(request: Request) -> Volume:
     size = tuple(size[axis] for axis in space)
     read, packed = _data(request, file, header, size[::-1])
     place = steps, origin, direction
-    return Volume(size[::-1], header.dtype, read, *place, packed=packed, notes=header.notes())
+    return Volume(
+        *(size[::-1], header.dtype, read, *place), packed=packed, notes=header.notes(), space=LPS
+    )
 
 
 class _Header:
