@@ -17,7 +17,7 @@ from test_slabs import bad_samples, rod
 
 from super_sdf import load_network
 from super_sdf.cluster import bricks, stored
-from super_sdf.cluster.bricks import BrickWork, convert_on_cluster
+from super_sdf.cluster.bricks import BrickWork, check_can_brick, convert_on_cluster
 from super_sdf.cluster.checking import Needs, check_workers
 from super_sdf.cluster.connecting import connect
 from super_sdf.cluster.crew import Crew
@@ -234,7 +234,10 @@ def test_results_that_nobody_takes_may_be_collected_by_the_thread_of_dask(cluste
 
 
 def test_workers_know_each_option_of_reading():
-    assert set(GRID) == {*PLACE, "axes", *Values.__annotations__}  # refuse others, or hand them on
+    # refuse others, or hand them on
+    assert set(GRID) == {*PLACE, "axes", "space", *Values.__annotations__}
+    with pytest.raises(OptionError, match="space is RAS: a.npy states neither RAS nor LPS"):
+        check_can_brick("a.npy", ConvertOptions(space="RAS"))
 
 
 def test_a_grid_that_the_workers_do_not_see(cluster, network):

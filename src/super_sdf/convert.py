@@ -196,7 +196,7 @@ def describe_place(grid: SdfGrid) -> dict[str, Any]:
         "spacing": list(grid.spacing),
         "origin": list(grid.origin),
         "direction": [list(row) for row in grid.direction],
-        **({"space": grid.space} if grid.space else {}),
+        "space": grid.space,
     }
 
 
