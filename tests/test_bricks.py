@@ -236,7 +236,7 @@ def test_results_that_nobody_takes_may_be_collected_by_the_thread_of_dask(cluste
 def test_workers_know_each_option_of_reading():
     # refuse others, or hand them on
     assert set(GRID) == {*PLACE, "axes", "space", *Values.__annotations__}
-    with pytest.raises(OptionError, match="space is RAS: a.npy states neither RAS nor LPS"):
+    with pytest.raises(OptionError, match="states neither RAS nor LPS"):
         check_can_brick("a.npy", ConvertOptions(space="RAS"))
 
 
