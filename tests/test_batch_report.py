@@ -127,7 +127,7 @@ def test_a_row_without_room_is_an_error_and_not_torn(run_batch):
 
 
 def test_a_mesh_without_room_fails_by_its_name_and_leaves_nothing():
-    code, err = limited(2000)
+    code, err = limited(4000)
     assert code == 1
     want = f"Failed: in/a.npy: {Path('out/a.ply')} cannot be written: File too large\n"
     assert want in err and "Traceback" not in err

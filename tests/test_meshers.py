@@ -139,7 +139,7 @@ def test_the_command_takes_a_mesher_and_says_which(tmp_path, monkeypatch, comman
     asked = {"auto": (), "sharp": ("--mesher", "sharp"), "marching": ("--mesher", "marching")}
     for name, option in asked.items():
         code, out, _ = command("upsample", "in.npy", f"{name}.ply", *option, *words)
-        assert code == 0 and json.loads(out)["mesher"] == name
+        assert code == 0 and json.loads(out)["asked"]["mesher"] == name
     sizes = [Path(f"{name}.ply").stat().st_size for name in asked]
     assert sizes[0] == sizes[1] > sizes[2]
     code, out, err = command("upsample", "in.npy", "x.ply", "--mesher", "dual", *words)
@@ -155,4 +155,4 @@ def test_a_batch_with_another_mesher_is_made_again(run_batch):
     assert "nothing to do" in run_batch("in/a.npy", "--mesher", "sharp")[2]
     Path("list.jsonl").write_text('{"in": "in/a.npy", "out": "a.ply", "mesher": "marching"}')
     assert "nothing to do" not in run_batch("list.jsonl", "--mesher", "sharp")[2]
-    assert [row["mesher"] for row in rows()] == ["marching", "sharp", "marching"]
+    assert [row["asked"]["mesher"] for row in rows()] == ["marching", "sharp", "marching"]

@@ -115,7 +115,6 @@ def attempt(
         "retry": False,
         "content": content,
         "output": printed[0],
-        "mesher": job.options.mesher,
         **done.report(),
         **certificate,
         "seconds": round(time.perf_counter() - start, 4),

@@ -39,8 +39,9 @@ in, out : absolute path of the input; path of the output, relative to the output
 status, reason : "ok" and None, or "failed" and why
 retry : whether another run may succeed with the same input and options
 content, output : fingerprints of the input and of the mesh
+version, network : of this package, and the SHA-256 of the network's file
+model, precision, asked : what was asked for, and the options of the conversion
 options : digest of all that the mesh depends on, besides the input
-mesher : what made the triangles
 simplified : with ``--simplify`` or ``--triangles``, triangles before and after, and distances
 check : with ``--check`` the certificate, or why there is none
 seconds : time in all; that of each stage is in ``stages``

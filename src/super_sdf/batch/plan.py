@@ -83,6 +83,17 @@ class Planner:
         settings = [job.options.digest(), self.network, __version__]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
 
+    def record(self, job: Job) -> Row:
+        """Return what a row says of how a mesh was made: enough to make it again."""
+        return {
+            "version": __version__,
+            "network": self.network[0],
+            "model": self.settings.model,
+            "precision": self.settings.precision,
+            "asked": job.options.digest(),
+            "options": self.digest(job),
+        }
+
     def may_replace(self, job: Job) -> bool:
         """Return whether a job may replace the existing file: if a batch made it as it is."""
         known = self.ledger.written.get(job.target)
@@ -116,7 +127,7 @@ class Planner:
             made = job.target in self.ledger.written
             why = "was changed after a batch made it" if made else "was not made by a batch"
             reason = f"{path} exists and {why}: remove it or use --force"
-        return {**failed_row(job, reason), "options": self.digest(job)}
+        return {**failed_row(job, reason), **self.record(job)}
 
     @cached_property
     def _inputs(self) -> dict[tuple[int, int], Path]:

@@ -118,7 +118,7 @@ class Run:
 
     def _keep(self, job: Job, row: Row) -> None:
         """Put the row of a finished job into the ledger and count it."""
-        row["options"] = self.planner.digest(job)
+        row |= self.planner.record(job)
         self.ledger.add(row)
         (self.batch.done if row["status"] == "ok" else self.batch.failed).append(Result(job, row))
         self.batch.work_done += expected_work(job)

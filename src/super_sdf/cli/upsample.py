@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
@@ -253,11 +254,11 @@ class Upsampling:
 
     def _report(self) -> dict[str, Any]:
         """Return counts, times and notes as ``--json`` prints them."""
-        shown = ("factor", "offset", "mesher")
         return {
             "input": self.source,
             "output": self.target,
-            **{name: getattr(self.chosen, name) for name in shown},
+            "version": __version__,
+            "asked": self.chosen.digest(),
             **_describe_network(self.model, self.network),
             **self.result.report(),
             **({"check": self.certificate.report()} if self.certificate else {}),
@@ -284,7 +285,8 @@ def upsample_labels(
         report = {
             "input": source,
             "output": target,
-            "factor": chosen.factor,
+            "version": __version__,
+            "asked": chosen.digest(),
             **_describe_network(model, network),
             **made,
             "seconds": _rounded(watch.seconds),
@@ -303,8 +305,11 @@ def upsample_labels(
 
 
 def _describe_network(model: str, network: Network) -> dict[str, Any]:
+    from ..network.network import digest_of_model
+
     return {
         "model": model,
+        "network": digest_of_model(model, network.precision),
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),

@@ -201,6 +201,11 @@ def float32_name(name: str) -> str:
     return name.removesuffix(f"-{INT8}")
 
 
+def digest_of_model(model: str | Path, precision: str = AUTO_PRECISION) -> str:
+    """Return the SHA-256 of a network's file, which is found as by ``find_model``."""
+    return hashlib.sha256(find_model(model, precision)[0].read_bytes()).hexdigest()
+
+
 def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path, int]:
     """Return the file for the CPU, and the number of symmetries to average over.
 

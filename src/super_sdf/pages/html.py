@@ -156,8 +156,7 @@ def _viewed_grid(source: str, network: Decoder, options: ConvertOptions) -> tupl
         target = Path(folder, "mesh.ply")
         done = convert(source, target, network, options, keep=True)
         item = item_of_files(target, source, options, done.kept, processes=0)
-    report = {**done.report(), "input": source, "factor": options.factor}
-    report |= {"mesher": options.mesher, "seconds": done.seconds}
+    report = {**done.report(), "input": source, "asked": options.digest(), "seconds": done.seconds}
     return entry_of_report(Path(source).name, report, item), item
 
 

@@ -227,7 +227,8 @@ def _facts(report: Mapping[str, Any]) -> list[list[str]]:
         "spacing": numbers(report.get("spacing", ())),
         "origin": numbers(report.get("origin", ())),
         "values": (report.get("field") or {}).get("kind"),
-        **{key: report.get(key) for key in ("factor", "mesher", "model", "precision", "device")},
+        **{key: report.get("asked", {}).get(key) for key in ("factor", "mesher")},
+        **{key: report.get(key) for key in ("model", "precision", "device", "version")},
         **{key.replace("_", " "): f"{report[key]:,}" for key in COUNTED if key in report},
         "bounds": " to ".join(f"({numbers(corner)})" for corner in report.get("bounds", ())),
     }
