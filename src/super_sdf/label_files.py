@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
@@ -12,6 +13,7 @@ import numpy as np
 
 from .convert import describe_place
 from .errors import MeshError, OptionError, seen
+from .files.mesh_writers import Colour
 from .files.meshes import (
     World,
     check_format_holds,
@@ -24,12 +26,13 @@ from .files.meshes import (
 from .files.output import check_apart, naming
 from .files.regular import files_of
 from .files.volume import PLACE
+from .label_names import LabelName, Names, in_file_name, numbers_of
 from .labels import ALL, LabelPiece, find_image, label_slabs
 from .mesh import Mesh
 from .network.decoder import Decoder
 from .options import LABELS, MARCHING, OPTIONS, ConvertOptions
 from .progress import Progress
-from .topology import OpenEdges
+from .topology import OpenEdges, vertex_components
 
 MOST_FILES = 500  # each is held open until all are complete
 
@@ -39,6 +42,7 @@ class LabelMesh:
     """What is known of the mesh of a label, and where its pieces wait in a file."""
 
     label: int
+    name: str
     path: Path
     waiting: IO[bytes]
     places: list[tuple[int, int, int]] = field(default_factory=list)
@@ -63,15 +67,22 @@ class LabelMesh:
             points = np.frombuffer(data[:size], self.dtype).reshape(-1, 3)
             yield Mesh(points, np.frombuffer(data[size:], np.int32).reshape(-1, 3))
 
+    def _components(self) -> int:
+        """Return in how many pieces the mesh is, by its faces alone."""
+        faces = np.concatenate([piece.faces for piece in self.pieces()])
+        return len(np.unique(vertex_components(faces, int(faces.max()) + 1)[faces[:, 0]]))
+
     def report(self) -> dict[str, Any]:
         """Return the row of the label as it can be written as JSON."""
         _, vertices, triangles = np.sum(self.places, axis=0).tolist()
         return {
             "label": self.label,
+            "name": self.name,
             "output": str(self.path),
             "vertices": vertices,
             "triangles": triangles,
             "volume": self.volume,
+            "components": self._components(),
             "closed": not len(self.edges),
         }
 
@@ -83,20 +94,23 @@ def convert_labels(
     labels: str | Sequence[int] = ALL,
     options: ConvertOptions | None = None,
     *,
+    names: Names | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Convert a file with a label image to closed meshes of its labels, which share their walls.
 
     A target ``.glb`` or ``.3mf`` gets all labels as its parts; of another, ``part.ply`` say, each
-    label has its own file, ``part-1.ply``. The other parameters are those of ``convert``; options
-    besides ``options.LABELS`` must have their defaults.
+    label has its own file, ``part-1.ply``. ``names`` of ``read_names`` take the place of numbers in
+    ``labels``, in files and as parts, and parts have their colours. The other parameters are those
+    of ``convert``; options besides ``options.LABELS`` must have their defaults.
 
     Returns
     -------
     dict
         Shape, spacing, origin and direction of the grid, a row for each label (``labels``), and
-        ``inferred``: sentences on what was inferred.
+        ``inferred``: sentences on what was inferred. A row has the volume of the mesh beside that
+        of the label's samples, each of which counts as a box.
 
     Raises
     ------
@@ -109,15 +123,21 @@ def convert_labels(
     check_mesh_suffix(Path(target), options.unit)
     given = options.reading()
     place, bound = {name: given[name] for name in PLACE}, options.max_memory
-    image = find_image(source, labels, place, options.axes, bound, options.space)
-    grid, paths = image.grid, label_paths(target, image.names())
+    known = names or {}
+    wanted = numbers_of(labels, known)
+    image = find_image(source, wanted, place, options.axes, bound, options.space)
+    grid = image.grid
+    called = names_of(image.names(), known)
+    ends = [in_file_name(called[n].name) if n in known else str(n) for n in called]
+    paths = label_paths(target, ends)
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
     about = check_format_holds(target, grid, options.factor)
     with naming(paths[0]), tempfile.TemporaryFile(dir=paths[0].parent) as waiting:
         meshes = {
-            label: LabelMesh(label, path, waiting) for label, path in zip(image.names(), paths)
+            label: LabelMesh(label, entry.name, path, waiting)
+            for (label, entry), path in zip(called.items(), paths)
         }
         slabs = label_slabs(image, network, options.factor, max_memory=bound, progress=progress)
         for piece in slabs:
@@ -125,18 +145,40 @@ def convert_labels(
         torn = [label for label, mesh in meshes.items() if len(mesh.edges)]
         if torn:
             raise MeshError(f"the mesh of label {torn[0]} is torn: run it again, and report it")
+        world = World(options.unit, grid.space, colours_of(called.values()))
         files: dict[Path, dict[str, Iterator[Mesh]]] = {path: {} for path in paths}
-        for label, mesh in meshes.items():
-            files[mesh.path][f"label {label}"] = mesh.pieces()
-        write_together(files, force=force, world=World(options.unit, grid.space), about=about)
+        for mesh in meshes.values():
+            files[mesh.path][mesh.name] = mesh.pieces()
+        cell, counts = float(np.prod(grid.spacing)), image.counts()
+        rows = [
+            {**mesh.report(), "sample_volume": cell * count}
+            for mesh, count in zip(meshes.values(), counts)
+        ]
+        write_together(files, force=force, world=world, about=about)
     return {
         **describe_place(grid),
-        "labels": [mesh.report() for mesh in meshes.values()],
+        "labels": rows,
         "inferred": [*grid.notes, *local_origin_note(target, about)],
     }
 
 
-def label_paths(target: str | Path, labels: list[int]) -> list[Path]:
+def names_of(labels: list[int], known: Names) -> Names:
+    """Return what each label is called; labels of one name get their number, too."""
+    times = Counter(known[label].name for label in labels if label in known)
+    called = {}
+    for label in labels:
+        entry = known.get(label, LabelName(f"label {label}"))
+        is_one = times[entry.name] < 2
+        called[label] = entry if is_one else entry._replace(name=f"{entry.name} {label}")
+    return called
+
+
+def colours_of(names: Iterable[LabelName]) -> dict[str, Colour]:
+    """Return the colours of parts by their names."""
+    return {entry.name: entry.colour for entry in names if entry.colour}
+
+
+def label_paths(target: str | Path, labels: Sequence[Any]) -> list[Path]:
     """Return the file of each label: the target itself, if it can have parts."""
     path = Path(target)
     if format_of(path).has_parts:

@@ -111,6 +111,14 @@ class LabelImage:
         """Return the labels as whole numbers."""
         return [int(label) for label in self.labels]
 
+    def counts(self) -> list[int]:
+        """Return how many samples each label has."""
+        parts = [PartOfPlanes(self.samples, box) for box in self.boxes[1:]]
+        return [
+            sum(int((part[i : i + 1] == label).sum()) for i in range(part.shape[0]))
+            for part, label in zip(parts, self.labels)
+        ]
+
     def border(self, planes: tuple[int, int]) -> IntArray:
         """Return indices of border samples in some planes and the number of their mask, (b, 4)."""
         parts = [np.empty((0, 4), np.int64)]

@@ -33,7 +33,7 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 GROUPS = {
     "The grid": ("spacing", "origin", "direction", "axes", "space"),
-    "Its values": ("inside", "field", "label", "labels", "level", "scale"),
+    "Its values": ("inside", "field", "label", "labels", "names", "level", "scale"),
     "The mesh": ("factor", "offset", "cap", "mesher", "simplify", "tolerance", "triangles", "unit"),
     "The work": (
         *("quality", "precision", "model", "device", "max_memory", "threads"),
@@ -122,6 +122,13 @@ labels_option = click.option(
     help="Mesh all labels of a label image but 0, or those listed, each with a closed mesh; "
     "neighbours share their walls. OUT.glb and OUT.3mf hold all as parts; for OUT.ply and others "
     "each label N has its own file, OUT-N.ply.",
+)
+names_option = click.option(
+    "--names",
+    type=click.Path(path_type=Path),
+    metavar="TABLE",
+    help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP or "
+    "FreeSurfer, CSV or JSON. --labels takes names then.",
 )
 cluster_option = click.option(
     "--cluster",

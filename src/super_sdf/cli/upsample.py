@@ -28,6 +28,7 @@ from .common import (
     labels_option,
     load_chosen,
     make_options,
+    names_option,
     one_line_errors,
     print_stderr,
     print_stdout,
@@ -71,6 +72,7 @@ NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 @click.argument("target", metavar="OUT")
 @conversion_options
 @labels_option
+@names_option
 @check_option
 @click.option(
     "--save-field",
@@ -95,6 +97,8 @@ def upsample_command(source: str, target: str, **options: Any) -> None:
     """Convert one grid to a mesh."""
     with one_line_errors(target, options["save_field"], options["report"]):
         chosen = make_options(options)
+        if options["labels"] is None and options["names"] is not None:
+            raise OptionError(f"--names {options['names']} is for --labels: give that, too")
         if options["labels"] is None:
             Upsampling(source, target, chosen, options).complete()
         else:
@@ -271,14 +275,19 @@ def upsample_labels(
 ) -> None:
     """Convert the labels of an image to meshes, and print what was made."""
     from ..label_files import check_options, convert_labels
+    from ..label_names import read_names
 
     watch, model = Stopwatch(), chosen_model(options)
     check_options(chosen, [name for name in NOT_WITH_LABELS if options[name]])
+    names = read_names(options["names"]) if options["names"] else None
     network, labels, force = load_chosen(options), options["labels"], options["force"]
     watch.lap("load network")
     with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
         made = convert_labels(
-            source, target, network, labels, chosen, force=force, progress=progress
+            *(source, target, network, labels, chosen),
+            names=names,
+            force=force,
+            progress=progress,
         )
     watch.lap("convert")
     if options["as_json"]:
@@ -298,8 +307,9 @@ def upsample_labels(
         print_stderr(f"Note: {note}")
     for row in made["labels"]:
         print_stderr(
-            f"{row['output']}: label {row['label']}, {row['vertices']:,} vertices, "
-            f"{row['triangles']:,} triangles, closed, volume {row['volume']:.6g}"
+            f"{row['output']}: {row['name']}, {row['vertices']:,} vertices, "
+            f"{row['triangles']:,} triangles, {row['components']:,} closed components, "
+            f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
         )
     print_stderr(f"{len(made['labels'])} labels, {sum(watch.seconds.values()):.1f} s")
 

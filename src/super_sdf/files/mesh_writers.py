@@ -13,7 +13,9 @@ import struct
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any, NamedTuple, TypeAlias
+from xml.sax.saxutils import quoteattr
 from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
@@ -31,6 +33,8 @@ STL_CHUNK = 1 << 15  # triangles at a time
 PLY_HEADER_BYTES, OFF_HEADER_BYTES = 320, 64
 STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
+Colour: TypeAlias = tuple[int, int, int]
+"""Red, green and blue, from 0 to 255."""
 ToBytes: TypeAlias = Callable[[NDArray[Any]], bytes]
 """Converts rows of vertices or triangles to the bytes that are written."""
 
@@ -233,7 +237,9 @@ def _index_lines(line: str, first: int = 0) -> ToBytes:
 
 # Several meshes by their names
 
-JSON_BYTES = 1200  # of the scene, padded, per part
+NO_COLOURS: Mapping[str, Colour] = MappingProxyType({})
+
+JSON_BYTES = 2400  # of the scene, padded, per part
 HEADER_BYTES = 12 + 8 + 8  # without the scene
 MOST_BYTES = 2**32 - 1  # the length in the header has 32 bits
 FLOAT, UNSIGNED_INT, VERTICES, INDICES = 5126, 5125, 34962, 34963  # constants of glTF
@@ -258,6 +264,7 @@ BEFORE = (
 )
 UNITS = {"um": "micron", "mm": "millimeter", "cm": "centimeter", "m": "meter", "in": "inch",
          "ft": "foot"}  # fmt: skip
+MATERIAL = '<basematerials id="{}"><base name={} displaycolor="{}"/></basematerials>'
 OBJECT = '<object id="{}"{} type="model"><mesh><vertices>\n'
 
 
@@ -265,13 +272,14 @@ def write_glb(
     parts: Mapping[str, Iterable[Mesh]],
     path: Path,
     unit: str | None = None,
+    colours: Mapping[str, Colour] = NO_COLOURS,
     about: Triple = (0.0, 0.0, 0.0),
 ) -> None:
     """Write meshes by their names as binary glTF; its header, of fixed length, is written last.
 
-    Vertices are float32, relative to the point ``about``. The nodes move them there, and scale
-    them from the unit to metres, those of glTF. Raises FileError if a mesh has no triangle, which
-    glTF does not allow, or the file exceeds 4.29 GB.
+    Some may have colours. Vertices are float32, relative to the point ``about``. The nodes move
+    them there, and scale them from the unit to metres, those of glTF. Raises FileError if a mesh
+    has no triangle, which glTF does not allow, or the file exceeds 4.29 GB.
     """
     scene, size = _Scene(about, LENGTHS[unit or "m"]), JSON_BYTES * len(parts)
     with path.open("wb") as file:
@@ -283,7 +291,7 @@ def write_glb(
                 if not written.faces:
                     raise FileError("a mesh without triangles cannot be .glb: give .ply")
                 append_spool(waiting, file)
-            scene.add(name, written, box)
+            scene.add(name, written, box, colours.get(name))
         length = file.tell()
         if length > MOST_BYTES:
             raise FileError(f"the mesh takes {length:,} bytes, .glb holds 4,294,967,295: give .ply")
@@ -325,12 +333,17 @@ class _Scene:
             "buffers": [{"byteLength": 0}],
         }
 
-    def add(self, name: str, written: Written, box: _Shift) -> None:
+    def add(self, name: str, written: Written, box: _Shift, colour: Colour | None) -> None:
         scene, named = self.described, {"name": name} if name else {}
         mesh, first = len(scene["meshes"]), len(scene["accessors"])
         scene["scenes"][0]["nodes"].append(mesh)
         scene["nodes"].append({"mesh": mesh, **named, **self.place})
         primitive = {"attributes": {"POSITION": first}, "indices": first + 1}
+        if colour:
+            materials = scene.setdefault("materials", [])
+            primitive["material"] = len(materials)
+            shown = {"baseColorFactor": [*map(linear, colour), 1], "metallicFactor": 0}
+            materials.append({**named, "pbrMetallicRoughness": shown})
         scene["meshes"].append({"primitives": [primitive], **named})
         positions = {"componentType": FLOAT, "type": "VEC3", "count": written.vertices}
         ends = {"min": box.low.tolist(), "max": box.high.tolist()}
@@ -347,8 +360,21 @@ class _Scene:
             buffer["byteLength"] += size
 
 
-def write_3mf(parts: Mapping[str, Iterable[Mesh]], path: Path, unit: str | None = None) -> None:
+def linear(level: int) -> float:
+    """Return a level of an sRGB colour, 0 to 255, as glTF has it, from 0 to 1."""
+    share = level / 255
+    return share / 12.92 if share <= 0.04045 else float(((share + 0.055) / 1.055) ** 2.4)
+
+
+def write_3mf(
+    parts: Mapping[str, Iterable[Mesh]],
+    path: Path,
+    unit: str | None = None,
+    colours: Mapping[str, Colour] = NO_COLOURS,
+) -> None:
     """Write meshes by their names as 3MF, in a unit or the format's default, the millimetre.
+
+    Some may have colours.
 
     Members opened by name have no date, so the same mesh always gives the same file. Triangles
     wait as binary numbers, which take half as much as text.
@@ -362,8 +388,14 @@ def write_3mf(parts: Mapping[str, Iterable[Mesh]], path: Path, unit: str | None 
         with archive.open("3D/3dmodel.model", "w", force_zip64=True) as file:
             file.write((HEAD + BEFORE.format(UNITS[unit or "mm"])).encode("ascii"))
             for number, (name, pieces) in enumerate(parts.items(), 1):
-                named = f' name="{name}"' if name else ""
-                file.write(OBJECT.format(number, named).encode("ascii"))
+                named = f" name={quoteattr(name)}" if name else ""
+                if name in colours:
+                    material = len(parts) + number
+                    shown = "#{:02X}{:02X}{:02X}".format(*colours[name])
+                    text = MATERIAL.format(material, quoteattr(name), shown)
+                    file.write(text.encode("utf-8"))
+                    named += f' pid="{material}" pindex="0"'
+                file.write(OBJECT.format(number, named).encode("utf-8"))
                 with spool_beside(path) as waiting:
                     write_split(pieces, (file, waiting), rows, TEXT_CHUNK)
                     file.write(b"</vertices><triangles>\n")

@@ -30,7 +30,16 @@ from ..grid.sdf_grid import SdfGrid, negated
 from ..machine.memory import in_words
 from ..mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
 from ..options import check_path, check_space, check_unit
-from .mesh_writers import write_3mf, write_glb, write_obj, write_off, write_ply, write_stl
+from .mesh_writers import (
+    NO_COLOURS,
+    Colour,
+    write_3mf,
+    write_glb,
+    write_obj,
+    write_off,
+    write_ply,
+    write_stl,
+)
 from .output import check_free, free_space, replacing
 from .volume import triple
 
@@ -39,10 +48,11 @@ CHUNK = 1 << 16  # triangles checked at a time
 
 
 class World(NamedTuple):
-    """What the coordinates of a mesh are: their unit, and the anatomical space, if known."""
+    """What a file says of meshes: unit and anatomical space, if known, and colours by name."""
 
     unit: str | None = None
     space: str | None = None
+    colours: Mapping[str, Colour] = NO_COLOURS
 
 
 AS_IT_IS = World()
@@ -63,7 +73,7 @@ class MeshFormat(NamedTuple):
         self, named: Mapping[str, Iterable[Mesh]], path: Path, world: World, about: Triple
     ) -> None:
         """Write meshes in pieces by their names, one if the format has no parts."""
-        stated: list[Any] = [world.unit] if self.has_unit else []
+        stated: list[Any] = [world.unit, world.colours] if self.has_unit else []
         stated += [about] if self.local_origin else []
         stated += [f"SPACE={world.space}"] if self.has_note and world.space else []
         for pieces in [named] if self.has_parts else named.values():
