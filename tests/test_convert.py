@@ -50,7 +50,7 @@ def test_options_take_effect_and_the_result_is_reported():
     assert mesh.extents == pytest.approx([20] * 3, rel=0.02)
     assert mesh.bounds.mean(0) == pytest.approx(np.array([1, 2, 3]) + 2 * 7.63, abs=0.2)
     assert list(done.seconds) == ["read", "band", "network", "nodes", "isosurface", "write"]
-    assert steps == [(20, 1000), (800, 1000), (900, 1000), (1000, 1000)]
+    assert steps == [(30, 1000), (480, 1000), (630, 1000), (1000, 1000)]
 
 
 def without_one(faces, first):

@@ -1,6 +1,7 @@
 """The contract of the ONNX file, the values of a network, and the errors of bad files."""
 
 import os
+import pickle
 import shutil
 
 import numpy as np
@@ -12,7 +13,7 @@ from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
 from super_sdf.neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
 from super_sdf.network.decoder import check_output, to_blocks
-from super_sdf.network.network import KIND_MODELS, Network, shipped_models
+from super_sdf.network.network import KIND_MODELS, Network, shipped_models, small_ball
 from super_sdf.network.onnx import CORE_CHUNK, CPU_CHUNK, cpu_chunk
 from super_sdf.options import QUALITIES
 from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
@@ -308,3 +309,14 @@ def test_a_mean_maps_a_turned_field_to_the_turned_surface(symmetries, flipped):
         apart[network.symmetries] = np.nanmax(off)
     assert apart[symmetries] < 1e-5 < 1e-3 < apart[1]
     assert load_network("best").symmetries == 4
+
+
+@pytest.mark.parametrize("name", ["fast", "best", "mask"])
+def test_a_network_goes_to_other_processes(name):
+    network = load_network(name, threads=1)
+    other = pickle.loads(pickle.dumps(network))
+    inputs = small_ball()
+    np.testing.assert_array_equal(other(*inputs), network(*inputs))
+    assert vars(other).keys() == vars(network).keys()
+    for key in ("card", "device", "symmetries", "threads", "shipped", "path"):
+        assert getattr(other, key) == getattr(network, key), key

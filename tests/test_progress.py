@@ -37,8 +37,8 @@ def reported(work, *arguments):
 
 
 def test_steps_are_reported_in_thousandths_of_their_usual_time():
-    assert reported(reconstruct, ball(), trilinear) == [20, 800, 900, 1000]
-    assert reported(upsample, ball(), trilinear) == [22, 889, 1000]
+    assert reported(reconstruct, ball(), trilinear) == [30, 480, 630, 1000]
+    assert reported(upsample, ball(), trilinear) == [48, 762, 1000]
 
 
 @settings(max_examples=20)
@@ -57,9 +57,9 @@ def test_any_number_of_slabs_ends_with_all_done(slabs):
 
 def test_the_network_reports_progress_during_a_run(polled):
     done = reported(reconstruct, ball(), load_network("fast", device="cpu"))
-    assert done == sorted(done) and (done[0], done[-1]) == (20, 1000)
-    within = done[1 : done.index(800)] if 800 in done else done
-    assert len(within) >= 1 and set(done[-3:]) == {800, 900, 1000}
+    assert done == sorted(done) and (done[0], done[-1]) == (30, 1000)
+    within = done[1 : done.index(480)] if 480 in done else done
+    assert len(within) >= 1 and set(done[-3:]) == {480, 630, 1000}
 
 
 def test_runs_over_symmetries_are_reported_as_parts_of_one(polled):
@@ -189,3 +189,6 @@ def test_the_progress_bar_runs_to_100_percent(tmp_path, monkeypatch, command, po
     monkeypatch.setattr(type(sys.stderr), "isatty", lambda self: True, raising=False)
     code, _, err = command("upsample", tmp_path / "in.npy", tmp_path / "out.ply", "--spacing", "1")
     assert code == 0 and "upsampling" in err and "100%" in err
+    words = "--spacing", "1", "--triangles", "500"
+    code, _, err = command("upsample", tmp_path / "in.npy", tmp_path / "few.ply", *words)
+    assert code == 0 and err.index("upsampling") < err.index("simplifying") < err.index("100%")

@@ -18,7 +18,7 @@ ShareCallback = Callable[[float], None]
 TOTAL = 1000
 # Share of the time that each step takes with a network on a CPU. The first runs once, the others
 # once per slab.
-STEPS = {"band": 0.02, "network": 0.78, "nodes": 0.1, "isosurface": 0.1}
+STEPS = {"band": 0.03, "network": 0.45, "nodes": 0.15, "isosurface": 0.37}
 
 
 def part_of(progress: Progress | None, begin: float, end: float) -> Progress | None:

@@ -213,13 +213,24 @@ def _what_is_written(before: dict[str, tuple[int, int] | None]) -> str:
 
 
 @contextmanager
-def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Draw a progress bar with the remaining time on stderr; None if stderr is no terminal."""
+def progress_bar(
+    label: str, quiet: bool, then: tuple[float, str] | None = None
+) -> Iterator[Callable[[int, int], None] | None]:
+    """Draw a progress bar with the remaining time on stderr; None if stderr is no terminal.
+
+    ``then`` is another label, and the share of the work from which on it is right.
+    """
     if quiet or not sys.stderr.isatty():
         yield None
         return
     with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
-        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
+
+        def show(done: int, total: int) -> None:
+            if then and done >= then[0] * total:
+                shown.label = then[1]
+            shown.update(1000 * done // total - shown.pos)
+
+        yield show
 
 
 def print_stderr(line: str) -> None:

@@ -123,7 +123,10 @@ class Upsampling:
     def complete(self) -> None:
         """Convert the grid, check its mesh and write its page if asked for, print the result."""
         options = self.options
-        with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
+        from ..convert import SHARE_BEFORE
+
+        then = (SHARE_BEFORE, "simplifying") if self.chosen.goals() else None
+        with raising_interrupts(), progress_bar("upsampling", options["quiet"], then) as progress:
             convert = self._convert_here if options["cluster"] is None else self._convert_there
             self.result = convert(progress)
         self.seconds |= self.result.seconds

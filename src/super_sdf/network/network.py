@@ -68,6 +68,7 @@ class Network:
     notes: tuple[str, ...] = ()  # what the user should know about device and threads
     pace: Pace = field(default_factory=Pace, repr=False)  # of earlier runs
     shipped: bool = False  # whether it came with the package and was trained on distances
+    path: Path | None = None  # of its file
     reports_progress: ClassVar[bool] = True  # a call takes ``progress``, see ``decoder.Decoder``
 
     def __repr__(self) -> str:
@@ -76,6 +77,10 @@ class Network:
             f"Network({self.card.get('name', 'unnamed')}, receptive field {self.receptive_field}, "
             f"symmetries {self.symmetries}, device {self.device}, threads {threads})"
         )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Return how another process, which unpickles it, loads the same file."""
+        return _load_again, (self.path, self.device, self.threads, self.symmetries)
 
     def averaged(self, symmetries: int) -> Network:
         """Return the same network averaged over a number of symmetries."""
@@ -283,7 +288,12 @@ def load_network(
     cut = f"--threads {threads} is cut to {useful}, the cores that this process may use"
     notes = (*opened.notes, *([cut] if threads > useful > 0 else []))
     shipped = path.parent == MODELS and card.get("inputs") != MASKS
-    return Network(opened.session, card, opened.device, symmetries, useful, notes, shipped=shipped)
+    loaded = opened.session, card, opened.device, symmetries, useful, notes
+    return Network(*loaded, shipped=shipped, path=path)
+
+
+def _load_again(path: Path, device: str, threads: int, symmetries: int) -> Network:
+    return load_network(path, device=device, threads=threads).averaged(symmetries)
 
 
 def network_for(network: Decoder, kind: str) -> Decoder:
