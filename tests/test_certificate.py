@@ -210,6 +210,21 @@ def test_truncated_and_noisy_samples_promise_nothing(ball_mesh):
     assert exceeded(found, none) == []
 
 
+def test_of_a_mask_the_volume_is_beside_that_of_its_samples(here, command):
+    np.savez("mask.npz", values=sphere_values() < 0, spacing=H, origin=(-0.6, -0.6, -0.6))
+    assert command("upsample", "mask.npz", "mask.ply", "--quality", "fast", "-q")[0] == 0
+    code, out, _ = command("check", "mask.ply", "mask.npz")
+    inside = np.count_nonzero(sphere_values() < 0) * H**3
+    share = trimesh.load("mask.ply").volume / inside - 1
+    want = f"volume of the samples inside: {inside:.6g}; the mesh's volume is {share:+.2%} off"
+    assert code == 0 and want in out and abs(share) < 0.02
+    report = json.loads(command("check", "mask.ply", "mask.npz", "--json")[1])
+    assert report["sample_volume"] == pytest.approx(inside)
+    assert (
+        json.loads(command("check", "ball.ply", "ball.npz", "--json")[1])["sample_volume"] is None
+    )
+
+
 def test_the_triangles_that_a_file_states_are_read_from_its_head(tmp_path):
     mesh = round_mesh(subdivisions=1)
     stated = [stated_triangles(saved(mesh, tmp_path / f"a.{end}")) for end in ("ply", "stl", "off")]

@@ -23,11 +23,12 @@ from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
+from ..grid.planes import in_blocks
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words, memory_bound
 from ..machine.resources import allot, useful_threads
 from ..mesh import Mesh
-from ..options import LENGTHS, ConvertOptions, check_distance, check_max_memory
+from ..options import LENGTHS, MASK, ConvertOptions, check_distance, check_max_memory
 from ..steps.survey import Band, no_surface, survey
 from ..truth.mesh_files import merged, read_mesh
 from .search import search
@@ -67,6 +68,7 @@ class Certificate:
     surface: Surface
     touching: Touching
     strays: Strays | None  # None if no sample is exact
+    sample_volume: float | None = None  # of a mask: of its samples inside, each of which is a box
 
     @property
     def voxel_size(self) -> float:
@@ -85,6 +87,7 @@ class Certificate:
             "surface": self.surface.report(),
             **self.touching.report(),
             "strays": None if self.strays is None else asdict(self.strays),
+            "sample_volume": self.sample_volume,
             "faults": self.faults(),
             "inferred": list(self.grid.notes),
         }
@@ -120,7 +123,13 @@ class Certificate:
             ]
         else:
             lines.append("residual: unknown, since no sample is exact")
+        if self.sample_volume:
+            lines.append(f"volume of the samples inside: {self.sample_volume:.6g}; {self._off()}")
         return [*lines, *self._fault_lines()]
+
+    def _off(self) -> str:
+        share = self.surface.volume / (self.sample_volume or 1) - 1
+        return f"the mesh's volume is {share:+.2%} off that of the samples"
 
     def _fault_lines(self) -> list[str]:
         """Return the faults in one line, and what was not looked for."""
@@ -136,7 +145,10 @@ class Certificate:
     def summary(self) -> str:
         """Return the certificate in one line."""
         if not self.has_evidence:
-            return "; ".join(["no sample is exact, so the residual is unknown", *self.faults()])
+            said = ["no sample is exact, so the residual is unknown"]
+            if self.sample_volume:
+                said.append(self._off())
+            return "; ".join([*said, *self.faults()])
         figures = self.touching.summary()
         residual = (
             f"residual {figures['mean']:.4f} voxels in the mean, {figures['largest']:.4f} at most, "
@@ -252,7 +264,17 @@ def check_kept(
     del found
     give_back()
     strays = find_strays(mesh.vertices, grid, band, offset) if len(touching.values) else None
-    return Certificate(mesh, grid, surface, touching, strays)
+    volume = volume_of_samples(kept.grid, offset) if grid.field.kind == MASK else None
+    return Certificate(mesh, grid, surface, touching, strays, volume)
+
+
+def volume_of_samples(grid: SdfGrid, offset: float) -> float:
+    """Return the volume of the samples inside, each of which counts as a box."""
+    inside = sum(
+        int(np.count_nonzero(grid.planes(first, last) <= offset))
+        for first, last in in_blocks(grid.samples)
+    )
+    return inside * float(np.prod(grid.spacing))
 
 
 def band_of(kept: Kept, options: ConvertOptions) -> Band:
