@@ -171,7 +171,8 @@ def test_examples_run(example, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [example.name])
     runpy.run_path(str(example), run_name="__main__")
     assert capsys.readouterr().out
-    assert all(trimesh.load(path).is_watertight for path in tmp_path.iterdir())
+    scenes = [trimesh.load_scene(path) for path in tmp_path.iterdir()]
+    assert all(part.is_watertight for scene in scenes for part in scene.geometry.values())
 
 
 def test_the_functions_on_the_tour_are_there():

@@ -1,5 +1,9 @@
 """Tensors of PyTorch are taken as they come out of a model."""
 
+import runpy
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -36,3 +40,11 @@ def test_samples_may_be_a_tensor(dtype):
     tensor = torch.tensor(values, dtype=dtype, requires_grad=True)
     grid = make_grid(tensor, spacing=H, field="exact")
     np.testing.assert_allclose(grid.values, values, atol=4e-3)
+
+
+def test_the_example_of_a_neural_field(tmp_path, monkeypatch, capsys):
+    script = Path(__file__).parents[2] / "examples" / "tools" / "neural_field.py"
+    monkeypatch.setattr(sys, "argv", [script.name, str(tmp_path / "ring.ply")])
+    found = runpy.run_path(str(script), run_name="__main__")
+    assert "closed: True" in capsys.readouterr().out
+    assert found["off"] < 2e-3 and 10 * found["field"].evaluations < found["dense"]
