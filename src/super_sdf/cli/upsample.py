@@ -253,7 +253,7 @@ class Upsampling:
         if result.saved_field:
             print_stderr(f"{self.options['save_field']}: {_describe_field(result.saved_field)}")
         if result.simplified:
-            print_stderr(f"Simplified: {_describe_simplified(result.simplified)}")
+            print_stderr(f"Simplified: {_describe_simplified(result.simplified, self.chosen.unit)}")
         if self.certificate:
             print_stderr(f"Check: {self.certificate.summary()}")
         if self.options["report"]:
@@ -351,7 +351,7 @@ def _describe_field(field: dict[str, Any]) -> str:
     return f"the refined field, lattice {shape}, spacing {spacing}, origin {origin}"
 
 
-def _describe_simplified(simplified: dict[str, Any]) -> str:
+def _describe_simplified(simplified: dict[str, Any], unit: str | None) -> str:
     """Describe in one line how much simpler a mesh is and how far from the unsimplified one."""
     off = simplified["deviation"]
     largest = max(off["largest"], off["largest_back"])
@@ -359,5 +359,5 @@ def _describe_simplified(simplified: dict[str, Any]) -> str:
         f"from {simplified['triangles_before']:,} to {simplified['triangles']:,} triangles; "
         f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
         f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}; "
-        f"at most {largest * simplified['voxel_size']:.4g} in world units"
+        f"at most {largest * simplified['voxel_size']:.4g} {unit or 'in world units'}"
     )
