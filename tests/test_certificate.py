@@ -218,6 +218,8 @@ def test_of_a_mask_the_volume_is_beside_that_of_its_samples(here, command):
     share = trimesh.load("mask.ply").volume / inside - 1
     want = f"volume of the samples inside: {inside:.6g}; the mesh's volume is {share:+.2%} off"
     assert code == 0 and want in out and abs(share) < 0.02
+    moved = command("check", "mask.ply", "mask.npz", "--no-faults", "--origin", "-.5,-.5,-.5")
+    assert moved[0] == 1 and " vertices where the grid has no surface" in moved[2]
     report = json.loads(command("check", "mask.ply", "mask.npz", "--json")[1])
     assert report["sample_volume"] == pytest.approx(inside)
     assert (

@@ -93,6 +93,50 @@ def test_any_function_that_changes_sign_there_will_do(sign):
     assert mesh.is_closed() and mesh.volume() > 0
 
 
+def cubes(points, gap):
+    """Two cubes apart, shifted along their walls."""
+    one, other = ((np.abs(points - [x, y, z]) - 0.4) for x, y, z in
+                  ((-0.4 - gap / 2, 0, 0), (0.4 + gap / 2, 0.1, 0.2)))  # fmt: skip
+    far = [np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0) for q in (one, other)]
+    return np.minimum(*far)
+
+
+THIN = {
+    "shell of a block": lambda p: np.abs(block(p)) - 0.015,
+    "shell of a torus": lambda p: np.abs(torus(p)) - 0.005,
+    "two cubes": lambda p: cubes(p, 0.001),
+}
+
+
+@pytest.mark.parametrize("name", THIN)
+@pytest.mark.parametrize("far", [0, 100])
+def test_walls_that_nearly_touch_do_not_meet(name, far):
+    def function(points):
+        return THIN[name](points - [0, 0, far])
+
+    bounds = (-1, -1, far - 1), (1, 1, far + 1)
+    grid = DistanceFunction(function).sample(bounds, H)
+    plain, mesh = reconstruct(grid), reconstruct(grid, function=function)
+    assert check_mesh(mesh, grid).surface.faults() == check_mesh(plain, grid).surface.faults() == []
+    assert off(function, mesh).mean() < 0.7 * off(function, plain).mean()
+
+
+def test_what_is_masked_is_unknown():
+    def masked(points):
+        far = torus(points) > 0.35
+        return np.ma.masked_array(np.where(far, -7.0, torus(points)), far)
+
+    mesh = reconstruct(None, trilinear, function=masked, bounds=BOX, spacing=H)
+    assert is_on(torus, mesh)
+
+
+def test_the_unit_is_that_of_the_grid():
+    grid = DistanceFunction(torus).sample(BOX, H)
+    for scale in (1000, -0.001):
+        mesh = reconstruct(grid, trilinear, function=lambda p, s=scale: s * torus(p), offset=0.05)
+        assert is_on(lambda points: torus(points) - 0.05, mesh)
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_an_offset_is_where_the_function_has_it(sign):
     mesh = reconstruct(
@@ -167,7 +211,7 @@ GRID = make_grid(torus_samples(), spacing=H)
         ({"function": torus}, OptionError,
          "a function needs bounds and spacing, or a grid of its samples"),
         ({"grid": GRID, "bounds": BOX}, OptionError,
-         "bounds and spacing are for a function: the grid has its own"),
+         "bounds and spacing are for a function without a grid: give that"),
         ({"function": torus, "bounds": (1, -1), "spacing": H}, OptionError,
          "bounds are (1, -1): the box is empty, give (lowest, highest)"),
         ({"function": torus, "bounds": 3, "spacing": H}, OptionError,
@@ -179,12 +223,17 @@ GRID = make_grid(torus_samples(), spacing=H)
         ({"function": lambda p: p, "bounds": BOX, "spacing": H}, OptionTypeError,
          "the function returns an array of shape (8000, 3) for 8000 points: return one number for "
          "each"),
+        ({"function": lambda p: torus(p) + 1j, "bounds": BOX, "spacing": H}, OptionTypeError,
+         "the function returns array(["),
+        ({"function": lambda p: np.full(len(p), np.nan), "bounds": BOX, "spacing": H}, GridError,
+         "the function goes from 0 to 0 at 8,000 samples"),
         ({"function": lambda p: None, "bounds": BOX, "spacing": H}, OptionTypeError,
          "the function returns None: return numbers"),
         ({"function": lambda p: np.tanh(8 * torus(p)), "bounds": BOX, "spacing": H, "offset": 0.01},
          OptionError, "offset is 0.01: the function is no distance, leave it out"),
         ({"function": lambda p: p[:, 0] + 9, "bounds": BOX, "spacing": H}, GridError,
-         "no value is below 0 (the smallest is 8)"),
+         "the function goes from 8 to 10 at 8,000 samples, and its surface is where it is 0: give a "
+         "finer spacing or other bounds, or subtract a level"),
     ],
 )  # fmt: skip
 def test_errors(given, kind, message):
@@ -195,10 +244,17 @@ def test_errors(given, kind, message):
 def test_a_vertex_that_finds_no_surface_stays():
     grid = DistanceFunction(torus).sample(BOX, H)
     plain = reconstruct(grid, trilinear)
-    far = reconstruct(grid, trilinear, function=lambda points: torus(points) + 1)
+    far = reconstruct(grid, trilinear, function=lambda p: torus(p) + np.sign(torus(p)))
     np.testing.assert_array_equal(far.vertices, plain.vertices)
-    flat = reconstruct(grid, trilinear, function=lambda points: np.ones(len(points)))
-    np.testing.assert_array_equal(flat.vertices, plain.vertices)
+    nan = reconstruct(grid, trilinear, function=lambda p: np.full(len(p), np.nan))
+    np.testing.assert_array_equal(nan.vertices, plain.vertices)
+
+
+def test_a_function_of_another_grid_is_refused():
+    grid = DistanceFunction(torus).sample(BOX, H)
+    said = refusal(OptionError, reconstruct, grid, trilinear, function=block)
+    assert said.startswith("function has another side than the grid at ")
+    assert said.endswith("give the function that the grid has samples of")
 
 
 def test_what_would_fold_goes_back():
@@ -208,7 +264,7 @@ def test_what_would_fold_goes_back():
     moved = flat.copy()
     moved[3] = 0.3, 0.3, 0
     moved[0] = -0.1, 0, 0.05
-    found = zero.without_folds(moved, flat, faces)
+    found = zero.without_folds(moved, flat, faces, lambda points: points)
     np.testing.assert_allclose(found[3], [0.65, 0.65, 0])  # half of the way does
     np.testing.assert_array_equal(found[0], moved[0])
 

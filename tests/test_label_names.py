@@ -76,6 +76,19 @@ def test_names_become_numbers_and_file_names():
     assert in_file_name("..") == "label" and in_file_name("Leber, groß") == "Leber_groß"
 
 
+def test_long_names_of_any_letters_fit_into_a_glb(command, image):
+    letters = "\U0001f600" * 80
+    Path("long.csv").write_text(f"1,{letters},1,2,3\n5,{letters}!,4,5,6\n", encoding="utf-8")
+    convert(command, image, "o.glb", "all", "--names", "long.csv")
+    parts = trimesh.load("o.glb").geometry
+    assert sorted(map(len, parts)) == [82, 82]  # " 1" and " 5"
+    convert(command, image, "o.stl", "all", "--names", "long.csv")
+    Path("empty.txt").write_text('1 255 0 0 1 1 1 "liver"\n5 0 255 0 1 1 1 ""\n')
+    assert read_names("empty.txt") == {1: LabelName("liver", (255, 0, 0))}
+    Path("empty.csv").write_text("1,liver\n5,,4,5,6\n")
+    assert read_names("empty.csv") == {1: LabelName("liver")}
+
+
 @pytest.fixture
 def image():
     """Two boxes that share a wall, and a small one apart, twice in label 5."""
@@ -120,6 +133,18 @@ def test_labels_are_chosen_by_name(command, image):
     Path("same.csv").write_text("1,organ\n5,organ\n")
     rows, _ = convert(command, image, "o.glb", "all", "--names", "same.csv")
     assert [row["name"] for row in rows] == ["organ 1", "organ 5"]
+    for table, names, ends in (
+        ('{"1": "a/b", "5": "A:b"}', ["a/b", "A:b"], ["a_b-1", "A_b-5"]),
+        ('{"1": "label 5"}', ["label 5 1", "label 5 5"], ["label_5_1", "5"]),
+        ('{"1": "5"}', ["5", "label 5"], ["5-1", "5-5"]),
+        ('{"1": "", "5": "\U0001f600"}', ["label 1", "\U0001f600"], ["1", "label"]),
+    ):
+        Path("t.json").write_text(table)
+        rows, _ = convert(command, image, "t.stl", "all", "--names", "t.json", "--force")
+        assert [row["name"] for row in rows] == names
+        assert [row["output"] for row in rows] == [f"t-{end}.stl" for end in ends]
+        volumes = [trimesh.load(row["output"]).volume for row in rows]
+        np.testing.assert_allclose(volumes, [row["volume"] for row in rows], rtol=1e-4)
     rows, _ = convert(command, image, "p.ply", "all")
     assert [row["output"] for row in rows] == ["p-1.ply", "p-5.ply"]
     code, _, err = command("upsample", image, "o.ply", "--labels", "lung", "--names", "names.ctbl")

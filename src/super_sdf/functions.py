@@ -69,8 +69,8 @@ class DistanceFunction:
             )
         return values.reshape(-1)
 
-    def sample(self, bounds: ArrayLike, spacing: ArrayLike, **values: Any) -> SdfGrid:
-        """Return the samples on a lattice that covers a box.
+    def sample(self, bounds: ArrayLike, spacing: ArrayLike) -> SdfGrid:
+        """Return the samples on a lattice that covers a box. The surface is where they are 0.
 
         Parameters
         ----------
@@ -79,15 +79,13 @@ class DistanceFunction:
             The solid should end a few spacings inside.
         spacing : number or three
             World distance between neighbouring samples.
-        **values
-            What the values are: ``inside``, ``field``, ``level`` and ``scale`` of ``make_grid``.
 
         Raises
         ------
         OptionError
             If the box is empty, or takes more than 2^31 samples.
         GridError
-            As in ``make_grid``.
+            If no sample is inside, or none is outside; else as in ``make_grid``.
         """
         low, high = corners_of(bounds)
         step = np.array(check_spacing(spacing))
@@ -101,13 +99,25 @@ class DistanceFunction:
             planes = np.meshgrid(x[first : first + at_once], y, z, indexing="ij")
             part = samples[first : first + at_once]
             part[...] = self(np.stack(planes, 3).reshape(-1, 3)).reshape(part.shape)
+        _check_sides(samples)
         make = partial(make_grid, samples, spacing=spacing, origin=low)
         try:
-            return make(**values)
+            return make()
         except GridError:  # the spacing is right: what contradicts it is no distance
             with suppress(GridError):
-                return make(**{"field": SCALED, **values})
+                return make(field=SCALED)
             raise
+
+
+def _check_sides(samples: NDArray[np.float32]) -> None:
+    """Raise GridError unless some samples are below 0 and some above."""
+    known = samples[np.isfinite(samples)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    if not low < 0 < high:
+        raise GridError(
+            f"the function goes from {low:.6g} to {high:.6g} at {samples.size:,} samples, and its "
+            "surface is where it is 0: give a finer spacing or other bounds, or subtract a level"
+        )
 
 
 Function: TypeAlias = DistanceFunction | Callable[[Points], Any]
@@ -131,7 +141,7 @@ def sampled(
     """
     if grid is not None or function is None:
         if bounds is not None or spacing is not None:
-            raise OptionError("bounds and spacing are for a function: the grid has its own")
+            raise OptionError("bounds and spacing are for a function without a grid: give that")
         check_grid(grid)
         return cast(SdfGrid, grid)
     if bounds is None or spacing is None:
@@ -156,9 +166,11 @@ def corners_of(bounds: ArrayLike) -> tuple[Points, Points]:
 def as_numbers(values: Any) -> Numbers:
     """Return an array or a tensor of any library as float64."""
     try:
-        array = np.asarray(without_device(values))
-        if array.dtype.kind in "OSU":  # None is no NaN
+        array = np.asanyarray(without_device(values))
+        if array.dtype.kind not in "fiub" and array.dtype.name != "bfloat16":  # None is no NaN
             raise TypeError
-        return array.astype(np.float64)
+        if hasattr(array, "mask"):  # what is masked is unknown
+            array = np.ma.filled(array.astype(np.float64), np.nan)
+        return np.asarray(array, np.float64)
     except (TypeError, ValueError):
         raise OptionTypeError(f"the function returns {seen(values)}: return numbers") from None

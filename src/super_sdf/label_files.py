@@ -128,8 +128,8 @@ def convert_labels(
     image = find_image(source, wanted, place, options.axes, bound, options.space)
     grid = image.grid
     called = names_of(image.names(), known)
-    ends = [in_file_name(called[n].name) if n in known else str(n) for n in called]
-    paths = label_paths(target, ends)
+    ends = {n: in_file_name(called[n].name) if n in known else str(n) for n in called}
+    paths = label_paths(target, list(told_apart(ends, "-").values()))
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
@@ -163,14 +163,20 @@ def convert_labels(
 
 
 def names_of(labels: list[int], known: Names) -> Names:
-    """Return what each label is called; labels of one name get their number, too."""
-    times = Counter(known[label].name for label in labels if label in known)
-    called = {}
-    for label in labels:
-        entry = known.get(label, LabelName(f"label {label}"))
-        is_one = times[entry.name] < 2
-        called[label] = entry if is_one else entry._replace(name=f"{entry.name} {label}")
-    return called
+    """Return what each label is called, by a name of its own."""
+    entries = {label: known.get(label, LabelName(f"label {label}")) for label in labels}
+    names = told_apart({label: entry.name for label, entry in entries.items()}, " ")
+    return {label: entries[label]._replace(name=name) for label, name in names.items()}
+
+
+def told_apart(names: dict[int, str], mark: str) -> dict[int, str]:
+    """Return names to which the labels are added until no two are the same in any case."""
+    while True:
+        times = Counter(name.casefold() for name in names.values())
+        alike = {label: name for label, name in names.items() if times[name.casefold()] > 1}
+        if not alike:
+            return names
+        names = {**names, **{label: f"{name}{mark}{label}" for label, name in alike.items()}}
 
 
 def colours_of(names: Iterable[LabelName]) -> dict[str, Colour]:

@@ -58,7 +58,8 @@ def _of_json(text: str) -> Names:
         number, name = (key, value) if _is_whole(key) else (value, key)
         if not _is_whole(number) or not isinstance(name, str):
             raise ValueError(f"{seen(key)}: {seen(value)} is no label and name")
-        names[int(number)] = _named(name)
+        if name.strip():
+            names[int(number)] = _named(name)
     return names
 
 
@@ -67,7 +68,7 @@ def _of_lines(text: str) -> Names:
     names = {}
     for line in text.splitlines():
         fields = _fields(line)
-        if len(fields) < 2 or not _is_whole(fields[0]):
+        if len(fields) < 2 or not _is_whole(fields[0]) or "" in (fields[1], fields[-1]):
             continue
         if len(fields) >= 5 and all(map(_is_whole, fields[1:4])) and not _is_whole(fields[-1]):
             names[int(fields[0])] = _named(fields[-1], fields[1:4])
@@ -80,7 +81,8 @@ def _fields(line: str) -> list[str]:
     """Return the fields of a line, between commas, tabs or spaces; quotes hold them together."""
     mark = next((mark for mark in "\t,;" if mark in line), " ")
     (fields,) = csv.reader([line.strip()], delimiter=mark, skipinitialspace=True) or [[]]
-    return [field.strip() for field in fields if field.strip()]
+    fields = [field.strip() for field in fields]
+    return fields if mark != " " else [*filter(None, fields[:-1]), *fields[-1:]]
 
 
 def _is_whole(value: Any) -> bool:
@@ -112,5 +114,6 @@ def numbers_of(labels: Any, names: Names) -> Any:
 
 
 def in_file_name(name: str) -> str:
-    """Return a name as a part of a file's name: letters, digits, dots and dashes."""
-    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "label"
+    """Return a name as a part of a file's name: letters, digits, dots and dashes, not too many."""
+    plain = re.sub(r"[^\w.-]+", "_", name).strip("._") or "label"
+    return plain.encode()[:LONGEST].decode(errors="ignore")

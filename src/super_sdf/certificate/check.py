@@ -46,6 +46,7 @@ from .touching import (
 # Bytes for each triangle and each exact sample, beside mesh and band, at the most: search trees.
 BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
+OFF_OF_MASKS = 0.5  # voxels by which the distances that are made of a mask may be off
 REACH = 2.0  # voxels: how far slabs look; the samples near the surface are within 1.4 of it
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
@@ -67,7 +68,7 @@ class Certificate:
     grid: SdfGrid  # on its cubic lattice
     surface: Surface
     touching: Touching
-    strays: Strays | None  # None if no sample is exact
+    strays: Strays | None  # None if no sample is exact, and it is no mask
     sample_volume: float | None = None  # of a mask: of its samples inside, each of which is a box
 
     @property
@@ -263,8 +264,11 @@ def check_kept(
     touching = touch(mesh, samples, found, grid.voxel_size, simple=surface.is_simple)
     del found
     give_back()
-    strays = find_strays(mesh.vertices, grid, band, offset) if len(touching.values) else None
-    volume = volume_of_samples(kept.grid, offset) if grid.field.kind == MASK else None
+    is_mask, strays = grid.field.kind == MASK, None
+    if is_mask or len(touching.values):
+        slack = OFF_OF_MASKS * is_mask
+        strays = find_strays(mesh.vertices, grid, band, offset, slack)
+    volume = volume_of_samples(kept.grid, offset) if is_mask else None
     return Certificate(mesh, grid, surface, touching, strays, volume)
 
 

@@ -130,8 +130,12 @@ def touch(
     return Touching(**vars(samples), residuals=residuals, feet=found.feet, wrong_side=wrong)
 
 
-def find_strays(vertices: NDArray[Any], grid: SdfGrid, band: Band, offset: float = 0.0) -> Strays:
+def find_strays(
+    vertices: NDArray[Any], grid: SdfGrid, band: Band, offset: float = 0.0, slack: float = 0.0
+) -> Strays:
     """Look up the nearest sample of each vertex, (n, 3) in world units.
+
+    A sample's value may be off by ``slack``, in voxels, as those of masks are.
 
     Planes of the grid are read only for vertices whose nearest sample is not in the band.
     """
@@ -148,7 +152,7 @@ def find_strays(vertices: NDArray[Any], grid: SdfGrid, band: Band, offset: float
         if len(rows):
             i, j, k = nearest[rows].T
             values[rows] = rescale(grid, offset, first, last)[i - first, j, k]
-    depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1)
+    depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1) - slack
     count, beyond = np.count_nonzero(depth > STRAY), np.count_nonzero(~inside)
     return Strays(int(count), int(beyond), float(depth.max(initial=0)))
 

@@ -239,7 +239,7 @@ def _index_lines(line: str, first: int = 0) -> ToBytes:
 
 NO_COLOURS: Mapping[str, Colour] = MappingProxyType({})
 
-JSON_BYTES = 2400  # of the scene, padded, per part
+JSON_BYTES = 1200  # of the scene, padded, per part, besides its name, which it has up to 3 times
 HEADER_BYTES = 12 + 8 + 8  # without the scene
 MOST_BYTES = 2**32 - 1  # the length in the header has 32 bits
 FLOAT, UNSIGNED_INT, VERTICES, INDICES = 5126, 5125, 34962, 34963  # constants of glTF
@@ -281,7 +281,9 @@ def write_glb(
     them there, and scale them from the unit to metres, those of glTF. Raises FileError if a mesh
     has no triangle, which glTF does not allow, or the file exceeds 4.29 GB.
     """
-    scene, size = _Scene(about, LENGTHS[unit or "m"]), JSON_BYTES * len(parts)
+    scene = _Scene(about, LENGTHS[unit or "m"])
+    size = sum(JSON_BYTES + 3 * len(json.dumps(name)) for name in parts)
+    size += -size % 4
     with path.open("wb") as file:
         file.write(bytes(HEADER_BYTES + size))
         for name, pieces in parts.items():

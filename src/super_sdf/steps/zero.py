@@ -31,7 +31,10 @@ REACH = 0.5  # fine spacings that a vertex may move
 STEP = 0.02  # fine spacings in which slopes are measured
 GOOD = 1e-4  # fine spacings from the surface at which a vertex needs no other step
 HALF_WAY, BACK_ROUNDS = 3, 8  # rounds in which what folds goes half way back, and all
-ONE_WAY = 0.8  # cosine by which a triangle has turned that may fold the surface
+ONE_WAY = 0.1  # least cosine by which a triangle may have turned
+IN_PLANE, TOUCHING = 1e-7, 1e-5  # fine spacings off a plane, and by which triangles may overlap
+FLAT = 1e-6  # area of triangles, in squared fine spacings, whose vertices may coincide
+COMPARED, MOST_OTHER = 1000, 0.25  # samples at which function and grid are compared
 ROUNDS = 4  # of steps along the gradient
 LEAST_SLOPE = 1e-9
 REACHED = 0.25  # of the value at the start, above which the surface is not in reach
@@ -50,29 +53,61 @@ def put_on_zero(
     """
     if offset and not grid.field.has_exact:
         raise OptionError(f"offset is {offset:g}: the function is no distance, leave it out")
-    fine, sign = grid.voxel_size / factor, -1.0 if grid.positive_inside else 1.0
-    middle = grid.to_world((np.array(grid.shape) - 1) / 2)
+    fine, unit = grid.voxel_size / factor, unit_of(function, grid)
+    middle, kind = grid.to_world((np.array(grid.shape) - 1) / 2), mesh.vertices.dtype
 
     def value(points: Vectors) -> Numbers:
-        """Return values at points, both in fine spacings, so that slopes are those of a unit."""
-        return (function(middle + fine * points) - sign * offset) / fine
+        """Return values at points, both in fine spacings, so that slopes of distances are 1."""
+        return (function(middle + fine * points) / unit - offset) / fine
 
-    before_all = (mesh.vertices.astype(np.float64) - middle) / fine
-    points = before_all.copy()
+    def rounded(points: Vectors) -> Vectors:
+        """Return points as they will be written."""
+        return ((middle + fine * points).astype(kind) - middle) / fine
+
+    start = (mesh.vertices - middle) / fine
     free = _is_within(grid, mesh.vertices, REACH / factor)
-    rows, normals = np.flatnonzero(free), vertex_normals(points, mesh.faces)
-    start, before = points[rows], value(points[rows])
-    slope = np.full(len(rows), sign)
-    if not grid.field.has_exact:
-        slope = (value(start + STEP * normals[rows]) - before) / STEP
-    found, off = step_along(value, start, before, normals[rows], slope)
+    with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
+        points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.has_exact)
+        points = put_on_edges(value, points, mesh.faces, free)
+    points = without_folds(points, start, mesh.faces, rounded)
+    return Mesh((middle + fine * points).astype(kind), mesh.faces)
+
+
+def unit_of(function: DistanceFunction, grid: SdfGrid) -> float:
+    """Return the function's value for a distance of 1, negative inside, at the grid's samples.
+
+    OptionError if it has another side than many of the samples near the surface.
+    """
+    values = grid.values
+    near = np.argwhere(np.abs(values) < 2 * grid.voxel_size)
+    near = near[:: max(len(near) // COMPARED, 1)]
+    known = values[tuple(near.T)].astype(np.float64)
+    found = function(grid.to_world(near))
+    some = np.isfinite(found) & (known != 0)
+    ratio = float(np.median(found[some] / known[some])) if some.any() else 1.0
+    other = float(np.mean(found[some] / known[some] * ratio < 0)) if some.any() else 0.0
+    if other > MOST_OTHER or ratio == 0:
+        raise OptionError(
+            f"function has another side than the grid at {other:.0%} of the samples near the "
+            "surface: give the function that the grid has samples of"
+        )
+    return ratio
+
+
+def put_on_surface(
+    value: Value, start: Vectors, faces: NDArray[Any], free: BoolArray, *, exact: bool
+) -> Vectors:
+    """Return points (n, 3), the ``free`` ones where the values are 0, if that is in reach."""
+    points, rows, normals = start.copy(), np.flatnonzero(free), vertex_normals(start, faces)
+    before, slope = value(start[rows]), np.ones(len(rows))
+    if not exact:
+        slope = (value(start[rows] + STEP * normals[rows]) - before) / STEP
+    found, off = step_along(value, start[rows], before, normals[rows], slope)
     left = np.flatnonzero(np.abs(off) > GOOD * np.abs(slope))
-    found[left], off[left] = step_down(value, start[left], before[left])
+    found[left], off[left] = step_down(value, start[rows[left]], before[left])
     reached = np.abs(off) <= REACHED * np.abs(before)
     points[rows[reached]] = found[reached]
-    points = put_on_edges(value, points, mesh.faces, free)
-    points = without_folds(points, before_all, mesh.faces)
-    return Mesh((middle + fine * points).astype(mesh.vertices.dtype), mesh.faces)
+    return points
 
 
 def _is_within(grid: SdfGrid, points: NDArray[Any], margin: float) -> BoolArray:
@@ -154,27 +189,51 @@ def is_on_edge(points: Vectors, faces: NDArray[Any]) -> BoolArray:
     return turned
 
 
-def without_folds(points: Vectors, before: Vectors, faces: NDArray[Any]) -> Vectors:
+def without_folds(
+    points: Vectors, before: Vectors, faces: NDArray[Any], rounded: Callable[[Vectors], Vectors]
+) -> Vectors:
     """Return points (n, 3), some back where they were before, so that no triangles intersect.
 
-    Triangles that fold the surface have turned, or one beside them has.
+    ``rounded`` returns points as they are written: of those it must hold.
     """
-    points, back = points.copy(), np.zeros(0, np.int64)
-    original = length_and_unit(face_normals(before, faces))[1]
+    points, original = points.copy(), length_and_unit(face_normals(before, faces))[1]
+    suspect = np.any(points != before, axis=1)
     for turn in range(BACK_ROUNDS):
-        cosine = (length_and_unit(face_normals(points, faces))[1] * original).sum(1)
-        suspect = np.zeros(len(points), bool)
-        suspect[faces[cosine < ONE_WAY]] = True
-        suspect[back] = True
-        pairs = np.stack(overlapping_boxes(points, faces, suspect))
-        pairs = np.concatenate(intersecting(points, *faces[pairs]), axis=1)
-        back = np.unique(np.concatenate([pairs.ravel(), faces[cosine < 0].ravel()]))
+        now = rounded(points)
+        area, normals = length_and_unit(face_normals(now, faces))
+        folded = faces[((normals * original).sum(1) < ONE_WAY) | (area < FLAT)]
+        pairs = np.stack(overlapping_boxes(now, faces, suspect))
+        flat = faces[pairs[:, overlapping_in_plane(now, *faces[pairs])]]
+        pairs = np.concatenate(intersecting(now, *faces[pairs]), axis=1)
+        back = np.unique(np.concatenate([part.ravel() for part in (pairs, flat, folded)]))
         back = back[(points[back] != before[back]).any(1)]
         if not len(back):
             break
         way = 0.5 if turn < HALF_WAY else 1.0
         points[back] += way * (before[back] - points[back])
+        suspect = np.zeros(len(points), bool)
+        suspect[back] = True
     return points
+
+
+def overlapping_in_plane(points: Vectors, first: NDArray[Any], second: NDArray[Any]) -> BoolArray:
+    """Return which pairs of triangles, corners (m, 3) each, lie in one plane and overlap there.
+
+    Two convex shapes do unless a side of one of them separates them.
+    """
+    one, other = points[first], points[second]  # (m, 3, 3)
+    normals = length_and_unit(np.cross(one[:, 1] - one[:, 0], one[:, 2] - one[:, 0]))[1]
+    heights = ((other - one[:, :1]) * normals[:, None]).sum(2)
+    overlap: BoolArray = np.abs(heights).max(1, initial=0) < IN_PLANE
+    rows = np.flatnonzero(overlap)
+    one, other, normals = one[rows], other[rows], normals[rows]
+    for triangle in (one, other):
+        for k in range(3):
+            across = np.cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
+            mine, theirs = (one * across).sum(2), (other * across).sum(2)
+            beyond = np.minimum(mine.max(1), theirs.max(1)) - np.maximum(mine.min(1), theirs.min(1))
+            overlap[rows] &= beyond > TOUCHING
+    return overlap
 
 
 def gradient(value: Value, points: Vectors, values: Numbers) -> Vectors:
