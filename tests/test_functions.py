@@ -232,8 +232,8 @@ GRID = make_grid(torus_samples(), spacing=H)
         ({"function": lambda p: np.tanh(8 * torus(p)), "bounds": BOX, "spacing": H, "offset": 0.01},
          OptionError, "offset is 0.01: the function is no distance, leave it out"),
         ({"function": lambda p: p[:, 0] + 9, "bounds": BOX, "spacing": H}, GridError,
-         "the function goes from 8 to 10 at 8,000 samples, and its surface is where it is 0: give a "
-         "finer spacing or other bounds, or subtract a level"),
+         "the function goes from 8 to 10 at 8,000 samples, and its surface is where it is 0: give "
+         "a finer spacing or other bounds, or subtract a level"),
     ],
 )  # fmt: skip
 def test_errors(given, kind, message):
