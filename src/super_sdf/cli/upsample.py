@@ -235,9 +235,9 @@ class Upsampling:
 
     def print_report(self) -> None:
         """Print notes, warnings and a summary to stderr, and with ``--json`` JSON to stdout."""
-        report, result = self._report(), self.result
+        result = self.result
         if self.options["as_json"]:
-            print_stdout(json.dumps(report, indent=2), f"{self.target} is written")
+            print_stdout(json.dumps(self._report(), indent=2), f"{self.target} is written")
         if self.options["quiet"]:
             return
         for note in (*result.notes, *result.remarks(), *self.network.notes):
@@ -245,6 +245,7 @@ class Upsampling:
         for warning in result.warnings:
             print_stderr(f"Warning: {warning}")
         if self.options["verbose"]:
+            report = self._report()
             for key in ("shape", "spacing", "origin", "device", "band_voxels", "nodes"):
                 print_stderr(f"{key.replace('_', ' ')}: {report[key]}")
             for stage, seconds in self.seconds.items():
