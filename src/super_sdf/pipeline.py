@@ -40,7 +40,6 @@ from .steps.meshers import extract_pieces
 from .steps.spheres import fit_to_spheres, spheres_of_band
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
-from .steps.zero import put_on_zero
 
 
 def refine(
@@ -213,7 +212,11 @@ def reconstruct(
         progress=progress,
     )
     mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
-    return mesh if exact is None else put_on_zero(mesh, exact, grid, factor, offset)
+    if exact is None:
+        return mesh
+    from .steps.zero import put_on_zero  # imported here, as few call it
+
+    return put_on_zero(mesh, exact, grid, factor, offset)
 
 
 def reconstruct_slabs(
