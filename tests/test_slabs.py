@@ -21,6 +21,7 @@ from super_sdf.grid.field import Field
 from super_sdf.machine import resources
 from super_sdf.machine.resources import Resources
 from super_sdf.mesh import Mesh, join_meshes
+from super_sdf.options import MARCHING, SHARP
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import cutting, preparing
 from super_sdf.slabs.cutting import (
@@ -31,6 +32,7 @@ from super_sdf.slabs.cutting import (
     plan_slabs,
     slab_bytes,
 )
+from super_sdf.steps.meshers import BY_NAME
 from super_sdf.steps.nodes import number_parts, share_parts
 from super_sdf.steps.survey import count_crossings, look_at_band, survey
 
@@ -167,6 +169,20 @@ def test_less_memory_makes_more_slabs_and_too_little_is_refused(bare_plan):
     with pytest.raises(OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels needs 1\d\d MB of "):
         plan_slabs(band, 4, 2, Resources(memory=10**8 + 1))
     assert len(plan_slabs(band, 4, 2, Resources(memory=None))) == 1
+
+
+def test_where_only_marching_cubes_fits_it_is_named(bare_plan):
+    band, free = survey(SdfGrid.trusted(rod(112), (1.0,) * 3)), Resources(memory=None)
+    both = [BY_NAME[name] for name in (SHARP, MARCHING)]
+    more, less = (cutting.least_bytes(band, 4, 2, free, cutting.NETWORK_BYTES, m) for m in both)
+    between = Resources(memory=(more + less) // 2)
+    with pytest.raises(OutOfMemoryError) as caught:
+        plan_slabs(band, 4, 2, between, mesher=both[0])
+    want = "; use --mesher marching, which leaves edges alone, or a smaller factor, or allow more "
+    assert want in str(caught.value)
+    assert len(plan_slabs(band, 4, 2, between, mesher=both[1])) > 1
+    with pytest.raises(OutOfMemoryError, match="; use a smaller factor, or allow more "):
+        plan_slabs(band, 4, 2, Resources(memory=less // 2), mesher=both[0])
 
 
 def test_a_large_band_is_cut_where_that_costs_hardly_more(monkeypatch):

@@ -86,7 +86,8 @@ def plan_slabs(
         need = peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
         if bound is None or need <= bound:
             return slabs
-    raise _does_not_fit(band, factor, receptive_field, need, bound or 0)
+    given = factor, receptive_field, resources, network_bytes, mesher
+    raise _does_not_fit(band, need, *given, planes)
 
 
 def refuse_band(
@@ -103,11 +104,11 @@ def refuse_band(
     planes, _ = plan_reading(grid.samples, held_memory() or 0, resources)
     seen = look_at_band(grid, offset, planes)
     band = outline(grid, offset, resources.threads, seen.voxels, seen.decoded)
-    *_, slabs = _ways(band, receptive_field, mesher.planes_beside(factor))
-    need = peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
-    need += band_bytes(seen.summary.voxels, seen.beyond)
-    share = seen.summary.voxels / np.prod(grid.shape, dtype=float)
-    error = _does_not_fit(band, factor, receptive_field, need, resources.memory or 0)
+    given, more = (factor, receptive_field, resources, network_bytes), seen.summary.voxels
+    held = band_bytes(more, seen.beyond)
+    share = more / np.prod(grid.shape, dtype=float)
+    need = least_bytes(band, *given, mesher) + held
+    error = _does_not_fit(band, need, *given, mesher, held=held)
     if share < SURFACE_SHARE:
         return error
     return OutOfMemoryError(f"{error}; {share:.0%} of the samples are near the surface: {DOUBT}")
@@ -162,6 +163,20 @@ def peak_bytes(
     return max(held + max(needs), band.peak)
 
 
+def least_bytes(
+    band: Band,
+    factor: int,
+    receptive_field: int | None,
+    resources: Resources,
+    network_bytes: tuple[float, float],
+    mesher: Mesher,
+    planes: tuple[int, int] | None = None,
+) -> int:
+    """Return the peak memory in the smallest slabs."""
+    *_, slabs = _ways(band, receptive_field, mesher.planes_beside(factor), planes)
+    return peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
+
+
 def cut(
     band: Band,
     pieces: int,
@@ -212,15 +227,27 @@ def slab_of(band: Band, first: int, last: int, receptive_field: int, beside: int
 
 
 def _does_not_fit(
-    band: Band, factor: int, receptive_field: int | None, need: int, bound: int
+    band: Band,
+    need: int,
+    factor: int,
+    receptive_field: int | None,
+    resources: Resources,
+    network_bytes: tuple[float, float],
+    mesher: Mesher,
+    planes: tuple[int, int] | None = None,
+    held: int = 0,
 ) -> OutOfMemoryError:
     """Return the error for work that does not fit in memory; what it says to allow is enough."""
     how = "at once" if receptive_field is None else "even plane by plane"
+    bound, ways = resources.memory or 0, "a smaller factor"
+    given = factor, receptive_field, resources, network_bytes
+    if mesher.name != MARCHING and held + least_bytes(band, *given, DEFAULT, planes) <= bound:
+        ways = "--mesher marching, which leaves edges alone, or a smaller factor"
     if band.unpacked <= ROOM_SHARE * need:  # it would be unpacked into memory then
         need += band.unpacked
     return OutOfMemoryError(
         f"factor {factor} on {int(band.decoded_before[-1]):,} voxels needs {advised(need)} of "
-        f"memory {how}, {in_words(bound)} may be used; use a smaller factor, or allow more "
+        f"memory {how}, {in_words(bound)} may be used; use {ways}, or allow more "
         "(--max-memory)"
     )
 
