@@ -177,7 +177,7 @@ def large_row(grid: Path, limit: str, n: int, bench: Bench) -> Row:
     try:
         report = report_of(grid, *options)
     except SuperSdfError as refusal:
-        return {"refused": str(refusal)}
+        return {"refused": str(refusal).partition("Error: ")[2]}
     costs = {"seconds": report["wall"], "peak_mb": report["peak"] / 1e6}
     costs["planned_mb"] = report["planned_bytes"] / 1e6
     return {**{key: report[key] for key in ("slabs", "band_voxels", "triangles")}, **costs}

@@ -72,7 +72,7 @@ def test_edges_that_a_mask_cannot_show_are_a_note(tmp_path, monkeypatch, command
     monkeypatch.chdir(tmp_path)
     np.save("mask.npy", FIELDS["bar"] < 0)
     words = ("--spacing", 1, "--inside", "positive", "--factor", 2, "--force")
-    note = "Note: mask values tell of no edges: the mesh is that of marching cubes\n"
+    note = "Note: mask values show no edges: the mesh is that of marching cubes\n"
     for name, count in {"auto": 0, "marching": 0, "sharp": 1}.items():
         code, _, err = command("upsample", "mask.npy", "a.ply", "--mesher", name, *words)
         assert code == 0 and err.count(note) == count

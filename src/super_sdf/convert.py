@@ -397,7 +397,7 @@ def edges_note(grid: SdfGrid, options: ConvertOptions) -> list[str]:
     """Return why no edges are found, if they were asked for."""
     if options.mesher != SHARP or grid.field.has_exact:
         return []
-    return [f"{grid.field.kind} values tell of no edges: the mesh is that of marching cubes"]
+    return [f"{grid.field.kind} values show no edges: the mesh is that of marching cubes"]
 
 
 def find_warnings(
