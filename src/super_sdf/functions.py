@@ -34,8 +34,8 @@ class DistanceFunction:
     ----------
     function : callable
         Takes world positions, (n, 3) float64, and returns n distances, (n,) or (n, 1): an array, or
-        a tensor of PyTorch or JAX on any device, with or without gradients. Any function that
-        changes sign at the surface will do; it may be positive inside.
+        a tensor of PyTorch or JAX on any device, with or without gradients. Any continuous
+        function that is 0 on the surface will do; it may be positive inside.
 
     Attributes
     ----------

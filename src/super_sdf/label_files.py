@@ -187,7 +187,7 @@ def colours_of(names: Iterable[LabelName]) -> dict[str, Colour]:
 def label_paths(target: str | Path, labels: Sequence[Any]) -> list[Path]:
     """Return the file of each label: the target itself, if it can have parts."""
     path = Path(target)
-    if format_of(path).has_parts:
+    if format_of(path).has_scene:
         return [path] * len(labels)
     if len(labels) > MOST_FILES:
         raise OptionError(

@@ -163,9 +163,10 @@ class Certificate:
         return vertex_residuals(vertices, self.touching, self.grid)
 
 
+WORLD = "in world units"
 LIMITS = {
     "max_residual": ("largest", "the largest residual is", "voxels"),
-    "tolerance": ("largest", "the largest residual is", "in world units"),
+    "tolerance": ("largest", "the largest residual is", WORLD),
     "max_mean": ("mean", "the mean residual is", "voxels"),
     "max_share": ("share_above_tenth", "above 0.1 voxel is", ""),
 }
@@ -190,7 +191,7 @@ def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> li
     figures, found = certificate.touching.summary() if asked else {}, []
     for name in asked:
         (key, words, unit), limit = LIMITS[name], limits[name] or 0.0
-        figure = figures[key] * (certificate.voxel_size if name == "tolerance" else 1)
+        figure = figures[key] * (certificate.voxel_size if unit == WORLD else 1)
         if figure > limit:
             value = f"{figure:.4g} {unit}".rstrip()
             found.append(f"{words} {value}, --{name.replace('_', '-')} is {limit:g}")

@@ -65,18 +65,17 @@ class MeshFormat(NamedTuple):
     bytes_per_triangle: int  # with its half of a vertex; approximate for text and archives
     single_precision: bool = False  # whether coordinates are float32
     local_origin: bool = False  # whether coordinates may be relative to a point
-    has_parts: bool = False
-    has_unit: bool = False
+    has_scene: bool = False  # whether it has parts with names and colours, and a unit
     has_note: bool = False  # whether 3D Slicer looks in the header for the space
 
     def write_named(
         self, named: Mapping[str, Iterable[Mesh]], path: Path, world: World, about: Triple
     ) -> None:
         """Write meshes in pieces by their names, one if the format has no parts."""
-        stated: list[Any] = [world.unit, world.colours] if self.has_unit else []
+        stated: list[Any] = [world.unit, world.colours] if self.has_scene else []
         stated += [about] if self.local_origin else []
         stated += [f"SPACE={world.space}"] if self.has_note and world.space else []
-        for pieces in [named] if self.has_parts else named.values():
+        for pieces in [named] if self.has_scene else named.values():
             self.write(pieces, path, *stated)
 
 
@@ -85,10 +84,8 @@ FORMATS = {
     ".stl": MeshFormat(write_stl, 50, single_precision=True, has_note=True),
     ".obj": MeshFormat(write_obj, 40, has_note=True),
     ".off": MeshFormat(write_off, 39),
-    ".glb": MeshFormat(
-        write_glb, 18, single_precision=True, local_origin=True, has_parts=True, has_unit=True
-    ),
-    ".3mf": MeshFormat(write_3mf, 13, has_parts=True, has_unit=True),
+    ".glb": MeshFormat(write_glb, 18, single_precision=True, local_origin=True, has_scene=True),
+    ".3mf": MeshFormat(write_3mf, 13, has_scene=True),
 }
 MESH_SUFFIXES = tuple(FORMATS)
 
@@ -108,8 +105,8 @@ def check_mesh_suffix(path: Path, unit: str | None = None) -> None:
     """Raise OptionError if the suffix is not that of a mesh format, or of none that has a unit."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
-    if unit and not format_of(path).has_unit:
-        stating = " or ".join(suffix for suffix, kind in FORMATS.items() if kind.has_unit)
+    if unit and not format_of(path).has_scene:
+        stating = " or ".join(suffix for suffix, kind in FORMATS.items() if kind.has_scene)
         raise OptionError(f"unit is {unit}: {path} can state none, give {stating}, or no unit")
 
 

@@ -86,8 +86,11 @@ def plan_slabs(
         need = peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
         if bound is None or need <= bound:
             return slabs
-    given = factor, receptive_field, resources, network_bytes, mesher
-    raise _does_not_fit(band, need, *given, planes)
+    given = band, factor, receptive_field
+    plain = need
+    if mesher is not DEFAULT:
+        plain = least_bytes(*given, resources, network_bytes, DEFAULT, planes)
+    raise _does_not_fit(*given, need, bound or 0, plain)
 
 
 def refuse_band(
@@ -104,11 +107,12 @@ def refuse_band(
     planes, _ = plan_reading(grid.samples, held_memory() or 0, resources)
     seen = look_at_band(grid, offset, planes)
     band = outline(grid, offset, resources.threads, seen.voxels, seen.decoded)
-    given, more = (factor, receptive_field, resources, network_bytes), seen.summary.voxels
-    held = band_bytes(more, seen.beyond)
-    share = more / np.prod(grid.shape, dtype=float)
-    need = least_bytes(band, *given, mesher) + held
-    error = _does_not_fit(band, need, *given, mesher, held=held)
+    given, held = (band, factor, receptive_field), band_bytes(seen.summary.voxels, seen.beyond)
+    need = plain = held + least_bytes(*given, resources, network_bytes, mesher)
+    if mesher is not DEFAULT:
+        plain = held + least_bytes(*given, resources, network_bytes, DEFAULT)
+    share = seen.summary.voxels / np.prod(grid.shape, dtype=float)
+    error = _does_not_fit(*given, need, resources.memory or 0, plain)
     if share < SURFACE_SHARE:
         return error
     return OutOfMemoryError(f"{error}; {share:.0%} of the samples are near the surface: {DOUBT}")
@@ -227,22 +231,16 @@ def slab_of(band: Band, first: int, last: int, receptive_field: int, beside: int
 
 
 def _does_not_fit(
-    band: Band,
-    need: int,
-    factor: int,
-    receptive_field: int | None,
-    resources: Resources,
-    network_bytes: tuple[float, float],
-    mesher: Mesher,
-    planes: tuple[int, int] | None = None,
-    held: int = 0,
+    band: Band, factor: int, receptive_field: int | None, need: int, bound: int, plain: int
 ) -> OutOfMemoryError:
-    """Return the error for work that does not fit in memory; what it says to allow is enough."""
+    """Return the error for work that does not fit in memory; what it says to allow is enough.
+
+    Marching cubes need ``plain``.
+    """
     how = "at once" if receptive_field is None else "even plane by plane"
-    bound, ways = resources.memory or 0, "a smaller factor"
-    given = factor, receptive_field, resources, network_bytes
-    if mesher.name != MARCHING and held + least_bytes(band, *given, DEFAULT, planes) <= bound:
-        ways = "--mesher marching, which leaves edges alone, or a smaller factor"
+    ways = "a smaller factor"
+    if plain < need and plain <= bound:
+        ways = f"--mesher marching, which leaves edges alone, or {ways}"
     if band.unpacked <= ROOM_SHARE * need:  # it would be unpacked into memory then
         need += band.unpacked
     return OutOfMemoryError(

@@ -21,10 +21,9 @@ from ..errors import OptionError
 from ..functions import DistanceFunction
 from ..grid.sdf_grid import SdfGrid
 from ..mesh import Mesh
+from .sharp.patches import Numbers, Vectors, cross, dot, length, sums_at, unit
 from .sharp.triangle_pairs import intersecting, overlapping_boxes
 
-Vectors: TypeAlias = NDArray[np.float64]  # (n, 3)
-Numbers: TypeAlias = NDArray[np.float64]  # (n,)
 Value: TypeAlias = Callable[[Vectors], Numbers]
 
 REACH = 0.5  # fine spacings that a vertex may move
@@ -33,7 +32,7 @@ GOOD = 1e-4  # fine spacings from the surface at which a vertex needs no other s
 HALF_WAY, BACK_ROUNDS = 3, 8  # rounds in which what folds goes half way back, and all
 ONE_WAY = 0.1  # least cosine by which a triangle may have turned
 IN_PLANE, TOUCHING = 1e-7, 1e-5  # fine spacings off a plane, and by which triangles may overlap
-FLAT = 1e-6  # area of triangles, in squared fine spacings, whose vertices may coincide
+FLAT = 1e-6  # twice the area of triangles, in squared fine spacings, whose vertices may coincide
 COMPARED, MOST_OTHER = 1000, 0.25  # samples at which function and grid are compared
 ROUNDS = 4  # of steps along the gradient
 LEAST_SLOPE = 1e-9
@@ -53,12 +52,12 @@ def put_on_zero(
     """
     if offset and not grid.field.has_exact:
         raise OptionError(f"offset is {offset:g}: the function is no distance, leave it out")
-    fine, unit = grid.voxel_size / factor, unit_of(function, grid)
+    fine, scale = grid.voxel_size / factor, unit_of(function, grid)
     middle, kind = grid.to_world((np.array(grid.shape) - 1) / 2), mesh.vertices.dtype
 
     def value(points: Vectors) -> Numbers:
         """Return values at points, both in fine spacings, so that slopes of distances are 1."""
-        return (function(middle + fine * points) / unit - offset) / fine
+        return (function(middle + fine * points) / scale - offset) / fine
 
     def rounded(points: Vectors) -> Vectors:
         """Return points as they will be written."""
@@ -144,10 +143,10 @@ def step_down(value: Value, start: Vectors, before: Numbers) -> tuple[Vectors, N
     """
     at, now = start.copy(), before.copy()
     for _ in range(ROUNDS):
-        slope, direction = length_and_unit(gradient(value, at, now))
-        way = np.clip(-now / np.maximum(slope, LEAST_SLOPE), -REACH, REACH)
-        length, shift = length_and_unit(at + way[:, None] * direction - start)
-        new = start + np.minimum(length, REACH)[:, None] * shift
+        slopes = gradient(value, at, now)
+        way = np.clip(-now / np.maximum(length(slopes), LEAST_SLOPE), -REACH, REACH)
+        shift = at + way[:, None] * unit(slopes) - start
+        new = start + np.minimum(length(shift), REACH)[:, None] * unit(shift)
         there = value(new)
         closer = np.abs(there) < np.abs(now)
         at[closer], now[closer] = new[closer], there[closer]
@@ -162,8 +161,8 @@ def put_on_edges(value: Value, points: Vectors, faces: NDArray[Any], free: BoolA
     pairs = edges[one] & free[one] & free[other] & ~edges[other]
     rows, at = np.unique(one[pairs], return_inverse=True)
     known, beside = np.unique(other[pairs], return_inverse=True)
-    normals = length_and_unit(gradient(value, points[known], value(points[known])))[1][beside]
-    heights = (normals * (points[known][beside] - points[rows][at])).sum(1)
+    normals = unit(gradient(value, points[known], value(points[known])))[beside]
+    heights = dot(normals, points[known][beside] - points[rows][at])
     matrix = np.zeros((len(rows), 3, 3)) + STAY * np.eye(3)
     np.add.at(matrix, at, normals[:, :, None] * normals[:, None])
     vector = np.zeros((len(rows), 3))
@@ -178,13 +177,13 @@ def put_on_edges(value: Value, points: Vectors, faces: NDArray[Any], free: BoolA
 
 def is_on_edge(points: Vectors, faces: NDArray[Any]) -> BoolArray:
     """Return at which points, (n,), triangles turn by 30 degrees."""
-    area, normals = length_and_unit(face_normals(points, faces))
-    large = area > 2 * LEAST_AREA
-    corners, normals = faces[large].ravel(), np.repeat(normals[large], 3, axis=0)
-    mean = length_and_unit(sums_at(corners, normals, len(points)))[1]
+    normals = face_normals(points, faces)
+    large = length(normals) > 2 * LEAST_AREA
+    corners, normals = faces[large].ravel(), np.repeat(unit(normals[large]), 3, axis=0)
+    mean = unit(sums_at(corners, normals, len(points)))
     # Two that turn by an angle are at most half of it from their mean.
     least = np.ones(len(points))
-    np.minimum.at(least, corners, (normals * mean[corners]).sum(1))
+    np.minimum.at(least, corners, dot(normals, mean[corners]))
     turned: BoolArray = least < np.sqrt((1 + TURNED) / 2)
     return turned
 
@@ -196,12 +195,12 @@ def without_folds(
 
     ``rounded`` returns points as they are written: of those it must hold.
     """
-    points, original = points.copy(), length_and_unit(face_normals(before, faces))[1]
+    points, original = points.copy(), unit(face_normals(before, faces))
     suspect = np.any(points != before, axis=1)
     for turn in range(BACK_ROUNDS):
         now = rounded(points)
-        area, normals = length_and_unit(face_normals(now, faces))
-        folded = faces[((normals * original).sum(1) < ONE_WAY) | (area < FLAT)]
+        normals = face_normals(now, faces)
+        folded = faces[(dot(unit(normals), original) < ONE_WAY) | (length(normals) < FLAT)]
         pairs = np.stack(overlapping_boxes(now, faces, suspect))
         flat = faces[pairs[:, overlapping_in_plane(now, *faces[pairs])]]
         pairs = np.concatenate(intersecting(now, *faces[pairs]), axis=1)
@@ -222,15 +221,15 @@ def overlapping_in_plane(points: Vectors, first: NDArray[Any], second: NDArray[A
     Two convex shapes do unless a side of one of them separates them.
     """
     one, other = points[first], points[second]  # (m, 3, 3)
-    normals = length_and_unit(np.cross(one[:, 1] - one[:, 0], one[:, 2] - one[:, 0]))[1]
-    heights = ((other - one[:, :1]) * normals[:, None]).sum(2)
+    normals = unit(face_normals(points, first))
+    heights = dot(other - one[:, :1], normals[:, None])
     overlap: BoolArray = np.abs(heights).max(1, initial=0) < IN_PLANE
     rows = np.flatnonzero(overlap)
     one, other, normals = one[rows], other[rows], normals[rows]
     for triangle in (one, other):
         for k in range(3):
-            across = np.cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
-            mine, theirs = (one * across).sum(2), (other * across).sum(2)
+            across = cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
+            mine, theirs = dot(one, across), dot(other, across)
             beyond = np.minimum(mine.max(1), theirs.max(1)) - np.maximum(mine.min(1), theirs.min(1))
             overlap[rows] &= beyond > TOUCHING
     return overlap
@@ -244,21 +243,10 @@ def gradient(value: Value, points: Vectors, values: Numbers) -> Vectors:
 def face_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
     """Return normals of triangles (m, 3), as long as twice their areas."""
     a, b, c = (points[corner] for corner in faces.T)
-    return np.asarray(np.cross(b - a, c - a))
+    return cross(b - a, c - a)
 
 
 def vertex_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
     """Return unit normals at points (n, 3), means of the triangles' weighted by their areas."""
     normals = np.repeat(face_normals(points, faces), 3, axis=0)
-    return length_and_unit(sums_at(faces.ravel(), normals, len(points)))[1]
-
-
-def sums_at(place: NDArray[Any], vectors: Vectors, count: int) -> Vectors:
-    """Return the sums of vectors (m, 3) at each of ``count`` places, (count, 3)."""
-    return np.stack([np.bincount(place, component, count) for component in vectors.T], 1)
-
-
-def length_and_unit(vectors: NDArray[Any]) -> tuple[Numbers, Vectors]:
-    """Return lengths (n,) and unit vectors (n, 3)."""
-    length = np.linalg.norm(vectors, axis=1)
-    return length, vectors / np.maximum(length, np.finfo(np.float64).tiny)[:, None]
+    return unit(sums_at(faces.ravel(), normals, len(points)))

@@ -33,6 +33,7 @@ from .patches import (
     dot,
     length,
     middles,
+    sums_at,
     triangles_of,
     unit,
 )
@@ -110,7 +111,7 @@ def find_suspects(patches: Patches, placed: Placed, lattice: Vectors) -> BoolArr
 
 def turns(place: Index, normals: Vectors, count: int) -> BoolArray:
     """Return which of ``count`` places have normals that do not face one way."""
-    mean = unit(np.stack([np.bincount(place, component, count) for component in normals.T], 1))
+    mean = unit(sums_at(place, normals, count))
     least = np.ones(count)
     np.minimum.at(least, place, dot(normals, mean[place]))
     found: BoolArray = least < ONE_WAY

@@ -67,6 +67,11 @@ def unit(vectors: Vectors) -> Vectors:
     return units
 
 
+def sums_at(place: Index, vectors: Vectors, count: int) -> Vectors:
+    """Return the sums of vectors (m, 3) at each of ``count`` places, (count, 3)."""
+    return np.stack([np.bincount(place, component, count) for component in vectors.T], 1)
+
+
 def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolArray:
     """Return the voxels, (D,), of some rows in which slopes change at a node as at an edge."""
     near = np.zeros(len(field.voxel_ijk), bool)
