@@ -225,7 +225,7 @@ def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
     for told in (AUTO, SCALED) if kind.group == "scaled" else (AUTO,):
         try:
             grid = make_grid(values, field=told, **kind.options, **placed)
-            mesh = reconstruct(grid, network, factor=case.factor, cap=True)
+            mesh = reconstruct(grid, network, factor=case.factor)
         except GridError as problem:
             refusals.append(str(problem))
         else:
@@ -247,7 +247,7 @@ def resampled_by_hand(
     )
     grid = SdfGrid.trusted(values, h, origin)
     try:
-        return Surface(reconstruct(grid, network, factor=case.factor, cap=True))
+        return Surface(reconstruct(grid, network, factor=case.factor))
     except GridError as problem:
         return Surface(EMPTY, facts={"refused": str(problem)})
 

@@ -80,7 +80,7 @@ def our_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -
     """
     try:
         grid, factor = case.recognised, case.factor
-        mesh = reconstruct(grid, network, factor=factor, cap=True, mesher=mesher)
+        mesh = reconstruct(grid, network, factor=factor, mesher=mesher)
     except NoSurfaceError:
         return Surface(EMPTY)
     if case.setting.noise:

@@ -53,7 +53,7 @@ def ours(values: Values, spacing: Any, low: Any, network: Decoder) -> tuple[Mesh
     for told in ("auto", "scaled"):
         try:
             grid = make_grid(values, spacing=spacing, origin=low, field=told)
-            mesh = reconstruct(grid, network, factor=FACTOR, cap=True)
+            mesh = reconstruct(grid, network, factor=FACTOR)
         except GridError:
             continue
         return mesh, grid.field.kind if told == "auto" else f"{grid.field.kind}, told"

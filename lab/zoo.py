@@ -467,7 +467,7 @@ def call(sample: Kind, options: dict[str, Any], network: Decoder) -> Outcome:
     told["spacing"] = true if isinstance(told["spacing"], str) else told["spacing"]
     try:
         grid = make_grid(sample.values, **told)
-        mesh = reconstruct(grid, network, FACTOR, cap=True, offset=offset)
+        mesh = reconstruct(grid, network, FACTOR, offset=offset)
     except SuperSdfError as problem:
         return Outcome(named, str(problem))
     values, form = level_set(sample, options)

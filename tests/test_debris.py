@@ -137,7 +137,7 @@ def test_masks_of_thin_solids_have_no_handles(network, size, spacing, solid):
     for seed in range(2):
         places = turned_grid(size, spacing, seed)
         mask = rod(places, 1.0, 10) <= 0 if solid == "vessel" else box(places, 9, 9, 0.75) <= 0
-        mesh = reconstruct(make_grid(mask, spacing=spacing, origin=0), network, cap=True)
+        mesh = reconstruct(make_grid(mask, spacing=spacing, origin=0), network)
         euler = len(mesh.vertices) - len(mesh.faces) // 2
         handles = (2 * count_components(mesh.faces, len(mesh.vertices)) - euler) // 2
         assert handles <= (0 if solid == "vessel" else 3)

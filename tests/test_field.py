@@ -21,13 +21,13 @@ def test_a_surface_inside_the_grid_does_not_cross_the_border():
 def test_a_surface_that_leaves_is_found_and_left_open():
     grid = cut_ball()
     assert border_is_crossed(upsample(grid, trilinear))
-    assert reconstruct(grid, trilinear).open_edges() > 0
+    assert reconstruct(grid, trilinear, cap=False).open_edges() > 0
 
 
 @pytest.mark.parametrize("factor", [2, 4])
 def test_the_cap_closes_it_along_the_border(factor):
     grid = cut_ball()
-    mesh = reconstruct(grid, trilinear, factor, cap=True)
+    mesh = reconstruct(grid, trilinear, factor)
     assert mesh.open_edges() == 0
     low = np.array(grid.origin) - 0.25  # the fine lattice starts half a voxel before the samples
     assert np.abs(mesh.vertices.min(0) - low).max() < 0.02 * 0.5 / factor
@@ -44,7 +44,7 @@ def inside_volume(grid: SdfGrid, low: np.ndarray) -> float:
 
 def test_the_cap_changes_nothing_where_nothing_leaves():
     grid = ball()
-    plain, capped = reconstruct(grid, trilinear), reconstruct(grid, trilinear, cap=True)
+    plain, capped = reconstruct(grid, trilinear), reconstruct(grid, trilinear)
     np.testing.assert_array_equal(plain.faces, capped.faces)
     np.testing.assert_array_equal(plain.vertices, capped.vertices)
 
@@ -70,5 +70,5 @@ def test_a_tip_just_before_the_border_is_closed(axis, end):
 
 def test_a_tip_just_beyond_the_border_leaves_the_grid():
     grid = tip(beyond=0.01)
-    assert reconstruct(grid, trilinear).open_edges() > 0
-    assert reconstruct(grid, trilinear, cap=True).open_edges() == 0
+    assert reconstruct(grid, trilinear, cap=False).open_edges() > 0
+    assert reconstruct(grid, trilinear).open_edges() == 0

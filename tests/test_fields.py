@@ -168,7 +168,7 @@ def test_the_examples_of_the_docs_run(capsys):
     assert capsys.readouterr().out.startswith(f"{len(names['values'])} blocks; ")
     exec(second, names)
     assert np.abs(names["distances"] - to_plane(names["points"])).max() < 1e-6
-    want = reconstruct(plane(), trilinear, 4, mesher="sharp", cap=True)
+    want = reconstruct(plane(), trilinear, 4, mesher="sharp")
     write_mesh(want, "want.ply")
     assert Path("part-sharp.ply").read_bytes() == Path("want.ply").read_bytes()
 
@@ -382,11 +382,11 @@ def test_the_command_writes_the_mesh_and_the_field(command):
         "a.npz: the refined field, lattice 57 x 61 x 65, spacing 0.075, 0.075, 0.075, "
         "origin 0.85, 1.85, 2.85"
     )
-    write_mesh(extract_mesh(read_field("a.npz"), cap=True), "b.ply")
+    write_mesh(extract_mesh(read_field("a.npz")), "b.ply")
     assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
     code, out, _ = command(*run, "c.ply", "--save-field", "c.npy", "--open", "--json")
     assert code == 0 and '"path": "c.npy"' in out
-    write_mesh(extract_mesh(read_field("a.npz")), "d.ply")
+    write_mesh(extract_mesh(read_field("a.npz"), cap=False), "d.ply")
     assert Path("c.ply").read_bytes() == Path("d.ply").read_bytes()
     assert np.load("c.npy").shape == (57, 61, 65)
 

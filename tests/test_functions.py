@@ -3,10 +3,13 @@
 import numpy as np
 import pytest
 from conftest import refusal, trilinear
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from super_sdf import DistanceFunction, extract_mesh, functions, make_grid, reconstruct, upsample
 from super_sdf.certificate.check import check_mesh
 from super_sdf.errors import GridError, OptionError, OptionTypeError
+from super_sdf.grid.near import sample_near
 from super_sdf.steps import zero
 
 H = 2 / 19
@@ -39,12 +42,12 @@ def is_on(function, mesh):
 def test_vertices_lie_where_the_function_is_0():
     asked = DistanceFunction(torus)
     mesh = reconstruct(function=asked, bounds=BOX, spacing=H)
-    plain = reconstruct(make_grid(torus_samples(), spacing=H, origin=-1.0))
+    plain = reconstruct(DistanceFunction(torus).sample(BOX, H))
     np.testing.assert_array_equal(mesh.faces, plain.faces)
     assert off(torus, plain).mean() > 1e-3
     assert is_on(torus, mesh)
     assert mesh.is_closed()
-    assert 20**3 + 2 * len(mesh.vertices) <= asked.evaluations < 20**3 + 2.3 * len(mesh.vertices)
+    assert 2 * len(mesh.vertices) <= asked.evaluations < 20**3 + 2.3 * len(mesh.vertices)
     nodes = 4**3 * upsample(asked.sample(BOX, H), trilinear).band_voxels
     assert asked.evaluations - 20**3 < 1.5 * nodes
 
@@ -56,13 +59,46 @@ def torus_samples():
 
 
 def test_the_mesh_of_a_field_and_of_a_grid_is_the_same():
-    grid = DistanceFunction(torus).sample(BOX, H)
+    grid = DistanceFunction(torus).sample(BOX, H, np.inf)
     np.testing.assert_allclose(grid.values, torus_samples(), atol=1e-6)
     assert grid.origin == (-1, -1, -1) and grid.shape == (20, 20, 20)
     one = reconstruct(grid, trilinear, function=torus)
     other = extract_mesh(upsample(grid, trilinear), function=torus)
     np.testing.assert_array_equal(one.vertices, other.vertices)
     assert is_on(torus, one)
+
+
+@given(st.integers(0, 10**6))
+@settings(max_examples=40)
+def test_samples_near_the_surface_are_those_of_the_whole_lattice(seed):
+    random = np.random.default_rng(seed)
+    shape, step = random.integers(9, 40, 3), random.uniform(0.02, 0.08, 3)
+    middles = random.uniform(0, 1, (3, 3)) * shape * step
+    radii = random.uniform(0.01, 0.4, 3)
+    low = random.uniform(-9, 9, 3)
+
+    def balls(points):
+        return (np.linalg.norm(points[:, None] - low - middles, axis=2) - radii).min(1)
+
+    asked = DistanceFunction(balls)
+    near, cut = sample_near(lambda ijk: asked(low + step * ijk), tuple(shape), step, 0.1)
+    whole = balls(low + step * np.argwhere(np.ones(shape))).reshape(shape)
+    np.testing.assert_allclose(np.clip(near, -cut, cut), np.clip(whole, -cut, cut), atol=1e-6)
+    assert 0 < cut <= 0.1 + 1e-6
+    assert asked.evaluations == np.isfinite(near).sum()
+
+
+def test_far_from_the_surface_few_points_are_asked():
+    asked = DistanceFunction(torus)
+    grid = asked.sample(BOX, 2 / 95)
+    assert asked.evaluations < 0.4 * 96**3
+    assert np.abs(grid.values).max() == pytest.approx(8 / 95, 1e-4)
+    mesh, whole = (
+        reconstruct(DistanceFunction(torus).sample(BOX, 2 / 95, reach), trilinear)
+        for reach in (None, np.inf)
+    )
+    np.testing.assert_array_equal(mesh.faces, whole.faces)
+    np.testing.assert_array_equal(mesh.vertices, whole.vertices)
 
 
 def test_edges_and_corners_are_those_of_the_function():
@@ -150,8 +186,8 @@ def test_on_the_border_vertices_stay():
         return np.hypot(*points[:, :2].T) - 0.5
 
     grid = DistanceFunction(pillar).sample(BOX, H)
-    plain = reconstruct(grid, trilinear, cap=True)
-    mesh = reconstruct(grid, trilinear, function=pillar, cap=True)
+    plain = reconstruct(grid, trilinear)
+    mesh = reconstruct(grid, trilinear, function=pillar)
     border = np.abs(plain.vertices[:, 2]) > 1 + H / 2 - H / 10
     np.testing.assert_array_equal(mesh.vertices[border], plain.vertices[border])
     inner = np.abs(plain.vertices[:, 2]) < 1
@@ -203,7 +239,7 @@ GRID = make_grid(torus_samples(), spacing=H)
 
 
 @pytest.mark.parametrize(
-    ("given", "kind", "message"),
+    ("arguments", "kind", "message"),
     [
         ({"function": 3}, OptionTypeError, "function is 3: give a function of points (n, 3)"),
         ({}, OptionTypeError, "grid is None: make one with make_grid(values, spacing=...) or "
@@ -221,23 +257,23 @@ GRID = make_grid(torus_samples(), spacing=H)
         ({"function": torus, "bounds": BOX, "spacing": 0}, GridError,
          "spacing is 0, 0, 0: it must be greater than 0"),
         ({"function": lambda p: p, "bounds": BOX, "spacing": H}, OptionTypeError,
-         "the function returns an array of shape (8000, 3) for 8000 points: return one number for "
+         "the function returns an array of shape (64, 3) for 64 points: return one number for "
          "each"),
         ({"function": lambda p: torus(p) + 1j, "bounds": BOX, "spacing": H}, OptionTypeError,
          "the function returns array(["),
         ({"function": lambda p: np.full(len(p), np.nan), "bounds": BOX, "spacing": H}, GridError,
-         "the function goes from 0 to 0 at 8,000 samples"),
+         "the function goes from 0 to 0 at 0 samples"),
         ({"function": lambda p: None, "bounds": BOX, "spacing": H}, OptionTypeError,
          "the function returns None: return numbers"),
         ({"function": lambda p: np.tanh(8 * torus(p)), "bounds": BOX, "spacing": H, "offset": 0.01},
          OptionError, "offset is 0.01: the function is no distance, leave it out"),
         ({"function": lambda p: p[:, 0] + 9, "bounds": BOX, "spacing": H}, GridError,
-         "the function goes from 8 to 10 at 8,000 samples, and its surface is where it is 0: give "
+         "the function goes from 8 to 10 at 64 samples, and its surface is where it is 0: give "
          "a finer spacing or other bounds, or subtract a level"),
     ],
 )  # fmt: skip
-def test_errors(given, kind, message):
-    said = refusal(kind, reconstruct, network=trilinear, **given)
+def test_errors(arguments, kind, message):
+    said = refusal(kind, reconstruct, network=trilinear, **arguments)
     assert said.startswith(message), said
 
 

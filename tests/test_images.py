@@ -61,7 +61,7 @@ def test_the_surface_is_the_one_of_the_file(direction, where, folder):
     grid = read_grid("image.vti")
     assert repr(image.super_sdf.grid()) == repr(grid) == repr(grid_from_image(image))
     assert np.array_equal(image.super_sdf.grid().values, grid.values)
-    mesh = reconstruct(grid, trilinear, 2, cap=True)
+    mesh = reconstruct(grid, trilinear, 2)
     surface = image.super_sdf.contour(2, network=trilinear)
     assert surface.points.tobytes() == mesh.vertices.tobytes()
     assert surface.points.dtype == mesh.vertices.dtype
@@ -183,7 +183,7 @@ def test_other_mistakes_are_one_line():
     assert said == "the image has no array 'b': it holds distance"
     assert refusal(OptionError, contour, 3).startswith("factor is 3: ")
     said = refusal(OptionError, contour, quality="best", network=load_network("fast"))
-    assert said == "quality 'best' and a network are given: give only one"
+    assert said == "a network and quality are given: give only one of them"
     said = refusal(GridError, thin.contour)
     assert said == "values have shape (1, 22, 20): give at least 2 samples on each axis"
     image.spacing = (0.2, 0.2, 0.2)

@@ -106,7 +106,7 @@ def test_any_field_gives_a_closed_oriented_manifold(values, factor, mesher):
 def test_any_field_is_closed_by_the_network_and_the_cap(values):
     values[2, 2, 2], values[3, 3, 3] = -1, 1
     grid = SdfGrid.trusted(values, (1.0, 1.0, 1.0))
-    mesh = reconstruct(grid, load_network("fast"), 2, cap=True)
+    mesh = reconstruct(grid, load_network("fast"), 2)
     assert mesh.open_edges() == 0
     assert (count_fans(mesh.faces) == 1).all()
 

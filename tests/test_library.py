@@ -163,7 +163,7 @@ def test_so_are_those_of_the_other_functions(message):
 
 
 def test_numbers_of_numpy_are_numbers():
-    plain = reconstruct(GRID, trilinear, 2, offset=0.5, cap=True)
+    plain = reconstruct(GRID, trilinear, 2, offset=0.5)
     numpy = reconstruct(GRID, trilinear, np.int8(2), offset=np.float32(0.5), cap=np.True_)
     np.testing.assert_array_equal(plain.vertices, numpy.vertices)
 

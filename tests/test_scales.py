@@ -23,7 +23,7 @@ fields = hnp.arrays(
 def mesh_of(values: np.ndarray, spacing: float = 1.0, *, flipped: bool = False) -> Mesh:
     """Refine any values, distances or not, with a stand-in for the network."""
     grid = SdfGrid.trusted(values, spacing, positive_inside=flipped)
-    return reconstruct(grid, trilinear, 2, cap=True)
+    return reconstruct(grid, trilinear, 2)
 
 
 @settings(max_examples=12)
@@ -110,7 +110,7 @@ def test_thin_fields_raise_no_warnings(shape, spacing):
     values = THIN[shape](*np.indices((11, 10, 12)).astype(float))
     try:
         grid = make_grid(values, spacing=spacing, inside="negative")
-        mesh = reconstruct(grid, trilinear, 2, cap=True)
+        mesh = reconstruct(grid, trilinear, 2)
     except GridError as error:
         assert "\n" not in str(error)
     else:

@@ -303,7 +303,7 @@ def test_a_plane_that_holds_everything_is_meshed_in_chunks_to_the_same_mesh(monk
     meshes = []
     for chunk in (1 << 19, 2000):
         monkeypatch.setattr(resources, "CHUNK", chunk)
-        meshes.append(reconstruct(grid, trilinear, 2, cap=True))
+        meshes.append(reconstruct(grid, trilinear, 2))
     np.testing.assert_array_equal(meshes[0].faces, meshes[1].faces)
     np.testing.assert_array_equal(meshes[0].vertices, meshes[1].vertices)
     assert meshes[0].is_closed()

@@ -32,7 +32,7 @@ def field(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def mesh(field):
     """Return the mesh of the ball that the library makes."""
-    return reconstruct(read_grid(field), cap=True)
+    return reconstruct(read_grid(field))
 
 
 def recipe(name: str, **given: object) -> dict:
@@ -52,7 +52,7 @@ def test_the_programmable_filter_makes_the_mesh_of_the_library(field, mesh):
 def test_the_filter_takes_another_factor_and_mesher(field):
     fill, made = recipe("paraview_filter")["fill_surface"], vtkPolyData()
     fill(pyvista.read(field), made, "distance", 2, mesher="sharp")
-    sharp = reconstruct(read_grid(field), factor=2, mesher="sharp", cap=True)
+    sharp = reconstruct(read_grid(field), factor=2, mesher="sharp")
     assert pyvista.wrap(made).points.tobytes() == sharp.vertices.tobytes()
 
 

@@ -91,7 +91,7 @@ def test_an_unknown_region_between_inside_and_outside_cannot_be_closed():
         "96 of the unknown samples are in regions that touch both sides of the surface: it is open "
         "there"
     )
-    assert refusal(GridError, reconstruct, grid, trilinear, cap=True) == (
+    assert refusal(GridError, reconstruct, grid, trilinear) == (
         "96 samples are unknown, values[14, 0, 20] the first, in regions that touch samples on "
         "both sides of the surface, so whether they are inside is unknown; end the surface there "
         "(--open), or replace each by a distance of the right sign (the cut-off value of its side)"
@@ -117,7 +117,7 @@ def half_seen(seen: float = 9) -> np.ndarray:
 def test_the_surface_ends_where_that_of_marching_cubes_of_the_known_cells_does(make, mesher):
     values = make()
     grid, known = make_grid(values, **PLACE), ~np.isnan(values)
-    mesh = reconstruct(grid, trilinear, mesher=mesher)
+    mesh = reconstruct(grid, trilinear, mesher=mesher, cap=False)
     corners, faces = marching_cubes(np.where(known, values, 1), 0)[:2]
     faces = faces[cells(known)[tuple(corners[faces].mean(1).astype(int).T)]]
     want, found = trimesh.Trimesh(corners, faces), trimesh.Trimesh(mesh.vertices, mesh.faces)
@@ -137,16 +137,16 @@ def test_the_surface_ends_where_that_of_marching_cubes_of_the_known_cells_does(m
 def test_slabs_and_threads_change_nothing_where_a_surface_ends(options, monkeypatch):
     network = load_network("fast", device="cpu", threads=1)
     grid = make_grid(half_seen(), **PLACE, **options)
-    want = reconstruct(grid, load_network("fast", device="cpu", threads=2))
+    want = reconstruct(grid, load_network("fast", device="cpu", threads=2), cap=False)
     field = upsample(grid, network)
-    pieces = in_pieces(grid, network, monkeypatch, 4)
+    pieces = in_pieces(grid, network, monkeypatch, 4, cap=False)
     mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
     assert len(pieces) > 2 and not want.is_closed()
     np.testing.assert_array_equal(mesh.vertices, want.vertices)
     np.testing.assert_array_equal(mesh.faces, want.faces)
-    np.testing.assert_array_equal(extract_mesh(field).faces, want.faces)
+    np.testing.assert_array_equal(extract_mesh(field, cap=False).faces, want.faces)
     with pytest.raises(GridError, match=r"so whether they are inside is unknown; end the surface"):
-        extract_mesh(field, cap=True)
+        extract_mesh(field)
 
 
 def test_what_needs_the_whole_surface_is_refused(folder, command):
@@ -170,9 +170,9 @@ def test_unequal_spacings_of_distances_that_end_need_the_spline():
     values = half_seen()[:, :, ::2]
     grid = make_grid(values, spacing=(1, 1, 2), origin=0)
     with pytest.raises(GridError, match=r"mesh the spline of the values \(--field scaled\)$"):
-        reconstruct(grid, trilinear)
+        reconstruct(grid, trilinear, cap=False)
     scaled = make_grid(values, spacing=(1, 1, 2), origin=0, field="scaled")
-    mesh = reconstruct(scaled, trilinear)
+    mesh = reconstruct(scaled, trilinear, cap=False)
     off = np.linalg.norm(mesh.vertices - np.array([13.6, 13.3, 13.8]), axis=1) - 10.8
     assert np.abs(off).mean() < 0.05 and np.abs(mesh.vertices[:, 0] - 13.6).max() < 9
 
@@ -224,7 +224,7 @@ def test_a_value_where_nothing_was_seen_is_told_by_its_jumps(value):
     assert f"samples are exactly {value:g}, where no distance is: they are taken" in grid.notes[0]
     want = make_grid(np.where(far, np.nan, distances).astype(np.float32), **PLACE)
     np.testing.assert_array_equal(grid.values, want.values)
-    mesh, same = (reconstruct(g, trilinear, cap=True) for g in (grid, want))
+    mesh, same = (reconstruct(g, trilinear) for g in (grid, want))
     assert mesh.volume() == pytest.approx(same.volume(), rel=1e-3)
 
 
@@ -281,4 +281,4 @@ def test_fused_depth_images_are_meshed_by_their_spline(unseen, scale):
     grid = make_grid(values, **PLACE)
     assert grid.field.kind == "truncated" and grid.field.is_uneven
     assert grid.field.exact == (0, 0) and "their slope is uneven" in grid.notes[-1]
-    assert reconstruct(grid, trilinear, 2, cap=True).is_closed()
+    assert reconstruct(grid, trilinear, 2).is_closed()

@@ -43,7 +43,7 @@ def refine(path, factor=4, mesher="marching"):
     """Return the vertices (n, 3) and the triangles (m, 3) of a grid file's surface."""
     from super_sdf import read_grid, reconstruct
 
-    mesh = reconstruct(read_grid(path), factor=factor, mesher=mesher, cap=True)
+    mesh = reconstruct(read_grid(path), factor=factor, mesher=mesher)
     return mesh.vertices, mesh.faces
 
 

@@ -22,7 +22,7 @@ def fill_surface(image, surface, scalars=None, factor=4, **options):
     grid = grid_from_image(image, scalars)
     for note in grid.notes:
         print(f"super-sdf: {note}")
-    mesh = reconstruct(grid, factor=factor, cap=True, **options)
+    mesh = reconstruct(grid, factor=factor, **options)
     points, triangles = vtkPoints(), vtkCellArray()
     points.SetData(numpy_to_vtk(mesh.vertices, deep=True))
     corners = numpy_to_vtkIdTypeArray(mesh.faces.ravel().astype(np.int64), deep=True)

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .arrays import without_device
 from .errors import GridError, OptionError, OptionTypeError, seen
+from .grid.near import sample_near
 from .grid.placement import as_triple, check_spacing
 from .grid.sdf_grid import SdfGrid, check_grid, make_grid
 from .options import SCALED
@@ -25,6 +26,7 @@ Numbers = NDArray[np.float64]  # (n,)
 
 BATCH = 1 << 18  # points of a call at most
 MOST_SAMPLES = 1 << 31
+REACH = 4  # spacings from the surface: the network sees samples that are 3.2 off
 
 
 class DistanceFunction:
@@ -69,8 +71,10 @@ class DistanceFunction:
             )
         return values.reshape(-1)
 
-    def sample(self, bounds: ArrayLike, spacing: ArrayLike) -> SdfGrid:
+    def sample(self, bounds: ArrayLike, spacing: ArrayLike, reach: float | None = None) -> SdfGrid:
         """Return the samples on a lattice that covers a box. The surface is where they are 0.
+
+        Coarse cells are asked first, so that far from the surface few points are.
 
         Parameters
         ----------
@@ -79,6 +83,9 @@ class DistanceFunction:
             The solid should end a few spacings inside.
         spacing : number or three
             World distance between neighbouring samples.
+        reach : float, optional
+            World distance from the surface at which samples are cut off, by default 4 spacings;
+            infinite for all as they are.
 
         Raises
         ------
@@ -92,14 +99,10 @@ class DistanceFunction:
         shape = np.ceil((high - low) / step - 1e-9).astype(np.int64) + 1
         if np.prod(shape.astype(float)) > MOST_SAMPLES:
             raise OptionError(f"spacing is {seen(spacing)}: the box takes more than 2^31 samples")
-        x, y, z = (start + h * np.arange(count) for start, h, count in zip(low, step, shape))
-        samples = np.empty(shape, np.float32)
-        at_once = max(1, BATCH // (len(y) * len(z)))  # planes
-        for first in range(0, len(x), at_once):
-            planes = np.meshgrid(x[first : first + at_once], y, z, indexing="ij")
-            part = samples[first : first + at_once]
-            part[...] = self(np.stack(planes, 3).reshape(-1, 3)).reshape(part.shape)
+        reach = REACH * float(step.max()) if reach is None else reach
+        samples, cut = sample_near(lambda ijk: self(low + step * ijk), tuple(shape), step, reach)
         _check_sides(samples)
+        np.clip(samples, -cut, cut, out=samples)
         make = partial(make_grid, samples, spacing=spacing, origin=low)
         try:
             return make()
@@ -115,7 +118,7 @@ def _check_sides(samples: NDArray[np.float32]) -> None:
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     if not low < 0 < high:
         raise GridError(
-            f"the function goes from {low:.6g} to {high:.6g} at {samples.size:,} samples, and its "
+            f"the function goes from {low:.6g} to {high:.6g} at {len(known):,} samples, and its "
             "surface is where it is 0: give a finer spacing or other bounds, or subtract a level"
         )
 
@@ -134,8 +137,9 @@ def sampled(
     function: DistanceFunction | None,
     bounds: ArrayLike | None,
     spacing: ArrayLike | None,
+    offset: float,
 ) -> SdfGrid:
-    """Return the grid, or samples of the function if there is none.
+    """Return the grid, or samples of the function as far as an offset needs if there is none.
 
     OptionError unless either a grid is given, or a function with bounds and spacing.
     """
@@ -146,7 +150,8 @@ def sampled(
         return cast(SdfGrid, grid)
     if bounds is None or spacing is None:
         raise OptionError("a function needs bounds and spacing, or a grid of its samples")
-    return function.sample(bounds, spacing)
+    reach = REACH * max(check_spacing(spacing)) + abs(offset)
+    return function.sample(bounds, spacing, reach)
 
 
 def corners_of(bounds: ArrayLike) -> tuple[Points, Points]:

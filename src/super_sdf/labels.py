@@ -35,6 +35,8 @@ from .network.decoder import Adapter, Decoder, adapt
 from .network.network import network_for
 from .options import (
     MASK,
+    AxisOrder,
+    Space,
     check_factor,
     check_label,
     check_max_memory,
@@ -153,7 +155,7 @@ def reconstruct_labels(
     spacing: Any = None,
     origin: Any = None,
     direction: Any = None,
-    axes: str | None = None,
+    axes: AxisOrder | None = None,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, Mesh]:
@@ -212,9 +214,9 @@ def find_image(
     values: Any,
     labels: str | Sequence[int],
     place: dict[str, Any],
-    axes: str | None,
+    axes: AxisOrder | None,
     max_memory: int | None,
-    space: str | None = None,
+    space: Space | None = None,
 ) -> LabelImage:
     """Return the label image of an array or a file; ``place`` has spacing, origin and direction."""
     wanted, notes = check_labels(labels), []

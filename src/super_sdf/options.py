@@ -14,29 +14,43 @@ from math import inf, isfinite
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, TypedDict, cast
+from typing import Any, Final, Literal, NamedTuple, TypedDict, cast, get_args
 
 from .errors import OptionError, OptionTypeError, seen
 
-AUTO = "auto"
-EXACT, TRUNCATED, MASK, SCALED, NOISY = "exact", "truncated", "mask", "scaled", "noisy"
-FIELDS = (AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY)
-INSIDE = (AUTO, "negative", "positive")
-AXES = ("xyz", "zyx")
-RAS, LPS = SPACES = ("RAS", "LPS")
-"""Right, anterior, superior; left, posterior, superior."""
-MARCHING, SHARP = "marching", "sharp"
-MESHERS: tuple[str, ...] = (AUTO, MARCHING, SHARP)
-DEFAULT_MESHER = AUTO
+FieldKind = Literal["auto", "exact", "truncated", "mask", "scaled", "noisy"]
+Inside = Literal["auto", "negative", "positive"]
+AxisOrder = Literal["xyz", "zyx"]
+Space = Literal["RAS", "LPS"]
+MesherName = Literal["auto", "marching", "sharp"]
+Unit = Literal["um", "mm", "cm", "m", "in", "ft"]
+Quality = Literal["fast", "base", "best"]
+Device = Literal["auto", "cpu", "cuda"]
+Precision = Literal["auto", "float32", "int8"]
+
+AUTO: Final = "auto"
+EXACT: Final = "exact"
+TRUNCATED: Final = "truncated"
+MASK: Final = "mask"
+SCALED: Final = "scaled"
+NOISY: Final = "noisy"
+RAS: Final = "RAS"  # right, anterior, superior
+LPS: Final = "LPS"  # left, posterior, superior
+MARCHING: Final = "marching"
+SHARP: Final = "sharp"
+DEFAULT_MESHER: Final = AUTO
 GOALS = ("simplify", "tolerance", "triangles")
 """Of these at most one may be given."""
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 """Units that mesh files state, in metres."""
-DEVICES = (AUTO, "cpu", "cuda")
-AUTO_PRECISION, FLOAT32, INT8 = AUTO, "float32", "int8"
-PRECISIONS = (AUTO_PRECISION, FLOAT32, INT8)
-DEFAULT_QUALITY = "base"
+FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
+MESHERS: tuple[MesherName, ...] = get_args(MesherName)
+DEVICES: tuple[Device, ...] = get_args(Device)
+AUTO_PRECISION: Final = AUTO
+FLOAT32: Final = "float32"
+INT8: Final = "int8"
+DEFAULT_QUALITY: Final = "base"
 # The file of a shipped network, and the number of cube symmetries that are averaged.
 QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
 MAX_FACTOR = 16
@@ -229,8 +243,8 @@ def _choice(default: str | None, text: str, choices: Iterable[str]) -> Any:
 class Values(TypedDict, total=False):
     """What the values of a grid are: keywords of ``read_grid`` and of others that make grids."""
 
-    inside: str
-    field: str
+    inside: Inside
+    field: FieldKind
     label: int | None
     level: float | None
     scale: float | None
@@ -265,25 +279,25 @@ class ReadOptions:
         _parse_numbers((9,), "nine numbers separated by commas, row by row"),
         metavar="MATRIX",
     )
-    axes: str | None = _choice(
+    axes: AxisOrder | None = _choice(
         None,
         "Axis order of the array in a NumPy, TIFF, HDF5 or Zarr file. Default: the names "
         "of the axes in the file, else xyz for NumPy, zyx for the others. Files of other formats "
         "state it.",
-        AXES,
+        get_args(AxisOrder),
     )
-    space: str | None = _choice(
+    space: Space | None = _choice(
         None,
         "Anatomical space of the mesh, for files that state theirs, as medical images do. Default: "
         "that of the file, which .ply, .stl and .obj name in their header.",
-        SPACES,
+        get_args(Space),
     )
-    inside: str = _choice(
+    inside: Inside = _choice(
         AUTO,
         "Sign of the values inside the solid; auto takes the border of the grid as outside.",
-        INSIDE,
+        get_args(Inside),
     )
-    field: str = _choice(
+    field: FieldKind = _choice(
         AUTO,
         "What the values are: exact distances, truncated near the surface, a mask (inside or "
         "outside, or its distance transform), scaled (a field of another slope than 1), or noisy "
@@ -345,8 +359,8 @@ class ReadOptions:
 class ConvertOptions(ReadOptions):
     """The options of a conversion; see ``read_grid``, ``reconstruct`` and ``simplify_mesh``.
 
-    ``cap`` is True by default, as for the command, and unlike in ``reconstruct``. ``simplify`` is
-    an error in voxels; at most one of it, ``tolerance`` and ``triangles`` may be given.
+    ``simplify`` is an error in voxels; at most one of it, ``tolerance`` and ``triangles`` may be
+    given.
     """
 
     factor: int = _option(
@@ -369,7 +383,7 @@ class ConvertOptions(ReadOptions):
         bool,
         off="open",
     )
-    mesher: str = _choice(
+    mesher: MesherName = _choice(
         DEFAULT_MESHER,
         "Mesher: marching is marching cubes, which cuts off edges and corners; sharp also puts "
         "vertices on them; auto is sharp for distances, and marching for masks and noise.",
@@ -399,11 +413,11 @@ class ConvertOptions(ReadOptions):
         int,
         metavar="N",
     )
-    unit: str | None = _choice(
+    unit: Unit | None = _choice(
         None,
         "Unit of the world, which .3mf and .glb state, so that other programs show the true size. "
         "Default: a .3mf says millimetres, a .glb metres. Coordinates stay as they are.",
-        LENGTHS,
+        get_args(Unit),
     )
 
     def __post_init__(self) -> None:
@@ -430,17 +444,17 @@ class ConvertOptions(ReadOptions):
 class NetworkOptions:
     """Which network, and where it runs; see ``load_network``."""
 
-    quality: str = _choice(
+    quality: Quality = _choice(
         DEFAULT_QUALITY,
         "Network: fast is smaller and quicker than base; best averages base over 4 turns of the "
         "grid, and takes 4 times as long.",
-        QUALITIES,
+        get_args(Quality),
     )
-    precision: str = _choice(
+    precision: Precision = _choice(
         AUTO_PRECISION,
         "Arithmetic of the network: auto is int8 on the CPU if the network has it, otherwise "
         "float32. On the CPU int8 takes about half as long.",
-        PRECISIONS,
+        get_args(Precision),
     )
     model: str | None = _option(
         None,
@@ -448,8 +462,10 @@ class NetworkOptions:
         lambda value, name: value,
         metavar="FILE",
     )
-    device: str = _choice(
-        AUTO, "Where the network runs; auto uses CUDA if it works here, else the CPU.", DEVICES
+    device: Device = _choice(
+        AUTO,
+        "Where the network runs; auto uses CUDA if it works here, else the CPU.",
+        DEVICES,
     )
     threads: int = _option(
         0,

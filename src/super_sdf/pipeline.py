@@ -15,6 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,7 +28,7 @@ from .machine.memory import give_back
 from .mesh import Mesh, join_meshes
 from .neighbourhood import CENTRE
 from .network.decoder import Decoder, decode
-from .network.network import load_network
+from .network.network import Where, given_or_loaded
 from .progress import STEPS, Progress, StepCounter
 from .slabs.cutting import Slab
 from .slabs.preparing import Piece, Run, describe_piece, prepare
@@ -40,6 +42,9 @@ from .steps.meshers import extract_pieces
 from .steps.spheres import fit_to_spheres, spheres_of_band
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 
 def refine(
@@ -161,11 +166,13 @@ def reconstruct(
     function: Function | None = None,
     bounds: ArrayLike | None = None,
     spacing: ArrayLike | None = None,
+    quality: options.Quality | str | Path | None = None,
     offset: float = 0.0,
-    cap: bool = False,
-    mesher: str = options.DEFAULT_MESHER,
+    cap: bool = True,
+    mesher: options.MesherName = options.DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
+    **where: Unpack[Where],
 ) -> Mesh:
     """Turn a coarse grid, or a function, into a fine mesh.
 
@@ -176,16 +183,20 @@ def reconstruct(
     grid : SdfGrid, optional
         Coarse signed distances. Without a grid the function is sampled.
     network : Network, optional
-        By default the shipped network ``base``.
+        From ``load_network``, to load it once for many grids.
     function : callable or DistanceFunction, optional
         What the grid has samples of; vertices are then put where it is 0. See
         ``DistanceFunction``.
     bounds, spacing : optional
         The box and the distance of the samples, without a grid; see ``DistanceFunction.sample``.
+    quality : str or path, optional
+        Without a network: "fast", "base" (default) or "best", or an ONNX file.
+    device, precision, threads : optional
+        Without a network, where it runs: see ``load_network``.
     cap : bool
-        Close a surface that leaves the grid along the grid's border, as the command does unless it
-        gets ``--open``. By default it is left open there, so that meshes of neighbouring grids can
-        be joined. A surface leaves the grid where samples on the border are inside.
+        Close a surface that leaves the grid along the grid's border. Left open there, meshes of
+        neighbouring grids can be joined. A surface leaves the grid where samples on the border are
+        inside.
     mesher : str
         "marching" for marching cubes, which cuts off edges and corners; "sharp" also puts vertices
         on them; "auto" is "sharp" for distances and "marching" for masks and noise.
@@ -197,10 +208,15 @@ def reconstruct(
     -------
     Mesh
         In world units; closed, unless the surface leaves the grid and ``cap`` is False.
+
+    Raises
+    ------
+    OptionError
+        If there is a network, and besides what would load one.
     """
     exact = None if function is None else as_function(function)
-    grid = sampled(grid, exact, bounds, spacing)
-    network = load_network() if network is None else network
+    grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
+    network = given_or_loaded(network, quality, **where)
     pieces = reconstruct_slabs(
         grid,
         network,
@@ -225,8 +241,8 @@ def reconstruct_slabs(
     factor: int = 4,
     *,
     offset: float = 0.0,
-    cap: bool = False,
-    mesher: str = options.DEFAULT_MESHER,
+    cap: bool = True,
+    mesher: options.MesherName = options.DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
     save: Callable[[FineField], None] | None = None,
@@ -272,8 +288,8 @@ def reconstruct_planes(
     *,
     whole: BandSummary,
     offset: float = 0.0,
-    cap: bool = False,
-    mesher: str = options.DEFAULT_MESHER,
+    cap: bool = True,
+    mesher: options.MesherName = options.DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Iterator[Piece]:

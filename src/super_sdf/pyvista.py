@@ -16,13 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import pyvista
 
-from .errors import FileError, OptionError
+from .errors import FileError
 from .files.grids import grid_from_image
 from .grid.sdf_grid import SdfGrid
 from .machine.extras import check_modules, how_to_install
 from .network.decoder import Decoder
-from .network.network import load_network
-from .options import DEFAULT_MESHER, DEFAULT_QUALITY, ConvertOptions, Values
+from .options import DEFAULT_MESHER, ConvertOptions, MesherName, Quality, Values
 from .pipeline import reconstruct
 from .progress import Progress
 
@@ -72,12 +71,12 @@ class ImageAccessor:
         factor: int = 4,
         *,
         scalars: str | None = None,
-        quality: str | Path | None = None,
+        quality: Quality | str | Path | None = None,
         network: Decoder | None = None,
         residuals: bool = False,
         offset: float = 0.0,
         cap: bool = True,
-        mesher: str = DEFAULT_MESHER,
+        mesher: MesherName = DEFAULT_MESHER,
         max_memory: int | None = None,
         progress: Progress | None = None,
         **values: Unpack[Values],
@@ -113,10 +112,6 @@ class ImageAccessor:
         SuperSdfError
             As ``grid`` and ``reconstruct`` raise it; if ``quality`` and ``network`` are both given.
         """
-        if quality is not None and network is not None:
-            raise OptionError(f"quality {str(quality)!r} and a network are given: give only one")
-        if network is None:
-            network = load_network(DEFAULT_QUALITY if quality is None else quality)
         if residuals:
             check_modules("residuals=True", "report", ("igl",))
         grid = self.grid(scalars, max_memory=max_memory, **values)
@@ -124,6 +119,7 @@ class ImageAccessor:
             grid,
             network,
             factor,
+            quality=quality,
             offset=offset,
             cap=cap,
             mesher=mesher,

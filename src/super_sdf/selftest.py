@@ -23,7 +23,7 @@ from .machine.extras import EXTRAS, how_to_install, missing_modules
 from .machine.memory import free_memory
 from .network.device import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from .network.network import MASK_MODEL, NO_NETWORKS, float32_name, load_network, shipped_models
-from .options import AUTO, FLOAT32, MASK
+from .options import AUTO, FLOAT32, MASK, Device, FieldKind
 from .steps.nodes import block_offsets
 from .steps.survey import survey
 
@@ -52,24 +52,25 @@ class Ball(NamedTuple):
     allowed: float  # how far off a network may be, in voxels
 
 
-def run_checks(device: str = AUTO) -> Iterator[Finding]:
+def run_checks(device: Device = AUTO) -> Iterator[Finding]:
     """Run all checks and yield their results.
 
     Without CUDA "cuda" is a failure, and "auto" if onnxruntime was built for CUDA; "cpu" skips it.
     """
     yield check_versions()
     yield check_memory()
-    devices = ["cpu"]
+    devices: list[Device] = ["cpu"]
     if device != "cpu":
         found = find_cuda(needed=device == "cuda" or "cuda" in available_devices())
-        devices += ["cuda"] * (found.state == OK)
+        if found.state == OK:
+            devices.append("cuda")
         yield found
     if not shipped_models():
         yield Finding(FAILED, "networks", NO_NETWORKS)
     ball, mask = make_ball(), make_ball(MASK)
     for name in sorted(shipped_models(), key=lambda name: name != float32_name(name)):  # int8 last
         plain = float32_name(name)
-        some = devices if name == plain else ["cpu"]
+        some = devices if name == plain else devices[:1]
         yield from check_network(name, some, mask if plain == MASK_MODEL else ball)
     for name, modules in EXTRAS.items():
         yield check_extra(name, modules)
@@ -111,7 +112,7 @@ def find_cuda(needed: bool) -> Finding:
     return Finding(OK, "cuda", describe_gpu() or "its libraries are there")
 
 
-def make_ball(kind: str = AUTO) -> Ball:
+def make_ball(kind: FieldKind = AUTO) -> Ball:
     """Sample a ball, as a mask if so wanted."""
     values = np.linalg.norm(np.indices((SAMPLES,) * 3) - CENTRE, axis=0) - RADIUS
     band = survey(make_grid(values.astype(np.float32), spacing=1.0, origin=0.0, field=kind))
@@ -123,7 +124,7 @@ def make_ball(kind: str = AUTO) -> Ball:
     return Ball((patches, table, voxels, offsets), exact.astype(np.float32), allowed)
 
 
-def check_network(name: str, devices: list[str], ball: Ball) -> Iterator[Finding]:
+def check_network(name: str, devices: list[Device], ball: Ball) -> Iterator[Finding]:
     """Run a shipped network on the ball on each device, the CPU first."""
     reference: FloatArray | None = None
     for device in devices:
@@ -137,7 +138,7 @@ def check_network(name: str, devices: list[str], ball: Ball) -> Iterator[Finding
         reference = values if device == "cpu" else reference
 
 
-def run_network(name: str, device: str, ball: Ball) -> tuple[FloatArray, float]:
+def run_network(name: str, device: Device, ball: Ball) -> tuple[FloatArray, float]:
     """Return a network's values, (D, Q) in voxels, and microseconds per voxel of the band."""
     network = load_network(name, device=device, precision=FLOAT32)  # its own file
     network(*ball.inputs)  # the first run is slower

@@ -12,7 +12,7 @@ from ..convert import Conversion, ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.regular import check_grid_file
 from ..network.network import Network, load_network
-from ..options import AUTO_PRECISION
+from ..options import AUTO, AUTO_PRECISION, Device, Precision
 from ..progress import Progress
 from .ledger import Fingerprint, Row, fingerprint
 
@@ -23,8 +23,8 @@ class Settings:
 
     folder: Path  # of the outputs
     model: str = "base"
-    precision: str = AUTO_PRECISION
-    device: str = "auto"
+    precision: Precision = AUTO_PRECISION
+    device: Device = AUTO
     threads: int = 0  # of each worker process; 0: chosen by the number of cores
     workers: int = 0
     force: bool = False  # convert everything again; replace files that are not as a batch made them

@@ -11,7 +11,7 @@ import click
 
 from .. import __version__
 from ..errors import OptionError, SuperSdfError
-from ..options import DEVICES, FLOAT32, MESHERS
+from ..options import DEVICES, FLOAT32, MESHERS, Device
 from .common import CONTEXT, one_line_errors, print_stdout
 
 EXAMPLES = """\b
@@ -38,7 +38,7 @@ Examples:
     help="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def info_command(source: str | None, check: bool, device: str, as_json: bool) -> None:
+def info_command(source: str | None, check: bool, device: Device, as_json: bool) -> None:
     """Show versions, devices, and the shipped networks with their metadata.
 
     With GRID, show instead what that grid file states: shape, type, spacing, origin, and
@@ -80,7 +80,7 @@ def _in_words(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-def print_checks(device: str, as_json: bool) -> bool:
+def print_checks(device: Device, as_json: bool) -> bool:
     """Run the checks and print each result as it comes; return whether none failed."""
     from ..selftest import FAILED, run_checks
 

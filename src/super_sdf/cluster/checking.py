@@ -32,7 +32,7 @@ from ..machine.pool import settle_signals
 from ..machine.resources import Resources
 from ..network.device import onnxruntime_version
 from ..network.network import Fingerprint, find_model, fingerprint_of, shipped_models
-from ..options import AUTO_PRECISION
+from ..options import AUTO, AUTO_PRECISION, Device, Precision
 from .connecting import Cluster
 
 MOST_FILES = 100  # whose presence each worker checks
@@ -47,8 +47,8 @@ class Needs:
     """What the work needs of every worker; paths are absolute."""
 
     model: str  # the network: see ``load_network``
-    precision: str = AUTO_PRECISION
-    device: str = "auto"
+    precision: Precision = AUTO_PRECISION
+    device: Device = AUTO
     modules: tuple[str, ...] = ()  # beyond those that are always installed
     files: Sequence[Path] = ()  # inputs; if they are many, some of them are looked at
     folder: Path | None = None  # of the outputs; it exists

@@ -18,7 +18,7 @@ from ..grid.placement import STRAIGHT
 from ..grid.planes import InputFile, check_planes
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
-from ..options import ReadOptions, Values, check_path
+from ..options import AxisOrder, ReadOptions, Space, Values, check_path
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .numpy_files import NUMPY_READERS
 from .output import check_free, replacing
@@ -38,8 +38,8 @@ def read_grid(
     spacing: Any = None,
     origin: Any = None,
     direction: Any = None,
-    axes: str | None = None,
-    space: str | None = None,
+    axes: AxisOrder | None = None,
+    space: Space | None = None,
     max_memory: int | None = None,
     **values: Unpack[Values],
 ) -> SdfGrid:
@@ -94,8 +94,8 @@ def read_grid(
 def read_array(
     path: Any,
     given: dict[str, Any],
-    axes: str | None,
-    space: str | None,
+    axes: AxisOrder | None,
+    space: Space | None,
     max_memory: int | None,
 ) -> dict[str, Any]:
     """Return values, place (``PLACE``, unless ``given``), space and notes: see ``read_grid``."""

@@ -29,7 +29,7 @@ from ..grid.planes import in_blocks, over_planes
 from ..grid.sdf_grid import SdfGrid, negated
 from ..machine.memory import in_words
 from ..mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
-from ..options import check_path, check_space, check_unit
+from ..options import Space, Unit, check_path, check_space, check_unit
 from .mesh_writers import (
     NO_COLOURS,
     Colour,
@@ -115,8 +115,8 @@ def write_mesh(
     path: str | Path,
     *,
     force: bool = False,
-    unit: str | None = None,
-    space: str | None = None,
+    unit: Unit | None = None,
+    space: Space | None = None,
 ) -> None:
     """Write a mesh to a file, in the format of its suffix.
 

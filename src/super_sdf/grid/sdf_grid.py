@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from ..errors import GridError, OptionTypeError, seen
-from ..options import AUTO, ReadOptions
+from ..options import AUTO, FieldKind, Inside, ReadOptions
 from .census import Census, Extremes, not_finite
 from .distances import check_negative_inside, choose_spacing
 from .field import Field
@@ -228,8 +228,8 @@ def make_grid(
     spacing: ArrayLike | None = None,
     origin: ArrayLike | None = None,
     direction: ArrayLike | None = None,
-    inside: str = "auto",
-    field: str = AUTO,
+    inside: Inside = AUTO,
+    field: FieldKind = AUTO,
     label: int | None = None,
     level: float | None = None,
     scale: float | None = None,

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import DeviceError, ModelError
-from ..options import DEVICES
+from ..options import DEVICES, Device
 from .onnx import first_line, ort, run_bound, run_on_cpu
 
 CPU = "CPUExecutionProvider"
@@ -36,7 +36,7 @@ class OpenedSession:
     """An open session, where it runs, and what the user should know about the choice."""
 
     session: ort.InferenceSession
-    device: str
+    device: Device
     notes: tuple[str, ...] = ()
     failure: str = ""  # of the trial run: the file may be a network with another contract
 

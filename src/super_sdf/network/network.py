@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from ..machine.resources import cores_of_system, useful_threads
 from ..machine.system import lacks_avx2, processor_name
 from ..neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
 from ..options import (
+    AUTO,
     AUTO_PRECISION,
     DEFAULT_QUALITY,
     FLOAT32,
@@ -31,6 +32,9 @@ from ..options import (
     NOISY,
     OPTIONS,
     QUALITIES,
+    Device,
+    Precision,
+    Quality,
     check_path,
     check_threads,
 )
@@ -39,6 +43,9 @@ from .contract import EXACT_DISTANCES, INPUTS, MASKS, one_voxel, read_card
 from .decoder import Decoder
 from .device import open_session
 from .onnx import CUDA_CHUNK, LONG_RUN, Pace, Poll, ort, run_bound, run_on_cpu, work_of
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 MODELS = Path(__file__).parent.parent / "models"
 # Memory of a run, measured: of each voxel that it sees, its patch and its row of the neighbour
@@ -62,7 +69,7 @@ class Network:
 
     session: ort.InferenceSession
     card: Mapping[str, Any]  # receptive field, training factors, data, commit, accuracy
-    device: str  # "cpu" or "cuda"
+    device: Device  # "cpu" or "cuda"
     symmetries: int = 1  # of the cube, over which the values are averaged
     threads: int = 0  # of the CPU; 0 for one per core
     notes: tuple[str, ...] = ()  # what the user should know about device and threads
@@ -92,7 +99,7 @@ class Network:
         return self.card.get("receptive_field")
 
     @property
-    def precision(self) -> str:
+    def precision(self) -> Precision:
         """The arithmetic of the file: "float32" or "int8"."""
         return INT8 if self.card.get("precision") == INT8 else FLOAT32
 
@@ -237,11 +244,11 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
 
 
 def load_network(
-    model: str | Path = DEFAULT_QUALITY,
+    model: Quality | str | Path = DEFAULT_QUALITY,
     *,
-    device: str = "auto",
+    device: Device = AUTO,
     threads: int = 0,
-    precision: str = AUTO_PRECISION,
+    precision: Precision = AUTO_PRECISION,
 ) -> Network:
     """Load a network.
 
@@ -292,7 +299,27 @@ def load_network(
     return Network(*loaded, shipped=shipped, path=path)
 
 
-def _load_again(path: Path, device: str, threads: int, symmetries: int) -> Network:
+class Where(TypedDict, total=False):
+    """Keywords of ``load_network``, where a function loads one itself."""
+
+    device: Device
+    precision: Precision
+    threads: int
+
+
+def given_or_loaded(
+    network: Decoder | None, quality: Quality | str | Path | None, **where: Unpack[Where]
+) -> Decoder:
+    """Return a network, or load one if it is None; OptionError if both are asked for."""
+    if network is None:
+        return load_network(DEFAULT_QUALITY if quality is None else quality, **where)
+    asked = {"quality": quality, **where} if quality is not None else dict(where)
+    if asked:
+        raise OptionError(f"a network and {' and '.join(asked)} are given: give only one of them")
+    return network
+
+
+def _load_again(path: Path, device: Device, threads: int, symmetries: int) -> Network:
     return load_network(path, device=device, threads=threads).averaged(symmetries)
 
 
@@ -314,7 +341,9 @@ def network_for(network: Decoder, kind: str) -> Decoder:
 
 
 @lru_cache(maxsize=4)
-def _load_once(name: str, device: str, threads: int, symmetries: int, precision: str) -> Network:
+def _load_once(
+    name: str, device: Device, threads: int, symmetries: int, precision: Precision
+) -> Network:
     if name not in shipped_models():
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     loaded = load_network(name, device=device, threads=threads, precision=precision)
@@ -329,12 +358,12 @@ class Fingerprint(NamedTuple):
     """What a network computes, and where."""
 
     digest: str  # SHA-256 of its values on a small ball
-    device: str  # "cpu" or "cuda"
+    device: Device  # "cpu" or "cuda"
     processor: str
     precision: str  # "float32" or "int8"
 
 
-def fingerprint_of(model: str, precision: str, device: str) -> Fingerprint:
+def fingerprint_of(model: str, precision: Precision, device: Device) -> Fingerprint:
     """Return the fingerprint of a network, named as for ``load_network``; its errors, too."""
     network = load_network(model, precision=precision, device=device, threads=1)
     digest = hashlib.sha256(network(*small_ball()).tobytes()).hexdigest()

@@ -26,7 +26,7 @@ from ..machine import resources as limits
 from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
 from ..machine.resources import CHUNK, Resources, rows_in_chunk
 from ..network.decoder import NETWORK_BYTES
-from ..options import MARCHING, SHARP
+from ..options import MARCHING, SHARP, MesherName
 from ..steps import bounds, debris, spheres
 from ..steps.marching import LOOKUP_BYTES, lookups_at_once
 from ..steps.meshers import BY_NAME, Mesher
@@ -269,7 +269,7 @@ def slab_bytes(
     factor: int,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     threads: int = 1,
-    mesher: str = MARCHING,
+    mesher: MesherName = MARCHING,
 ) -> int:
     """Return the peak memory of the work on a ``Slab``, in bytes beyond what is held already.
 

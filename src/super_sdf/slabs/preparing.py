@@ -13,7 +13,7 @@ from ..machine.resources import Resources, allot
 from ..mesh import Mesh, vertex_type
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import network_for
-from ..options import MARCHING
+from ..options import MARCHING, MesherName
 from ..progress import StepCounter
 from ..steps.band import BandSummary
 from ..steps.field import FineField, border_is_crossed
@@ -48,7 +48,7 @@ def prepare(
     offset: float,
     max_memory: int | None,
     steps: StepCounter,
-    mesher: str = MARCHING,
+    mesher: MesherName = MARCHING,
     *,
     at_once: bool = False,
     part: tuple[tuple[int, int], BandSummary] | None = None,

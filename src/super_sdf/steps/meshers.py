@@ -14,7 +14,7 @@ from ..functions import Function, as_function
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid, check_grid
 from ..mesh import Mesh, join_meshes
-from ..options import AUTO, DEFAULT_MESHER, MARCHING, SHARP, check_cap, check_mesher
+from ..options import AUTO, DEFAULT_MESHER, MARCHING, SHARP, MesherName, check_cap, check_mesher
 from . import marching
 from .cap import check_can_close, close
 from .field import FineField
@@ -27,7 +27,7 @@ Extract = Callable[[FineField, SdfGrid, int, int], list[Mesh]]
 class Mesher:
     """A way to make triangles of a field."""
 
-    name: str  # "marching" or "sharp"
+    name: MesherName  # "marching" or "sharp"
     extract: Extract  # returns the mesh of a field's own planes, in one or more pieces
     # takes the factor; returns how many coarse planes to either side of a slab must have final
     # values, since its mesh depends on them
@@ -66,8 +66,8 @@ def extract_mesh(
     grid: SdfGrid | None = None,
     first_vertex: int = 0,
     *,
-    mesher: str = DEFAULT_MESHER,
-    cap: bool = False,
+    mesher: MesherName = DEFAULT_MESHER,
+    cap: bool = True,
     function: Function | None = None,
 ) -> Mesh:
     """Return the zero level of a field as triangles in world coordinates.
@@ -87,7 +87,8 @@ def extract_mesh(
     mesher : str
         As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
     cap : bool
-        Close a surface that leaves the grid, as in ``reconstruct``.
+        Close a surface that leaves the grid, as in ``reconstruct``. A field that was made without
+        its grid stays open.
     function : callable or DistanceFunction, optional
         What the grid has samples of; vertices are then put where it is 0, as in ``reconstruct``.
 
@@ -105,8 +106,9 @@ def extract_mesh(
     check_grid(grid)
     samples = field.spheres
     chosen = find_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
+    cap = check_cap(cap) and field.grid is not None
     check_can_close(grid, cap=cap)
-    whole = close(field, cap=check_cap(cap), beside=chosen.planes_beside(field.factor))
+    whole = close(field, cap=cap, beside=chosen.planes_beside(field.factor))
     mesh = join_meshes(extract_pieces(whole, cubic_grid(grid), first_vertex, 1, chosen))
     if function is None:
         return mesh

@@ -1,0 +1,91 @@
+"""Samples of a function on a lattice that gets finer only where its surface can be.
+
+Cells of 8^3 spacings are asked first, then their eighths. A cell is left out if even the steepest
+slope seen would not bring the values at its corners down to those of ``reach`` within it: Kalra and
+Barr, "Guaranteed ray intersections with implicit surfaces" (1989).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from itertools import combinations
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+STRIDE = 8  # spacings along the largest cells; a power of two
+STEEPER = 1.25  # than seen between samples may the function be
+CORNERS = np.indices((2, 2, 2), np.int32).reshape(3, 8).T
+
+Cells: TypeAlias = NDArray[np.int32]  # (n, 3) the lowest sample of each
+Samples: TypeAlias = NDArray[np.float32]
+At: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
+
+
+def sample_near(
+    at: At, shape: tuple[int, ...], step: NDArray[Any], reach: float
+) -> tuple[Samples, float]:
+    """Return the samples of a function near its surface, and its value at ``reach`` from there.
+
+    What was left out is infinite, with its sign.
+
+    Parameters
+    ----------
+    at : callable
+        Takes indices of samples, (n, 3), and returns the values there, (n,).
+    shape : three int
+        Samples along each axis.
+    step : array, (3,)
+        World distance between neighbouring samples along each axis.
+    reach : float
+        World distance from the surface; infinite for all samples.
+    """
+    samples = np.full(shape, np.nan, np.float32)
+    last = np.array(shape, np.int32) - 1
+    cells = (STRIDE * np.argwhere(np.ones(-(-last // STRIDE), bool))).astype(np.int32)
+    stride, steepest = STRIDE, 0.0
+    while len(cells):
+        corners = np.stack([np.minimum(cells + stride * corner, last) for corner in CORNERS])
+        _evaluate(samples, at, corners)
+        if stride == 1:
+            break
+        values = np.stack([samples[tuple(corner.T)] for corner in corners], 1)
+        steepest = max(steepest, _steepest(values, corners, step))
+        least = STEEPER * steepest * (reach + stride / 2 * float(np.linalg.norm(step)))
+        far = np.abs(values).min(1) > least  # not where a value is unknown
+        _leave_out(samples, cells[far], stride, values[far, 0])
+        stride //= 2
+        cells = (cells[~far, None] + stride * CORNERS).reshape(-1, 3)
+        cells = cells[(cells < last).all(1)]
+    return samples, steepest * reach if steepest else np.inf
+
+
+def _evaluate(samples: Samples, at: At, corners: Iterable[NDArray[Any]]) -> None:
+    """Fill in the samples at corners that are not known yet."""
+    wanted = np.zeros(samples.shape, bool)
+    for corner in corners:
+        wanted[tuple(corner.T)] = True
+    places = np.flatnonzero(wanted & np.isnan(samples))
+    indices = np.stack(np.unravel_index(places, samples.shape), 1)
+    samples.reshape(-1)[places] = at(indices)
+
+
+def _steepest(values: NDArray[Any], corners: NDArray[Any], step: NDArray[Any]) -> float:
+    """Return the largest slope between two corners, (n, 8) and (8, n, 3), of the same cell."""
+    steepest = 0.0
+    for one, other in combinations(range(8), 2):
+        length = np.linalg.norm((corners[one] - corners[other]) * step, axis=1)
+        with np.errstate(invalid="ignore"):  # between corners that were left out
+            slopes = np.abs(values[:, one] - values[:, other]) / length
+        steepest = max(steepest, float(slopes[np.isfinite(slopes)].max(initial=0)))
+    return steepest
+
+
+def _leave_out(samples: Samples, cells: Cells, stride: int, values: NDArray[Any]) -> None:
+    """Give the other samples of cells that lie far on one side of the surface that side."""
+    last, sides = np.array(samples.shape, np.int32) - 1, np.copysign(np.inf, values)
+    for offset in np.ndindex((stride + 1,) * 3):
+        places = np.minimum(cells + np.array(offset, np.int32), last)
+        new = np.isnan(samples[tuple(places.T)])
+        samples[tuple(places[new].T)] = sides[new]
