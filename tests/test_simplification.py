@@ -275,6 +275,19 @@ def test_the_command_simplifies_and_says_how_far_off(here, command):
     assert err.splitlines()[-1].endswith(" mm")
 
 
+@pytest.mark.parametrize("option, way_out", [
+    ("--simplify", "give a number of voxels; --tolerance takes world units"),
+    ("--tolerance", "give a number without a unit; it is in world units"),
+])  # fmt: skip
+def test_a_length_with_a_unit_is_refused_with_the_option_or_unit_to_give(
+    option, way_out, here, command
+):
+    code, _, err = command("upsample", "ball.npz", "a.ply", option, "0.01mm")
+    line = f"Error: Invalid value for '{option}': '0.01mm': {way_out}"
+    assert code == 2 and err.splitlines()[-1] == line
+    assert command("upsample", "ball.npz", "a.ply", "--tolerance", "0.01", *QUICK)[0] == 0
+
+
 def test_the_file_is_the_same_for_any_threads_and_slabs_and_in_the_library(here, command):
     command("upsample", "ball.npz", "two.ply", "--simplify", 0.02, "--threads", 2, *QUICK)
     network = load_network("fast", threads=1)

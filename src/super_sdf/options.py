@@ -197,6 +197,18 @@ def parse_label(text: str) -> int | str:
     return int(text) if re.fullmatch("[-+]?[0-9]{1,20}", text) else text
 
 
+def _parse_plain(way_out: str) -> Callable[[str], float]:
+    """Return what parses a number without a unit, with what to give instead of "0.01mm"."""
+
+    def parse(text: str) -> float:
+        try:
+            return float(text)
+        except ValueError:
+            raise ValueError(way_out) from None
+
+    return parse
+
+
 def parse_labels(text: str) -> str | list[int | str]:
     """Parse "all", or labels separated by commas."""
     return text if text == "all" else [parse_label(part.strip()) for part in text.split(",")]
@@ -395,14 +407,14 @@ class ConvertOptions(ReadOptions):
         "of the grid (such as 0.02), measured both ways. A closed mesh stays closed. Needs the "
         "extra simplify.",
         _number("a number greater than 0", above=0, way_out="a number greater than 0"),
-        float,
+        _parse_plain("give a number of voxels; --tolerance takes world units"),
         metavar="ERROR",
     )
     tolerance: float | None = _option(
         None,
         "Simplify as with --simplify, but within D in world units, such as millimetres.",
         _number("a number greater than 0", above=0, way_out="a number greater than 0"),
-        float,
+        _parse_plain("give a number without a unit; it is in world units"),
         metavar="D",
     )
     triangles: int | None = _option(
