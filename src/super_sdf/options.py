@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypedDict, cast
 
 from .errors import OptionError, OptionTypeError, seen
 
-AUTO = "auto"
+ALL, AUTO = "all", "auto"
 EXACT, TRUNCATED, MASK, SCALED, NOISY = "exact", "truncated", "mask", "scaled", "noisy"
 FIELDS = (AUTO, EXACT, TRUNCATED, MASK, SCALED, NOISY)
 INSIDE = (AUTO, "negative", "positive")
@@ -124,6 +124,15 @@ def check_label(label: Any, name: str = "label") -> int:
     return int(label)
 
 
+def check_labels(labels: Any, name: str = "labels") -> str | tuple[int | str, ...]:
+    """Return "all" or some labels, numbers or names; OptionError if it is neither."""
+    if isinstance(labels, str) and labels == ALL:
+        return ALL
+    if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
+        raise OptionError(f"{name} is {seen(labels)}: give all, or some labels such as 1,2,3")
+    return tuple(each if isinstance(each, str) else check_label(each, name) for each in labels)
+
+
 def check_path(path: Any, name: str) -> Path:
     """Return an argument as a path; OptionTypeError if it is neither a string nor a path."""
     if not isinstance(path, (str, PathLike)):
@@ -183,9 +192,9 @@ def parse_label(text: str) -> int | str:
     return int(text) if re.fullmatch("[-+]?[0-9]{1,20}", text) else text
 
 
-def parse_labels(text: str) -> str | list[int | str]:
+def parse_labels(text: str) -> str | tuple[int | str, ...]:
     """Parse "all", or labels separated by commas."""
-    return text if text == "all" else [parse_label(part.strip()) for part in text.split(",")]
+    return text if text == ALL else tuple(parse_label(part.strip()) for part in text.split(","))
 
 
 def parse_size(text: str) -> int:
@@ -405,6 +414,16 @@ class ConvertOptions(ReadOptions):
         "Default: a .3mf says millimetres, a .glb metres. Coordinates stay as they are.",
         LENGTHS,
     )
+    labels: str | tuple[int | str, ...] | None = _option(
+        None,
+        "Mesh all labels of a label image but 0, or those listed, each with a closed mesh; "
+        "neighbours share their walls. A .glb or .3mf holds all as parts; of other formats each "
+        "label N has its own file, NAME-N.ply. A listed label that an image lacks is left out, "
+        "with a note.",
+        check_labels,
+        parse_labels,
+        metavar="all|N,N",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -471,9 +490,12 @@ UPSAMPLE = (
     "unit",
 )
 """What ``upsample``, ``batch`` and ``view`` take, in the order of their help."""
-BATCH_LISTS = (*MESH, *GOALS, "unit")
+BATCH_LISTS = (*MESH, *GOALS, "unit", "labels")
 """What a line of a batch's list may say."""
-LABELS = ("factor", "spacing", "origin", "direction", "axes", "space", "max_memory", "unit")
+LABELS = (
+    *("labels", "factor", "spacing", "origin", "direction", "axes", "space"),
+    *("max_memory", "unit"),
+)
 """What of ``ConvertOptions`` goes with ``--labels``."""
 
 check_distance = OPTIONS["offset"].check
