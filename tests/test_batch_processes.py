@@ -1,6 +1,7 @@
 """Batches and their processes, killed, ended, short of memory: nothing is lost or left over."""
 
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -134,15 +135,23 @@ def test_without_locks_of_its_file_system_a_batch_runs_other_errors_are_named(
 
 
 @pytest.mark.parametrize(
-    ("number", "said"), [(signal.SIGHUP, "ended by SIGHUP"), (signal.SIGINT, "interrupted")]
+    ("number", "said", "options"),
+    [
+        (signal.SIGHUP, "ended by SIGHUP", ()),
+        (signal.SIGINT, "interrupted", ("--quiet",)),
+        (signal.SIGTERM, "ended by SIGTERM", ("--json",)),
+    ],
 )
-def test_a_signal_ends_batch_and_workers_in_a_line(number, said):
+def test_a_signal_ends_batch_and_workers_in_a_line(number, said, options):
     larger_grids(10)
-    process = start_batch()
+    process = start_batch(*options)
     workers = psutil.Process(process.pid).children()
     process.send_signal(number)
-    _, err = process.communicate(timeout=PATIENCE)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 128 + number
+    facts = json.loads(out) if "--json" in options else {}
+    assert not facts or err == f"Error: {facts['error']}\n"
+    assert not facts or facts["done"] + facts["failed"] == len(rows()) > 0
     assert err.startswith(f"Error: {said}: ") and err.count("\n") == 1
     assert err.endswith("of 14 are done and kept; run it again to go on\n")
     assert all_end(workers) and not list(Path("out").rglob(".*.part"))

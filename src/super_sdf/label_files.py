@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -157,9 +157,7 @@ def convert_labels(
             {**mesh.report(), "sample_volume": cell * count}
             for mesh, count in zip(meshes.values(), counts)
         ]
-        write_together(
-            files, force=force, world=world, about=about, before_rename=before_rename
-        )
+        write_together(files, force=force, world=world, about=about, before_rename=before_rename)
     return {
         **describe_place(grid),
         "labels": rows,
@@ -169,6 +167,15 @@ def convert_labels(
         ],
         "inferred": [*grid.notes, *local_origin_note(target, about)],
     }
+
+
+def with_numbers(options: ConvertOptions, names: Names | None) -> ConvertOptions:
+    """Return options with numbers in place of names of labels; OptionError if some do not go."""
+    if options.labels is None:
+        return options
+    check_options(options)
+    labels = in_order(numbers_of(options.labels, names or {}))
+    return replace(options, labels=labels if isinstance(labels, str) else tuple(labels))
 
 
 def names_of(labels: list[int], known: Names) -> Names:

@@ -140,10 +140,15 @@ report_option = click.option(
 
 
 class InterruptedCommand(BaseException):  # as KeyboardInterrupt, no error
-    """A signal ended the command: the message names the signal and what was kept."""
+    """A signal ended the command: the message names the signal and what was kept.
 
-    def __init__(self, kept: str, interrupt: KeyboardInterrupt) -> None:
-        self.exit_code = exit_code(interrupt)
+    ``facts`` are what ``--json`` prints of what was done.
+    """
+
+    def __init__(
+        self, kept: str, interrupt: KeyboardInterrupt, facts: dict[str, Any] | None = None
+    ) -> None:
+        self.exit_code, self.facts = exit_code(interrupt), facts or {}
         super().__init__(f"{describe_interrupt(self.exit_code)}{kept}")
 
 
