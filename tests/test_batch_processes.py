@@ -169,7 +169,12 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
 
     monkeypatch.setattr(Pool, "results", deaths)
     monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 2)
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    Path("out").mkdir()
+    (part := Path(f"out/.a.ply.{ended.pid}.part")).write_text("half")
     code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", 2)
+    assert not part.exists()
     reason = "the process that converted it was killed by SIGKILL, twice"
     assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n3 done, 1 failed")
     assert [job.source.name for job in seen].count("a.npy") == 2

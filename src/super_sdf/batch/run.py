@@ -121,7 +121,7 @@ class Run:
         """Put the row of a finished job into the ledger and count it."""
         row |= self.planner.record(job)
         if "labels" in row:
-            row["earlier"] = self.ledger.others(row)
+            row["beside"] = self.ledger.others(row)
         self.ledger.add(row)
         (self.batch.done if row["status"] == "ok" else self.batch.failed).append(Result(job, row))
         self.batch.work_done += expected_work(job)

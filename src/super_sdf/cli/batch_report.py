@@ -139,7 +139,7 @@ def remarks(batch: Batch) -> list[str]:
         lines.append(f"Note: {inferred} have notes on how they were read: see {report}")
     if lacking := sum(bool(row.get("missing")) for row in rows):
         lines.append(f"Note: {lacking} lack labels that were asked for: see {report}")
-    if beside := sum(bool(row.get("earlier")) for row in rows):
+    if beside := sum(bool(row.get("beside")) for row in rows):
         lines.append(f"Warning: {beside} have files of labels from other runs: see {report}")
     if warned:
         lines.append(f"Warning: {warned} are from noisy or contradictory values: see {report}")
