@@ -34,7 +34,7 @@ def start_command(*words: object) -> subprocess.Popen[str]:
     """Start the command line as a process that hears all signals."""
     arguments = [sys.executable, "-c", COMMAND, *map(str, words)]
     pipe = subprocess.PIPE
-    return subprocess.Popen(arguments, stderr=pipe, text=True, preexec_fn=hear_signals)
+    return subprocess.Popen(arguments, stdout=pipe, stderr=pipe, text=True, preexec_fn=hear_signals)
 
 
 def wait_until(condition: Callable[[], bool]) -> bool:

@@ -30,7 +30,7 @@ def test_folders_are_mirrored_failures_named_and_meshes_those_of_single_runs(run
     assert (code, out) == (1, "")
     assert err == (
         f"Failed: in/bad.npy: {CONSTANT}\n"
-        f"Note: spacing, origin or sign of 1 was inferred: see {Path('out/report.jsonl')}\n"
+        f"Note: 1 have notes on how they were read: see {Path('out/report.jsonl')}\n"
         "3 done, 1 failed; 3 meshes closed, 0 open\n"
     )
     made = {"a.ply": "a.npy", "deep/b.ply": "deep/b.npz", "deep/er/c.d.ply": "deep/er/c.d.npy"}
@@ -244,6 +244,7 @@ def test_json_is_the_summary_and_fail_fast_begins_nothing_after_a_failure(run_ba
     assert facts.pop("seconds") > 0
     assert facts == {
         **{"done": 3, "done_before": 0, "failed": 1, "not_begun": 0, "closed": 2, "open": 1},
+        "made_again": {"outputs": 0, "options": []},
         "failures": [{"in": os.path.abspath("in/bad.npy"), "out": "bad.ply", "reason": CONSTANT}],
         "report": str(Path("out/report.jsonl")),
     }
@@ -261,7 +262,7 @@ def test_what_was_noisy_is_said_once_and_of_many_failures_twenty(run_batch, comm
     np.save("in/noisy.npy", ball(12, 4.0).values + noise)
     words = ("batch", "in", "--out", "out", *PLAIN[:4], *FAST)
     report, (_, _, err) = Path("out/report.jsonl"), command(*words)
-    assert f"Note: spacing, origin or sign of 4 was inferred: see {report}\n" in err
+    assert f"Note: 4 have notes on how they were read: see {report}\n" in err
     assert f"Warning: 1 are from noisy or contradictory values: see {report}\n" in err
     assert "Note" not in command(*words)[2]
     for i in range(23):

@@ -1,6 +1,7 @@
 """Batches and their processes, killed, ended, short of memory: nothing is lost or left over."""
 
 import errno
+import json
 import os
 import signal
 import subprocess
@@ -134,15 +135,23 @@ def test_without_locks_of_its_file_system_a_batch_runs_other_errors_are_named(
 
 
 @pytest.mark.parametrize(
-    ("number", "said"), [(signal.SIGHUP, "ended by SIGHUP"), (signal.SIGINT, "interrupted")]
+    ("number", "said", "options"),
+    [
+        (signal.SIGHUP, "ended by SIGHUP", ()),
+        (signal.SIGINT, "interrupted", ("--quiet",)),
+        (signal.SIGTERM, "ended by SIGTERM", ("--json",)),
+    ],
 )
-def test_a_signal_ends_batch_and_workers_in_a_line(number, said):
+def test_a_signal_ends_batch_and_workers_in_a_line(number, said, options):
     larger_grids(10)
-    process = start_batch()
+    process = start_batch(*options)
     workers = psutil.Process(process.pid).children()
     process.send_signal(number)
-    _, err = process.communicate(timeout=PATIENCE)
+    out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 128 + number
+    facts = json.loads(out) if "--json" in options else {}
+    assert not facts or err == f"Error: {facts['error']}\n"
+    assert not facts or facts["done"] + facts["failed"] == len(rows()) > 0
     assert err.startswith(f"Error: {said}: ") and err.count("\n") == 1
     assert err.endswith("of 14 are done and kept; run it again to go on\n")
     assert all_end(workers) and not list(Path("out").rglob(".*.part"))
@@ -160,7 +169,12 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
 
     monkeypatch.setattr(Pool, "results", deaths)
     monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 2)
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    Path("out").mkdir()
+    (part := Path(f"out/.a.ply.{ended.pid}.part")).write_text("half")
     code, _, err = command("batch", "in", "--out", "out", "--quality", "fast", "--jobs", 2)
+    assert not part.exists()
     reason = "the process that converted it was killed by SIGKILL, twice"
     assert code == 1 and err.startswith(f"Failed: in/a.npy: {reason}\n3 done, 1 failed")
     assert [job.source.name for job in seen].count("a.npy") == 2

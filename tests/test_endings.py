@@ -1,6 +1,8 @@
 """How a process of the command line ends: by signals, without streams, with little of anything."""
 
+import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -34,7 +36,6 @@ def run(*arguments, shell="", **options):
     return done.returncode, done.stdout, done.stderr
 
 
-# What stands in for a long step: it says where it is, and waits for the signal.
 # What stands in for a long step: it says where it is, and waits for the signal.
 STAGE = """
 import sys, time
@@ -90,8 +91,6 @@ entry.main()
 """
 
 
-# The same in the midst of an import.
-# The same within the work, in a library that swallows whatever is raised while it is imported.
 @pytest.mark.parametrize(
     "script, number, begun, line",
     [
@@ -113,6 +112,71 @@ def test_a_signal_leaves_a_line_its_exit_code_and_no_file(script, number, begun,
     assert (process.returncode, err) == (128 + number, f"Error: {line}\n")
     assert out == ("imported\n" if script == LIBRARY else "")
     assert sorted(os.listdir()) == ["go", "in.npy"]
+
+
+@pytest.mark.parametrize(
+    ("script", "line"),
+    [(STAGE, "ended by SIGTERM; nothing was written"), (IMPORT, "ended by SIGTERM")],
+)
+def test_with_json_what_ended_it_is_json_on_stdout(script, line):
+    words = [sys.executable, "-c", script, *QUICK, "--json"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, preexec_fn=hear_signals, **pipes) as process:
+        process.stdout.readline()
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, err) == (143, f"Error: {line}\n")
+    assert json.loads(out) == {"error": line}
+
+
+def test_with_json_an_error_is_json_on_stdout(command):
+    for words, code in (
+        (["upsample", "none.npy", "out.ply"], 1),
+        (["upsample", "in.npy", "out.txt"], 2),
+        (["check", "none.ply", "in.npy"], 1),
+        (["batch", "none", "--out", "out"], 2),
+        (["upsample", "--factor", "x"], 2),
+    ):
+        found, out, err = command(*words, "--json")
+        assert found == code and err == f"Error: {json.loads(out)['error']}\n"
+
+
+TABLE = (Path(__file__).parent.parent / "docs" / "reference" / "cli.md").read_text()
+CODES = {
+    0: [QUICK, ["--help"], ["batch", "in.npy", "--out", "a", *QUICK[3:]]],
+    1: [
+        ["upsample", "none.npy", "out.ply"],
+        ["batch", "in.npy", "flat.npy", "--out", "b", *QUICK[3:]],
+        ["check", "cube.ply", "in.npy", "--max-mean", "1e-9", *QUICK[7:]],
+    ],
+    2: [["none"], ["upsample", "in.npy"], ["upsample", "in.npy", "out.ply", "--factor", "3"]],
+}
+SIGNALS = {129: signal.SIGHUP, 130: signal.SIGINT, 137: signal.SIGKILL, 143: signal.SIGTERM}
+
+
+def test_the_table_has_all_exit_codes():
+    """A reader that ended, 141, has a test of its own."""
+    rows = re.findall(r"^\| (\d+) \|", TABLE, re.MULTILINE)
+    assert list(map(int, rows)) == sorted([*CODES, *SIGNALS, 141])
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(code, words) for code, runs in CODES.items() for words in runs]
+)
+def test_what_ends_with_a_code_of_the_table(code, words, command):
+    np.save("flat.npy", np.ones((4, 4, 4)))
+    trimesh.creation.box().export("cube.ply")
+    assert command(*words)[0] == code
+
+
+@pytest.mark.parametrize(("code", "number"), SIGNALS.items())
+def test_a_signal_ends_with_its_code_of_the_table(code, number):
+    words = [sys.executable, "-c", STAGE, *QUICK]
+    with subprocess.Popen(words, preexec_fn=hear_signals, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        process.send_signal(number)
+    ended = process.returncode
+    assert code == (128 - ended if ended < 0 else ended)  # as a shell counts
 
 
 @pytest.mark.parametrize("made_of_it", [None, SuperSdfError("odd")])
@@ -150,9 +214,16 @@ def test_streams_that_are_closed_or_full_cost_no_mesh():
 
 
 @pytest.mark.parametrize(
-    ("words", "code"), [("info", 141), ("info --json", 141), ("", 141), ("upsample --help", 1)]
+    ("words", "code", "line"),
+    [
+        ("info", 141, ""),
+        ("info --json", 141, ""),
+        ("", 141, ""),
+        ("upsample --help", 1, ""),
+        ("upsample none.npy out.ply --json", 1, "Error: none.npy does not exist\n"),
+    ],
 )
-def test_a_reader_that_has_seen_enough_is_no_error(words, code):
+def test_a_reader_that_has_seen_enough_is_no_error(words, code, line):
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
@@ -162,7 +233,7 @@ def test_a_reader_that_has_seen_enough_is_no_error(words, code):
         restore_signals=False,
     )
     os.close(writer)
-    assert (done.returncode, done.stderr) == (code, b"")
+    assert (done.returncode, done.stderr.decode()) == (code, line)
 
 
 @pytest.mark.parametrize("handles", [7, 20])

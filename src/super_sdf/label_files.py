@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,10 +27,10 @@ from .files.output import check_apart, naming
 from .files.regular import files_of
 from .files.volume import PLACE
 from .label_names import LabelName, Names, in_file_name, numbers_of
-from .labels import ALL, LabelPiece, find_image, label_slabs
+from .labels import LabelPiece, find_image, in_order, label_slabs
 from .mesh import Mesh
 from .network.decoder import Decoder
-from .options import LABELS, MARCHING, OPTIONS, ConvertOptions
+from .options import ALL, LABELS, MARCHING, OPTIONS, ConvertOptions
 from .progress import Progress
 from .topology import OpenEdges, vertex_components
 
@@ -91,26 +91,29 @@ def convert_labels(
     source: str | Path,
     target: str | Path,
     network: Decoder,
-    labels: str | Sequence[int] = ALL,
     options: ConvertOptions | None = None,
     *,
     names: Names | None = None,
     force: bool = False,
     progress: Progress | None = None,
+    before_rename: Callable[[Mapping[Path, Path]], None] | None = None,
 ) -> dict[str, Any]:
     """Convert a file with a label image to closed meshes of its labels, which share their walls.
 
     A target ``.glb`` or ``.3mf`` gets all labels as its parts; of another, ``part.ply`` say, each
     label has its own file, ``part-1.ply``. ``names`` of ``read_names`` take the place of numbers in
-    ``labels``, in files and as parts, and parts have their colours. The other parameters are those
-    of ``convert``; options besides ``options.LABELS`` must have their defaults.
+    ``options.labels``, in files and as parts, and parts have their colours. Listed labels that the
+    image lacks are left out. ``before_rename`` is called with all complete files, by the paths that
+    they will have; an exception in it leaves none. The other parameters are those of ``convert``;
+    options besides ``options.LABELS`` must have their defaults.
 
     Returns
     -------
     dict
-        Shape, spacing, origin and direction of the grid, a row for each label (``labels``), and
-        ``inferred``: sentences on what was inferred. A row has the volume of the mesh beside that
-        of the label's samples, each of which counts as a box.
+        Shape, spacing, origin and direction of the grid, a row for each label (``labels``), the
+        listed labels that the image lacks (``missing``), and ``inferred``: sentences on what was
+        inferred. A row has the volume of the mesh beside that of the label's samples, each of which
+        counts as a box.
 
     Raises
     ------
@@ -124,7 +127,7 @@ def convert_labels(
     given = options.reading()
     place, bound = {name: given[name] for name in PLACE}, options.max_memory
     known = names or {}
-    wanted = numbers_of(labels, known)
+    wanted = in_order(numbers_of(options.labels or ALL, known))
     image = find_image(source, wanted, place, options.axes, bound, options.space)
     grid = image.grid
     called = names_of(image.names(), known)
@@ -154,12 +157,25 @@ def convert_labels(
             {**mesh.report(), "sample_volume": cell * count}
             for mesh, count in zip(meshes.values(), counts)
         ]
-        write_together(files, force=force, world=world, about=about)
+        write_together(files, force=force, world=world, about=about, before_rename=before_rename)
     return {
         **describe_place(grid),
         "labels": rows,
+        "missing": [
+            {"label": label, "name": entry.name}
+            for label, entry in names_of(image.missing(wanted), known).items()
+        ],
         "inferred": [*grid.notes, *local_origin_note(target, about)],
     }
+
+
+def with_numbers(options: ConvertOptions, names: Names | None) -> ConvertOptions:
+    """Return options with numbers in place of names of labels; OptionError if some do not go."""
+    if options.labels is None:
+        return options
+    check_options(options)
+    labels = in_order(numbers_of(options.labels, names or {}))
+    return replace(options, labels=labels if isinstance(labels, str) else tuple(labels))
 
 
 def names_of(labels: list[int], known: Names) -> Names:
@@ -167,6 +183,12 @@ def names_of(labels: list[int], known: Names) -> Names:
     entries = {label: known.get(label, LabelName(f"label {label}")) for label in labels}
     names = told_apart({label: entry.name for label, entry in entries.items()}, " ")
     return {label: entries[label]._replace(name=name) for label, name in names.items()}
+
+
+def missing_note(missing: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a note on the labels that an image lacks, if there are some."""
+    names = ", ".join(row["name"] for row in missing)
+    return [f"no sample has a label that was asked for: {names}"] if missing else []
 
 
 def told_apart(names: dict[int, str], mark: str) -> dict[int, str]:

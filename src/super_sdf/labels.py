@@ -34,11 +34,13 @@ from .neighbourhood import CENTRE
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import network_for
 from .options import (
+    ALL,
     MASK,
     AxisOrder,
     Space,
     check_factor,
     check_label,
+    check_labels,
     check_max_memory,
     check_network,
     check_progress,
@@ -50,7 +52,6 @@ from .steps.nodes import VoxelIndex
 from .steps.survey import Band, survey
 from .steps.walls import Labels, Part, absent_parts, extract_walls, put_together
 
-ALL = "all"
 MOST_LABELS = 1000  # more values than these are densities
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
 BAND_SHARE = 0.05  # of the time
@@ -112,6 +113,10 @@ class LabelImage:
     def names(self) -> list[int]:
         """Return the labels as whole numbers."""
         return [int(label) for label in self.labels]
+
+    def missing(self, wanted: str | list[int]) -> list[int]:
+        """Return which of the wanted labels no sample has."""
+        return [] if isinstance(wanted, str) else [n for n in wanted if n not in self.names()]
 
     def counts(self) -> list[int]:
         """Return how many samples each label has."""
@@ -199,7 +204,10 @@ def reconstruct_labels(
         If not even a plane of the image can be worked on in memory.
     """
     place = {"spacing": spacing, "origin": origin, "direction": direction}
-    image = find_image(values, labels, place, axes, max_memory)
+    wanted = in_order(labels)
+    image = find_image(values, wanted, place, axes, max_memory)
+    for label in image.missing(wanted):
+        labelled(image.samples, label)  # raises
     if network is None:
         from .network.network import load_network
 
@@ -212,14 +220,17 @@ def reconstruct_labels(
 
 def find_image(
     values: Any,
-    labels: str | Sequence[int],
+    wanted: str | list[int],
     place: dict[str, Any],
     axes: AxisOrder | None,
     max_memory: int | None,
     space: Space | None = None,
 ) -> LabelImage:
-    """Return the label image of an array or a file; ``place`` has spacing, origin and direction."""
-    wanted, notes = check_labels(labels), []
+    """Return the label image of an array or a file; ``place`` has spacing, origin and direction.
+
+    Of labels ``in_order``, those that no sample has are left out; GridError if none is left.
+    """
+    notes: list[str] = []
     if isinstance(values, (str, PathLike)):
         place = read_array(values, place, axes, space, max_memory)
         values, notes = place["values"], list(place["notes"])
@@ -260,13 +271,12 @@ def find_image(
     return LabelImage(samples, np.array(list(boxes), samples.dtype), around, grid)
 
 
-def check_labels(labels: Any) -> str | list[int]:
+def in_order(labels: Any) -> str | list[int]:
     """Return labels in ascending order, each once; "all" for all."""
-    if isinstance(labels, str) and labels == ALL:
-        return ALL
-    if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
-        raise OptionError(f"labels is {seen(labels)}: give all, or some labels such as 1,2,3")
-    chosen = sorted({check_label(label, "labels") for label in labels})
+    given = check_labels(labels)
+    if isinstance(given, str):
+        return given
+    chosen = sorted({check_label(label, "labels") for label in given})
     if not 0 < len(chosen) <= MOST_LABELS:
         raise OptionError(f"labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
     return chosen
@@ -302,9 +312,8 @@ def find_labels(samples: SampleArray, wanted: list[int] | None) -> dict[Any, NDA
                 f"the values are more than {MOST_LABELS:,} different whole numbers: choose some of "
                 "them (--labels 1,2,3) if they are labels, or a --level if they are densities"
             )
-    for label in wanted or ():
-        if label not in boxes:
-            labelled(samples, label)  # raises
+    if wanted and not boxes:
+        labelled(samples, wanted[0])  # raises
     if not boxes or (len(boxes) == 1 and not others):
         only = int(next(iter(boxes), 0))
         raise GridError(f"every sample has the label {only}: there is no surface")

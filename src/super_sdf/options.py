@@ -28,6 +28,7 @@ Quality = Literal["fast", "base", "best"]
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["auto", "float32", "int8"]
 
+ALL: Final = "all"
 AUTO: Final = "auto"
 EXACT: Final = "exact"
 TRUNCATED: Final = "truncated"
@@ -138,6 +139,15 @@ def check_label(label: Any, name: str = "label") -> int:
     return int(label)
 
 
+def check_labels(labels: Any, name: str = "labels") -> str | tuple[int | str, ...]:
+    """Return "all" or some labels, numbers or names; OptionError if it is neither."""
+    if isinstance(labels, str) and labels == ALL:
+        return ALL
+    if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
+        raise OptionError(f"{name} is {seen(labels)}: give all, or some labels such as 1,2,3")
+    return tuple(each if isinstance(each, str) else check_label(each, name) for each in labels)
+
+
 def check_path(path: Any, name: str) -> Path:
     """Return an argument as a path; OptionTypeError if it is neither a string nor a path."""
     if not isinstance(path, (str, PathLike)):
@@ -209,9 +219,9 @@ def _parse_plain(way_out: str) -> Callable[[str], float]:
     return parse
 
 
-def parse_labels(text: str) -> str | list[int | str]:
+def parse_labels(text: str) -> str | tuple[int | str, ...]:
     """Parse "all", or labels separated by commas."""
-    return text if text == "all" else [parse_label(part.strip()) for part in text.split(",")]
+    return text if text == ALL else tuple(parse_label(part.strip()) for part in text.split(","))
 
 
 def parse_size(text: str) -> int:
@@ -431,6 +441,16 @@ class ConvertOptions(ReadOptions):
         "Default: a .3mf says millimetres, a .glb metres. Coordinates stay as they are.",
         get_args(Unit),
     )
+    labels: str | tuple[int | str, ...] | None = _option(
+        None,
+        "Mesh all labels of a label image but 0, or those listed, each with a closed mesh; "
+        "neighbours share their walls. A .glb or .3mf holds all as parts; of other formats each "
+        "label N has its own file, NAME-N.ply. A listed label that an image lacks is left out, "
+        "with a note.",
+        check_labels,
+        parse_labels,
+        metavar="all|N,N",
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -499,9 +519,12 @@ UPSAMPLE = (
     "unit",
 )
 """What ``upsample``, ``batch`` and ``view`` take, in the order of their help."""
-BATCH_LISTS = (*MESH, *GOALS, "unit")
+BATCH_LISTS = (*MESH, *GOALS, "unit", "labels")
 """What a line of a batch's list may say."""
-LABELS = ("factor", "spacing", "origin", "direction", "axes", "space", "max_memory", "unit")
+LABELS = (
+    *("labels", "factor", "spacing", "origin", "direction", "axes", "space"),
+    *("max_memory", "unit"),
+)
 """What of ``ConvertOptions`` goes with ``--labels``."""
 
 check_distance = OPTIONS["offset"].check

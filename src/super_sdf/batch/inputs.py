@@ -18,6 +18,8 @@ from ..errors import FileError, OptionError
 from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import check_mesh_suffix
 from ..files.regular import is_store, reason_of
+from ..label_files import with_numbers
+from ..label_names import Names
 from ..options import ConvertOptions
 from .job import Job
 from .ledger import LOCK_NAME, NAME, STARTED_NAME
@@ -33,14 +35,17 @@ class Inputs(NamedTuple):
     unread: list[tuple[str, str]]
 
 
-def find_jobs(arguments: Sequence[str], suffix: str, options: ConvertOptions) -> Inputs:
+def find_jobs(
+    arguments: Sequence[str], suffix: str, options: ConvertOptions, names: Names | None = None
+) -> Inputs:
     """Return the jobs that the arguments name, each once: files, folders, patterns, manifests.
 
     ``suffix`` is the mesh file format, such as ".ply"; a manifest may say otherwise, and it may
-    have other options. OptionError if an argument names no grid, or if two inputs would become one
-    output; FileError if a manifest, or the only folder, cannot be read.
+    have other options. ``names`` are those of labels, in place of which jobs have numbers.
+    OptionError if an argument names no grid, if two inputs would become one output, or if an option
+    does not go with labels; FileError if a manifest, or the only folder, cannot be read.
     """
-    search = _Search(suffix, options)
+    search = _Search(suffix, with_numbers(options, names), names)
     jobs = _each_once([job for argument in arguments for job in search.expand(argument)])
     for kind, unit in {(PurePath(job.target).suffix, job.options.unit) for job in jobs}:
         check_mesh_suffix(Path(f"*{kind}"), unit)
@@ -70,8 +75,8 @@ def _each_once(jobs: Iterable[Job]) -> list[Job]:
 class _Search:
     """Expands arguments into jobs; ``unread`` lists the folders that could not be read."""
 
-    def __init__(self, suffix: str, options: ConvertOptions) -> None:
-        self.suffix, self.options = suffix, options
+    def __init__(self, suffix: str, options: ConvertOptions, names: Names | None) -> None:
+        self.suffix, self.options, self.names = suffix, options, names
         self.unread: list[tuple[str, str]] = []
 
     def expand(self, argument: str) -> list[Job]:
@@ -82,7 +87,7 @@ class _Search:
         if argument and os.path.isdir(path):
             return self._below(path, self._files_below(path), argument)
         if suffix in MANIFEST_SUFFIXES and os.path.isfile(path):
-            return read_manifest(path, self.suffix, self.options)
+            return read_manifest(path, self.suffix, self.options, self.names)
         if is_grid(path) and os.path.lexists(file := split_member(path)[0]):
             return self._below(file.parent, [path], argument)
         if glob.has_magic(argument):

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from ..convert import Conversion, ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
+from ..files.meshes import format_of
 from ..files.regular import check_grid_file
+from ..label_files import convert_labels
+from ..label_names import Names
 from ..network.network import Network, load_network
 from ..options import AUTO, AUTO_PRECISION, Device, Precision
 from ..progress import Progress
@@ -33,6 +37,7 @@ class Settings:
     check: bool = False  # against the samples; meshes without a certificate are made again
     items: Path | None = None  # the folder for what a page shows of each mesh
     cluster: str | None = None  # "local", or the address of a scheduler: where files are converted
+    names: Names | None = None  # of labels
 
     def load_network(self, threads: int) -> Network:
         """Return the network of a worker."""
@@ -45,13 +50,26 @@ class Settings:
 class Job:
     """A grid to convert: the path as it was given, the mesh below the output folder, and how.
 
-    ``replace`` says whether an existing file may be replaced; decided when the job starts.
+    ``replace`` are the existing files that may be replaced; decided when the job starts.
     """
 
     source: Path
-    target: str
+    mesh: str
     options: ConvertOptions
-    replace: bool = False
+    replace: frozenset[str] = frozenset()
+
+    @property
+    def has_label_files(self) -> bool:
+        """Whether each label has its own file, of a name that is known when it is written."""
+        return self.options.labels is not None and not format_of(self.mesh).has_scene
+
+    @property
+    def target(self) -> str:
+        """The name of the output: of the mesh, or for files of labels a pattern, ``a-*.stl``."""
+        path = PurePath(self.mesh)
+        if not self.has_label_files:
+            return self.mesh
+        return path.with_name(f"{path.stem}-*{path.suffix}").as_posix()
 
 
 class Result(NamedTuple):
@@ -74,52 +92,92 @@ def attempt(
     A mesh that has appeared since the plan is replaced by the same mesh only: it was made by a
     process that was killed before the row was written. An exception in ``progress`` ends the work.
     """
-    start, target = time.perf_counter(), settings.folder / job.target
-    content, printed = fingerprint(job.source), []
-    has_appeared = not job.replace and os.path.lexists(target)
-
-    def note(part: Path) -> None:
-        if (mesh_print := fingerprint(part)) is None:
-            raise WriteError(f"{part} cannot be read again")
-        printed.append(mesh_print)
-        if has_appeared and mesh_print["sha256"] != (fingerprint(target) or {}).get("sha256"):
-            raise WriteError(
-                f"{target} exists and is not what this batch makes: remove it or use --force"
-            )
-
+    start, content = time.perf_counter(), fingerprint(job.source)
+    convert_it = _convert if job.options.labels is None else _convert_labels
+    prints = Prints(job, settings)
     try:
         check_grid_file(job.source)
-        _make_folder(target.parent)
-        done = convert(
-            job.source,
-            target,
-            network,
-            job.options,
-            force=job.replace or has_appeared,
-            progress=progress,
-            before_rename=note,
-            keep=settings.check or settings.items is not None,
-        )
+        _make_folder((settings.folder / job.mesh).parent)
+        facts = convert_it(job, settings, network, progress, prints)
     except Exception as error:  # a bug that one file shows must not cost the others
         by_input = isinstance(error, (GridError, OptionError, FileError))
         retry = not by_input or isinstance(error, WriteError)
         row = failed_row(job, _reason(error), retry=retry, content=content)
         return {**row, "seconds": round(time.perf_counter() - start, 4)}
-    certificate = {}
-    if settings.items or settings.check:
-        certificate = {"check": _certify(job, done, printed[0], settings)}
     return {
         **_paths(job),
         "status": "ok",
         "reason": None,
         "retry": False,
         "content": content,
-        "output": printed[0],
-        **done.report(),
-        **certificate,
+        "output": prints.get(job.target, dict(prints)),
+        **facts,
         "seconds": round(time.perf_counter() - start, 4),
-        "stages": {stage: round(spent, 4) for stage, spent in done.seconds.items()},
     }
+
+
+class Prints(dict[str, Fingerprint]):
+    """Fingerprints of the files that a job writes, by their names below the output folder."""
+
+    def __init__(self, job: Job, settings: Settings) -> None:
+        self.replace, self.settings = job.replace, settings
+
+    def name(self, path: str | Path) -> str:
+        """Return the name of a file in the output folder."""
+        return Path(path).relative_to(self.settings.folder).as_posix()
+
+    def take(self, parts: Mapping[Path, Path]) -> None:
+        """Take complete files by their paths to be; WriteError if one would replace another."""
+        for path, part in parts.items():
+            if (made := fingerprint(part)) is None:
+                raise WriteError(f"{part} cannot be read again")
+            name = self.name(path)
+            is_kept = os.path.lexists(path) and not (self.settings.force or name in self.replace)
+            if is_kept and made["sha256"] != (fingerprint(path) or {}).get("sha256"):
+                raise WriteError(
+                    f"{path} exists and is not what this batch makes: remove it or use --force"
+                )
+            self[name] = made
+
+
+def _convert(
+    job: Job, settings: Settings, network: Network, progress: Progress | None, prints: Prints
+) -> Row:
+    """Convert a file; return what its row says of the mesh."""
+    target = settings.folder / job.mesh
+    done = convert(
+        job.source,
+        target,
+        network,
+        job.options,
+        force=os.path.lexists(target),
+        progress=progress,
+        before_rename=lambda part: prints.take({target: part}),
+        keep=settings.check or settings.items is not None,
+    )
+    facts = done.report()
+    if settings.items or settings.check:
+        facts["check"] = _certify(job, done, prints[job.target], settings)
+    return {**facts, "stages": {stage: round(s, 4) for stage, s in done.seconds.items()}}
+
+
+def _convert_labels(
+    job: Job, settings: Settings, network: Network, progress: Progress | None, prints: Prints
+) -> Row:
+    """Convert the labels of a file; return what its row says of their meshes."""
+    made = convert_labels(
+        job.source,
+        settings.folder / job.mesh,
+        network,
+        job.options,
+        names=settings.names,
+        force=True,  # ``prints`` decides file by file
+        progress=progress,
+        before_rename=prints.take,
+    )
+    labels = [{**row, "output": prints.name(row["output"])} for row in made["labels"]]
+    closed = all(row["closed"] for row in labels)
+    return {**made, "labels": labels, "closed": closed, "warnings": []}
 
 
 def _certify(job: Job, done: Conversion, mesh: Fingerprint, settings: Settings) -> dict[str, Any]:

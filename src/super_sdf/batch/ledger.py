@@ -38,7 +38,7 @@ Row = dict[str, Any]
 in, out : absolute path of the input; path of the output, relative to the output folder
 status, reason : "ok" and None, or "failed" and why
 retry : whether another run may succeed with the same input and options
-content, output : fingerprints of the input and of the mesh
+content, output : fingerprints of the input and of the mesh; of files of labels by their names
 version, network : of this package, and the SHA-256 of the network's file
 model, precision, asked : what was asked for, and the options of the conversion
 options : digest of all that the mesh depends on, besides the input
@@ -142,15 +142,16 @@ def folder_lock(folder: Path) -> Iterator[None]:
 class Ledger:
     """The rows of an output folder; FileError if something else has the name of its files.
 
-    ``rows`` are the last finished ones by output, ``written`` the fingerprints of the last meshes
-    that a batch wrote. This batch has ``started`` some outputs and not finished them. A killed
-    one ``left`` others: a part of a mesh, or a mesh without a row, may be there.
+    ``rows`` are the last finished ones by output, ``written`` the fingerprints of all files that
+    a batch wrote for one, as it wrote them last. This batch has ``started`` some outputs and not
+    finished them. A killed one ``left`` others: a part of a mesh, or a mesh without a row, may be
+    there.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.rows: dict[str, Row] = {}
-        self.written: dict[str, Fingerprint] = {}
+        self.written: dict[str, dict[str, Fingerprint]] = {}
         self.started, self.left = set[str](), set[str]()
         self.file, self.journal = RecordFile(folder / NAME), RecordFile(folder / STARTED_NAME)
         if os.path.exists(self.file.path):
@@ -167,6 +168,11 @@ class Ledger:
         _append(self.file, row)
         self._take(row)
 
+    def others(self, row: Row) -> list[str]:
+        """Return the files of earlier rows of an output that a new row does not have."""
+        names = self.written.get(row["out"], {}).keys() - outputs_of(row).keys()
+        return sorted(name for name in names if os.path.lexists(self.folder / name))
+
     def remove_parts(self) -> None:
         """Remove the unfinished parts of outputs whose processes have ended."""
         remove_abandoned_parts(self.folder / target for target in self.started | self.left)
@@ -180,17 +186,20 @@ class Ledger:
                 os.truncate(self.journal.path, 0)
 
     def _has_no_row(self, target: str) -> bool:
-        """Return whether the file of an output is there and is not as its row says."""
-        path, known = self.folder / target, self.written.get(target)
-        return os.path.lexists(path) and not (known and is_unchanged(path, known))
+        """Return whether a file of an output is there and is not as its row says."""
+        return any(
+            os.path.lexists(path := self.folder / name)
+            and not (known and is_unchanged(path, known))
+            for name, known in self.written.get(target, {target: None}).items()
+        )
 
     def _read_left(self) -> None:
         _check_is_regular(self.journal.path)
         with suppress(OSError):
             for name in self.journal.read():
                 # unfinished files are removed nowhere else
-                if isinstance(name, str) and ".." not in PurePath(name).parts:
-                    self.left |= set() if PurePath(name).is_absolute() else {name}
+                if isinstance(name, str) and _is_below(name):
+                    self.left.add(name)
 
     def _read(self) -> None:
         path, is_report = self.file.path, False
@@ -213,10 +222,22 @@ class Ledger:
     def _take(self, row: Row) -> None:
         target = row["out"]
         self.rows[target] = row
-        if row["status"] == "ok":
-            self.written[target] = row["output"]
+        if made := outputs_of(row):
+            self.written.setdefault(target, {}).update(made)
         if row["status"] == "ok" or not os.path.lexists(self.folder / target):
             self.started.discard(target)  # otherwise its process may have died after writing it
+
+
+def outputs_of(row: Row) -> dict[str, Fingerprint]:
+    """Return the fingerprints of the files of a row by their names; none if it failed."""
+    output = row["output"]
+    return {row["out"]: output} if _is_fingerprint(output) else output or {}
+
+
+def asked_of(row: Row) -> dict[str, Any]:
+    """Return the options of a row, none if it does not state them."""
+    asked = row.get("asked")
+    return asked if isinstance(asked, dict) else {}
 
 
 def is_row(record: Any) -> bool:
@@ -229,13 +250,25 @@ def is_row(record: Any) -> bool:
     if content is not None and not _is_fingerprint(content):
         return False
     if record["status"] == "ok":
-        return _is_fingerprint(output) and type(record.get("closed")) is bool
+        return _are_outputs(output) and type(record.get("closed")) is bool
     return record["status"] == "failed" and output is None
 
 
 def _is_fingerprint(value: Any) -> bool:
     types = {"sha256": str, "size": int, "mtime_ns": int}
     return isinstance(value, dict) and all(type(value.get(k)) is t for k, t in types.items())
+
+
+def _are_outputs(value: Any) -> bool:
+    """Return whether a value is the fingerprint of a file, or of several by their names."""
+    if _is_fingerprint(value) or not isinstance(value, dict):
+        return _is_fingerprint(value)
+    return bool(value) and all(_is_below(k) and _is_fingerprint(value[k]) for k in value)
+
+
+def _is_below(name: str) -> bool:
+    """Return whether a name is of a path below the output folder."""
+    return not PurePath(name).is_absolute() and ".." not in PurePath(name).parts
 
 
 def _check_is_regular(path: Path) -> None:

@@ -19,6 +19,8 @@ from typing import Any
 from ..errors import FileError, OptionError
 from ..files.formats import mesh_path
 from ..files.meshes import MESH_SUFFIXES
+from ..label_files import with_numbers
+from ..label_names import Names
 from ..options import BATCH_LISTS, GOALS, OPTIONS, ConvertOptions
 from .job import Job
 
@@ -27,14 +29,16 @@ USAGE = 'give an object, {"in": "a.npy"}'
 LONGEST = 240  # characters of a line or an error that a message quotes
 
 
-def read_manifest(path: Path, suffix: str, options: ConvertOptions) -> list[Job]:
+def read_manifest(
+    path: Path, suffix: str, options: ConvertOptions, names: Names | None = None
+) -> list[Job]:
     """Return a job for each line; OptionError with the number of one that is not valid."""
     jobs = []
     for number, line in _lines(path):
         where = f"{path}, line {number}"
         entry = {"in": line} if path.suffix.lower() == ".txt" else _parse(line, where)
         try:
-            jobs.append(_job(entry, path.parent, suffix, options))
+            jobs.append(_job(entry, path.parent, suffix, options, names))
         except OptionError as error:
             raise OptionError(f"{where}: {_shorten(str(error))}") from None
     if not jobs:
@@ -89,7 +93,9 @@ def _shorten(text: str) -> str:
     return text if len(text) <= LONGEST else f"{text[:half]}...{text[-half:]}"
 
 
-def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
+def _job(
+    entry: Entry, home: Path, suffix: str, options: ConvertOptions, names: Names | None
+) -> Job:
     """Return the job that a line describes."""
     source, target = entry.pop("in", None), entry.pop("out", None)
     if not isinstance(source, str) or not source:
@@ -101,7 +107,7 @@ def _job(entry: Entry, home: Path, suffix: str, options: ConvertOptions) -> Job:
     asked = {name: OPTIONS[name].check(value, repr(name)) for name, value in entry.items()}
     if asked.keys() & set(GOALS):  # one of them replaces the others
         asked = {**dict.fromkeys(GOALS), **asked}
-    chosen = replace(options, **asked)
+    chosen = with_numbers(replace(options, **asked), names)
     named = target is not None
     name = _given_target(target) if named else _target_of(source, suffix, chosen.label)
     return Job(home / source, name.as_posix(), chosen)

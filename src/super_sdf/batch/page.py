@@ -27,7 +27,7 @@ from ..pages.items import (
     remove_items,
 )
 from .job import Job
-from .ledger import Row, is_unchanged
+from .ledger import Row, asked_of, is_unchanged
 from .plan import Batch
 
 MOST_WITHIN = 5_000_000  # bytes of meshes that a page may hold itself
@@ -37,13 +37,14 @@ class BatchPage:
     """The page of a batch as it stands, at its end or interrupted.
 
     ``jobs`` are all jobs of the run, ``rows`` those of the ledger by output, also of runs with
-    other inputs.
+    other inputs. Those of labels are left out.
     """
 
     def __init__(self, path: Path, batch: Batch, jobs: Sequence[Job], rows: dict[str, Row]) -> None:
         self.path, self.batch, self.folder = path, batch, items_folder(path)
         self.jobs = {job.target: job for job in jobs}
-        self.rows = rows | {result.job.target: result.row for result in batch.failures()}
+        rows = rows | {result.job.target: result.row for result in batch.failures()}
+        self.rows = {name: row for name, row in rows.items() if asked_of(row).get("labels") is None}
         finished = {result.job.target for result in (*batch.results(), *batch.failures())}
         self.unfinished = [job for job in jobs if job.target not in finished]
 

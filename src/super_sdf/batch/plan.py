@@ -9,12 +9,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from .. import __version__
 from ..files.regular import files_of
 from ..network.network import find_model
 from .job import Job, Result, Settings, failed_row
-from .ledger import Ledger, Row, file_state, fingerprint, is_unchanged
+from .ledger import (
+    Fingerprint,
+    Ledger,
+    Row,
+    asked_of,
+    file_state,
+    fingerprint,
+    is_unchanged,
+    outputs_of,
+)
 
 
 @dataclass
@@ -27,6 +37,7 @@ class Batch:
 
     settings: Settings
     waiting: list[Job] = field(default_factory=list)  # not started yet, in their order
+    changed: dict[str, list[str]] = field(default_factory=dict)  # options of meshes made again
     done_before: list[Result] = field(default_factory=list)
     failed_before: list[Result] = field(default_factory=list)
     done: list[Result] = field(default_factory=list)
@@ -44,6 +55,11 @@ class Batch:
     def results(self) -> list[Result]:
         """Return the meshes that exist, of this run and of earlier ones."""
         return self.done_before + self.done
+
+    def made_again(self) -> dict[str, Any]:
+        """Return how many outputs are made again since options changed, and which options."""
+        options = dict.fromkeys(name for names in self.changed.values() for name in names)
+        return {"outputs": len(self.changed), "options": list(options)}
 
 
 class Planner:
@@ -66,6 +82,8 @@ class Planner:
             row = self._known(job) or self._refused(job)
             if row is None:
                 batch.waiting.append(job)
+                if names := self._changed(job):
+                    batch.changed[job.target] = names
             else:
                 before = batch.done_before if row["status"] == "ok" else batch.failed_before
                 before.append(Result(job, row))
@@ -80,7 +98,7 @@ class Planner:
         Device, threads and memory do not count: the mesh asked for is the same. If the precision
         follows the device, the network for the CPU counts.
         """
-        settings = [job.options.digest(), self.network, __version__]
+        settings = [self._asked(job), self.network, __version__]
         return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
 
     def record(self, job: Job) -> Row:
@@ -90,14 +108,35 @@ class Planner:
             "network": self.network[0],
             "model": self.settings.model,
             "precision": self.settings.precision,
-            "asked": job.options.digest(),
+            "asked": self._asked(job),
             "options": self.digest(job),
         }
 
-    def may_replace(self, job: Job) -> bool:
-        """Return whether a job may replace the existing file: if a batch made it as it is."""
-        known = self.ledger.written.get(job.target)
-        return self.settings.force or bool(known and is_unchanged(self._path(job), known))
+    def _asked(self, job: Job) -> Row:
+        """Return the options of a job; of names of labels, a hash stands for the table."""
+        asked, names = job.options.digest(), self.settings.names
+        if job.options.labels is None or not names:
+            return asked
+        return {**asked, "names": hashlib.sha256(json.dumps(names).encode()).hexdigest()}
+
+    def _changed(self, job: Job) -> list[str]:
+        """Return by which options, or what else, a mesh differs from the one that is there."""
+        row = self.ledger.rows.get(job.target, {})
+        if row.get("status") != "ok" or row["options"] == self.digest(job):
+            return []
+        now = json.loads(json.dumps(self.record(job)))  # as rows are read: without tuples
+        before, asked = asked_of(row), now["asked"]
+        names = [name for name in {**asked, **before} if asked.get(name) != before.get(name)]
+        others = ("version", "model", "precision", "network")
+        return names + [key for key in others if now[key] != row.get(key)] or ["version"]
+
+    def replaceable(self, job: Job) -> frozenset[str]:
+        """Return the existing files that a job may replace: those that are as a batch made them."""
+        known = self.ledger.written.get(job.target, {})
+        return frozenset(name for name in known if self._is_as_made(name, known[name]))
+
+    def _is_as_made(self, name: str, known: Fingerprint | None) -> bool:
+        return bool(known and is_unchanged(self.settings.folder / name, known))
 
     def _known(self, job: Job) -> Row | None:
         """Return the row of an earlier run, None if there is none that still holds."""
@@ -110,33 +149,40 @@ class Planner:
         same_path = row["in"] == os.path.abspath(job.source)
         if not is_unchanged(job.source, row["content"], same_path=same_path):
             return None
-        if is_ok and not is_unchanged(self._path(job), row["output"]):
+        if not all(self._is_as_made(name, known) for name, known in outputs_of(row).items()):
             return None
         return None if is_ok and self.settings.check and "check" not in row else row
 
     def _refused(self, job: Job) -> Row | None:
-        """Return a failed row if the output exists and may not be replaced, else None."""
-        path = self._path(job)
+        """Return a failed row if a file exists and may not be replaced, else None.
+
+        Of labels only the files of the row are known; others show when the job has made its own.
+        """
+        known = self.ledger.written.get(job.target, {})
+        row = self.ledger.rows.get(job.target)
+        names = [job.target] if not job.has_label_files else outputs_of(row) if row else []
+        for name in names:
+            if reason := self._why_not(job, name, known.get(name)):
+                return {**failed_row(job, reason), **self.record(job)}
+        return None
+
+    def _why_not(self, job: Job, name: str, known: Fingerprint | None) -> str | None:
+        """Return why a job may not write a file, None if it may."""
+        path = self.settings.folder / name
         if not os.path.lexists(path):
             return None
         if os.path.exists(path) and (read := self._inputs.get(_identity(path))):
-            reason = f"{path} is the same file as {read}: remove that link"
-        elif job.target in self.ledger.left or self.may_replace(job):
+            return f"{path} is the same file as {read}: remove that link"
+        if self.settings.force or job.target in self.ledger.left or self._is_as_made(name, known):
             return None
-        else:
-            made = job.target in self.ledger.written
-            why = "was changed after a batch made it" if made else "was not made by a batch"
-            reason = f"{path} exists and {why}: remove it or use --force"
-        return {**failed_row(job, reason), **self.record(job)}
+        why = "was changed after a batch made it" if known else "was not made by a batch"
+        return f"{path} exists and {why}: remove it or use --force"
 
     @cached_property
     def _inputs(self) -> dict[tuple[int, int], Path]:
         """The files that the jobs read, by their identity."""
         files = (file for job in self.jobs for file in files_of(job.source))
         return {_identity(file): file for file in files if file.is_file()}
-
-    def _path(self, job: Job) -> Path:
-        return self.settings.folder / job.target
 
 
 def _identity(path: Path) -> tuple[int, int]:

@@ -7,7 +7,6 @@ changes; others, such as a killed process or a full disk, are tried again.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import closing
@@ -109,7 +108,9 @@ class Run:
         """Keep the row of a job; if its worker died, try the job once more, after the others."""
         if not isinstance(result, Death):
             self._keep(job, result)
-        elif job.target in self.died:
+            return
+        self.ledger.remove_parts()
+        if job.target in self.died:
             reason = f"the process that converted it {result.cause}, twice"
             self._keep(job, failed_row(job, reason))
         else:
@@ -119,6 +120,8 @@ class Run:
     def _keep(self, job: Job, row: Row) -> None:
         """Put the row of a finished job into the ledger and count it."""
         row |= self.planner.record(job)
+        if "labels" in row:
+            row["beside"] = self.ledger.others(row)
         self.ledger.add(row)
         (self.batch.done if row["status"] == "ok" else self.batch.failed).append(Result(job, row))
         self.batch.work_done += expected_work(job)
@@ -141,8 +144,7 @@ class Queue:
         run = self.run
         job = run.batch.waiting.pop(0)
         run.ledger.start(job.target)
-        exists = os.path.lexists(run.settings.folder / job.target)
-        job = replace(job, replace=exists and run.planner.may_replace(job))
+        job = replace(job, replace=run.planner.replaceable(job))
         if self.memory is None:
             return job
         return replace(job, options=replace(job.options, max_memory=self.memory))

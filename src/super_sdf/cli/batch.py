@@ -13,19 +13,29 @@ from ..errors import SuperSdfError, WriteError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
 from ..options import MESH_FORMATS
-from .batch_report import print_plan, print_summary, progress_line, sentence
+from .batch_report import (
+    made_again_lines,
+    print_plan,
+    print_summary,
+    progress_line,
+    sentence,
+    summary,
+)
 from .common import (
     CONTEXT,
     GroupedCommand,
     InterruptedCommand,
     check_can_check,
     check_cluster,
+    check_names,
     check_option,
     check_page,
     chosen_model,
     cluster_option,
     conversion_options,
+    labels_option,
     make_options,
+    names_option,
     one_line_errors,
     print_stderr,
     report_option,
@@ -52,6 +62,7 @@ EXAMPLES = """\b
 Examples:
   super-sdf batch grids/ --out meshes/
   super-sdf batch 'scans/**/*.npz' more.txt --out meshes/ --format stl --factor 2
+  super-sdf batch cases/ --out meshes/ --format stl --labels all --names organs.ctbl
 """
 
 
@@ -81,6 +92,8 @@ Examples:
     help="Mesh file format.",
 )
 @conversion_options
+@labels_option
+@names_option
 @check_option
 @report_option
 @click.option(
@@ -116,12 +129,19 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     from ..batch.job import Settings
     from ..batch.ledger import Ledger
     from ..batch.plan import Planner
+    from ..label_files import check_options
+    from ..label_names import read_names
     from ..network.network import find_model
 
     if options["check"]:
         check_can_check()
     check_cluster(options)
-    jobs, unread = find_jobs(sources, suffix, chosen)
+    names = read_names(options["names"]) if options["names"] else None
+    jobs, unread = find_jobs(sources, suffix, chosen, names)
+    of_labels = [job.options for job in jobs if job.options.labels is not None]
+    check_names(options["names"], of_labels or None)
+    for each in of_labels:
+        check_options(each, [name for name in ("check", "report") if options[name]])
     if any(job.options.goals() for job in jobs):  # a list may say so
         check_modules("simplify", "simplify")
     items = check_batch_page(page, jobs, folder, force=options["force"]) if page else None
@@ -133,6 +153,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         model,
         workers=options["jobs"],
         items=items,
+        names=names,
         **{name: options[name] for name in taken},
     )
     if options["dry_run"]:
@@ -175,6 +196,8 @@ def complete(
     with raising_interrupts(), folder_lock(settings.folder):
         run = Run(jobs, settings)
         run.batch.unread = unread
+        for line in () if options["quiet"] else made_again_lines(run.batch):
+            print_stderr(line)
         total = len(run.batch.waiting)
         # in place of a progress line, if one is shown
         cleared = "\r\x1b[K" if sys.stderr is not None and sys.stderr.isatty() else ""
@@ -188,7 +211,7 @@ def complete(
             except SuperSdfError as fault:
                 print_stderr(f"Warning: {fault}")
             kept = f": {len(run.batch.done)} of {total} are done and kept; run it again to go on"
-            raise InterruptedCommand(kept, error) from None
+            raise InterruptedCommand(kept, error, summary(run.batch)) from None
     return run.batch
 
 

@@ -84,12 +84,22 @@ def print_plan(plan: Batch, as_json: bool) -> None:
         note(kind, _failure(result.row), result.failure())
     for path, reason in plan.unread:
         note("unread", {"in": path, "reason": reason}, f"{path} {reason}")
-    for text in [json.dumps(report, indent=2)] if as_json else lines:
+    told = {**report, "made_again": plan.made_again()}
+    for text in [json.dumps(told, indent=2)] if as_json else lines:
         print_stdout(text, "nothing was written")
+    for line in made_again_lines(plan):
+        print_stderr(line)
     counted = {
         kind: len(entries) for kind, entries in report.items() if entries or kind != "unread"
     }
     print_stderr(", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in counted.items()))
+
+
+def made_again_lines(batch: Batch) -> list[str]:
+    """Return a line that says how much is made again since options changed, if anything is."""
+    again = batch.made_again()
+    names = ", ".join(name.replace("_", "-") for name in again["options"])
+    return [f"Note: {again['outputs']} are made again, since these changed: {names}"] * bool(names)
 
 
 def _failure(row: Row) -> dict[str, Any]:
@@ -126,7 +136,11 @@ def remarks(batch: Batch) -> list[str]:
         warned += len(row["warnings"]) > others
     lines = [f"Note: {note}" for note in batch.notes]
     if inferred:
-        lines.append(f"Note: spacing, origin or sign of {inferred} was inferred: see {report}")
+        lines.append(f"Note: {inferred} have notes on how they were read: see {report}")
+    if lacking := sum(bool(row.get("missing")) for row in rows):
+        lines.append(f"Note: {lacking} lack labels that were asked for: see {report}")
+    if beside := sum(bool(row.get("beside")) for row in rows):
+        lines.append(f"Warning: {beside} have files of labels from other runs: see {report}")
     if warned:
         lines.append(f"Warning: {warned} are from noisy or contradictory values: see {report}")
     if simplified:
@@ -178,7 +192,8 @@ def sentence(batch: Batch) -> str:
 
 def summary(batch: Batch) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
-    closed = sum(bool(result.row["closed"]) for result in batch.results())
+    counts = [(len(row.get("labels", [row])), bool(row["closed"])) for _, row in batch.results()]
+    closed = sum(count for count, is_closed in counts if is_closed)
     unread = [{"in": path, "out": None, "reason": reason} for path, reason in batch.unread]
     return {
         "done": len(batch.done),
@@ -186,8 +201,9 @@ def summary(batch: Batch) -> dict[str, Any]:
         "failed": len(batch.failures()) + len(batch.unread),
         "not_begun": len(batch.waiting),
         "closed": closed,
-        "open": len(batch.results()) - closed,
+        "open": sum(count for count, _ in counts) - closed,
         "seconds": round(batch.seconds, 3),
+        "made_again": batch.made_again(),
         "failures": [*(_failure(row) for _, row in batch.failures()), *unread],
         "report": str(batch.settings.folder / "report.jsonl"),
     }

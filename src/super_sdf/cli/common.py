@@ -16,7 +16,7 @@ from click.core import ParameterSource
 
 from ..errors import OptionError, SuperSdfError, seen
 from ..machine.extras import check_modules
-from ..options import MARCHING, OPTIONS, UPSAMPLE, ConvertOptions, Option, parse_labels
+from ..options import MARCHING, OPTIONS, UPSAMPLE, ConvertOptions, Option
 from .interrupts import describe_interrupt, exit_code
 
 if TYPE_CHECKING:
@@ -115,14 +115,7 @@ check_option = click.option(
     is_flag=True,
     help="Check each mesh against its samples, as check does. Needs the extra report.",
 )
-labels_option = click.option(
-    "--labels",
-    type=Parsed(parse_labels),
-    metavar="all|N,N",
-    help="Mesh all labels of a label image but 0, or those listed, each with a closed mesh; "
-    "neighbours share their walls. OUT.glb and OUT.3mf hold all as parts; for OUT.ply and others "
-    "each label N has its own file, OUT-N.ply.",
-)
+labels_option = table_options("labels")
 names_option = click.option(
     "--names",
     type=click.Path(path_type=Path),
@@ -147,10 +140,15 @@ report_option = click.option(
 
 
 class InterruptedCommand(BaseException):  # as KeyboardInterrupt, no error
-    """A signal ended the command: the message names the signal and what was kept."""
+    """A signal ended the command: the message names the signal and what was kept.
 
-    def __init__(self, kept: str, interrupt: KeyboardInterrupt) -> None:
-        self.exit_code = exit_code(interrupt)
+    ``facts`` are what ``--json`` prints of what was done.
+    """
+
+    def __init__(
+        self, kept: str, interrupt: KeyboardInterrupt, facts: dict[str, Any] | None = None
+    ) -> None:
+        self.exit_code, self.facts = exit_code(interrupt), facts or {}
         super().__init__(f"{describe_interrupt(self.exit_code)}{kept}")
 
 
@@ -283,6 +281,12 @@ def check_cluster(options: dict[str, Any]) -> None:
     check_modules("--cluster", "cluster")
 
 
+def check_names(table: Path | None, labels: Any) -> None:
+    """Raise OptionError if a table of names was given, but no labels."""
+    if table is not None and labels is None:
+        raise OptionError(f"--names {table} is for --labels: give that, too")
+
+
 def chosen_model(options: dict[str, Any]) -> str:
     """Return the value of ``--model`` or ``--quality``; OptionError if both were given."""
     if options["model"] is None:
@@ -317,7 +321,7 @@ def load_chosen(options: dict[str, Any], meanwhile: Callable[[], None] = lambda:
 
 def make_options(options: dict[str, Any]) -> ConvertOptions:
     """Return the conversion's options, picked from all options of a command."""
-    taken = [name for name in UPSAMPLE if hasattr(ConvertOptions, name)]
+    taken = options.keys() & ConvertOptions.__dataclass_fields__.keys()
     chosen = ConvertOptions(**{name: options[name] for name in taken})
     for name in chosen.goals():
         check_modules(f"--{name}", "simplify")

@@ -42,13 +42,22 @@ def describe_interrupt(code: int) -> str:
     return "interrupted" if name == "SIGINT" else f"ended by {name}"
 
 
+def wants_json() -> bool:
+    """Return whether the command line asks for JSON; also before it is parsed."""
+    return "--json" in sys.argv[1:]
+
+
 @contextmanager
 def ending_at_once() -> Iterator[None]:
     """End the process on a signal within the block, which must not write files."""
 
     def end(number: int, frame: FrameType | None) -> None:
+        line = describe_interrupt(128 + number)
         with suppress(OSError):
-            os.write(2, f"Error: {describe_interrupt(128 + number)}\n".encode("ascii"))
+            if wants_json():
+                os.write(1, f'{{"error": "{line}"}}\n'.encode("ascii"))
+        with suppress(OSError):
+            os.write(2, f"Error: {line}\n".encode("ascii"))
         os._exit(128 + number)
 
     with _handling(end):

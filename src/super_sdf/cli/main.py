@@ -6,12 +6,16 @@ Only click is imported at the top, so that ``super-sdf --help`` is quick.
 from __future__ import annotations
 
 import difflib
+import json
 import sys
+from contextlib import suppress
+from typing import Any
 
 import click
 
 from .. import __version__
 from .common import CONTEXT, PIPE_CLOSED, InterruptedCommand, print_stderr, print_stdout
+from .interrupts import wants_json
 
 COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
 
@@ -84,17 +88,23 @@ def run() -> int:
     try:
         code = cli.main(standalone_mode=False)  # a number if a command ended early
     except click.ClickException as error:
-        print_stderr(f"Error: {error.format_message()}")
-        return error.exit_code
+        return _end(error.format_message(), error.exit_code)
     except InterruptedCommand as error:
-        print_stderr(f"Error: {error}")
-        return error.exit_code
+        return _end(str(error), error.exit_code, error.facts)
     except click.Abort:  # an interrupt outside of a command's work
-        print_stderr("Error: interrupted")
-        return 130
+        return _end("interrupted", 130)
     except OSError as error:  # outside of a command's work, while help is printed
         if isinstance(error, BrokenPipeError):
             return PIPE_CLOSED
         print_stderr(f"Error: stdout cannot be written: {error.strerror or error}")
         return 1
     return code if isinstance(code, int) else 0
+
+
+def _end(line: str, code: int, facts: dict[str, Any] | None = None) -> int:
+    """Print an error, with ``--json`` also as JSON to stdout; return the exit code."""
+    if wants_json():
+        with suppress(click.ClickException, click.exceptions.Exit):
+            print_stdout(json.dumps({**(facts or {}), "error": line}, indent=2))
+    print_stderr(f"Error: {line}")
+    return code

@@ -20,6 +20,7 @@ from .common import (
     GroupedCommand,
     check_can_check,
     check_cluster,
+    check_names,
     check_option,
     check_page,
     chosen_model,
@@ -97,9 +98,8 @@ def upsample_command(source: str, target: str, **options: Any) -> None:
     """Convert one grid to a mesh."""
     with one_line_errors(target, options["save_field"], options["report"]):
         chosen = make_options(options)
-        if options["labels"] is None and options["names"] is not None:
-            raise OptionError(f"--names {options['names']} is for --labels: give that, too")
-        if options["labels"] is None:
+        check_names(options["names"], chosen.labels)
+        if chosen.labels is None:
             Upsampling(source, target, chosen, options).complete()
         else:
             upsample_labels(source, target, chosen, options)
@@ -278,19 +278,19 @@ def upsample_labels(
     source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
 ) -> None:
     """Convert the labels of an image to meshes, and print what was made."""
-    from ..label_files import check_options, convert_labels
+    from ..label_files import check_options, convert_labels, missing_note
     from ..label_names import read_names
 
     watch, model = Stopwatch(), chosen_model(options)
     check_options(chosen, [name for name in NOT_WITH_LABELS if options[name]])
     names = read_names(options["names"]) if options["names"] else None
-    network, labels, force = load_chosen(options), options["labels"], options["force"]
+    network = load_chosen(options)
     watch.lap("load network")
     with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
         made = convert_labels(
-            *(source, target, network, labels, chosen),
+            *(source, target, network, chosen),
             names=names,
-            force=force,
+            force=options["force"],
             progress=progress,
         )
     watch.lap("convert")
@@ -307,7 +307,7 @@ def upsample_labels(
         print_stdout(json.dumps(report, indent=2), "the meshes are written")
     if options["quiet"]:
         return
-    for note in (*made["inferred"], *network.notes):
+    for note in (*made["inferred"], *missing_note(made["missing"]), *network.notes):
         print_stderr(f"Note: {note}")
     for row in made["labels"]:
         print_stderr(

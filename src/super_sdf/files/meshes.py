@@ -180,12 +180,20 @@ def write_together(
     force: bool = False,
     world: World = AS_IT_IS,
     about: Triple = WORLD_ORIGIN,
+    before_rename: Callable[[Mapping[Path, Path]], None] | None = None,
 ) -> None:
-    """Write files of meshes in pieces, by path and name: all of them, or none."""
+    """Write files of meshes in pieces, by path and name: all of them, or none.
+
+    ``before_rename`` is called with all complete files, by the paths that they will have.
+    """
+    parts: dict[Path, Path] = {}
     with ExitStack() as files:
         for path, named in meshes.items():
-            part = files.enter_context(replacing(check_target(path, force=force), force=force))
-            format_of(path).write_named(named, part, world, about)
+            target = replacing(check_target(path, force=force), force=force)
+            parts[path] = files.enter_context(target)
+            format_of(path).write_named(named, parts[path], world, about)
+        if before_rename:
+            before_rename(parts)
         for path in meshes:
             check_target(path, force=force)  # before the first of them appears
 

@@ -173,15 +173,20 @@ def _reserved_part(target: Path) -> Iterator[Path]:
 
 
 def remove_abandoned_parts(targets: Iterable[Path], pid: int | None = None) -> None:
-    """Remove unfinished parts of the targets that ended processes, or process ``pid``, left."""
+    """Remove unfinished parts of the targets that ended processes, or process ``pid``, left.
+
+    A ``*`` in the name of a target stands for anything.
+    """
     stems_in: dict[Path, set[str]] = {}
     for target in targets:
         stems_in.setdefault(target.parent, set()).add(_stem(target.name))
     for folder, stems in stems_in.items():
+        pattern = "|".join(re.escape(stem).replace(r"\*", ".*") for stem in stems)
+        is_one = re.compile(pattern, re.DOTALL).fullmatch
         with suppress(OSError):
             for name in os.listdir(folder):
                 match = PART.fullmatch(name)
-                if match and match["stem"] in stems:
+                if match and is_one(match["stem"]):
                     owner = int(match["pid"])
                     if owner == pid or _is_abandoned(folder / name, owner):
                         (folder / name).unlink(missing_ok=True)
