@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -29,6 +29,7 @@ from ..volume import Box, Request, Volume, from_affine
 Ints = NDArray[np.int64]
 Tiles = tuple[Ints, Ints, NDArray[Any], BoolArray]  # corners, edges, values, which are active
 Leaves = tuple[Ints, NDArray[np.uint8]]  # corners, masks of active voxels
+Entry = tuple[str, str, str, int]  # a grid's name, type, whose tree it shares, first byte
 
 ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
 # How the inactive values of a node are stored: the first three have one, and a mask chooses between
@@ -294,8 +295,10 @@ def read_vdb(request: Request) -> Volume:
     entries = _entries(file)
     usable = [entry for entry in entries if entry[1].removesuffix(HALF) in TYPES]
     names = [name for name, *_ in usable]
+    if request.describes and request.member is None:
+        names = names[:1]
     chosen = names.index(request.choose(names, "grid of floating-point values"))
-    _, kind, parent, place = usable[chosen]
+    name, kind, parent, place = usable[chosen]
     flags, metadata, affine, place = _read_head(file, place)
     if parent:  # whose tree it shares
         places = [place for name, _, _, place in entries if name == parent]
@@ -311,10 +314,24 @@ def read_vdb(request: Request) -> Volume:
             f"{file.name} is damaged: it has {tree.active_count:,} active voxels and states "
             f"{stated:,}"
         )
-    return _volume(file, tree, metadata, affine)
+    volume = _volume(file, tree, metadata, affine)
+    return _with_grids(volume, file, entries, name) if request.describes else volume
 
 
-def _entries(file: InputFile) -> list[tuple[str, str, str, int]]:
+def _with_grids(volume: Volume, file: InputFile, entries: list[Entry], read: str) -> Volume:
+    """Return a volume that says which grids its file holds, and which of them it is."""
+    grids = []
+    for name, kind, _, place in entries:
+        metadata = _read_metadata(_Cursor(file, place + 4))
+        kind = kind.removeprefix("Tree_").split("_")[0]
+        grids.append({"name": name, "type": kind, "class": metadata.get("class", "unknown")})
+        grids[-1]["active_voxels"] = metadata.get("file_voxel_count")
+    other = f"shape and place are those of {read!r}: give {file.name}:NAME for another grid"
+    notes = volume.notes + (other,) * (len(grids) > 1)
+    return replace(volume, about={"grids": grids}, notes=notes)
+
+
+def _entries(file: InputFile) -> list[Entry]:
     cursor = _Cursor(file)
     if file.size < 12 or cursor.number("q") != MAGIC:
         raise FileError(f"{file.name} is no .vdb file: its first bytes are not OpenVDB's")
