@@ -76,7 +76,9 @@ class VdbWriter:
             return
         if not self.active:
             raise NoSurfaceError("the field has no surface: there is no level set to write")
-        self.digest.update(repr((self.grid.spacing, self.grid.origin, self.grid.direction)).encode())
+        self.digest.update(
+            repr((self.grid.spacing, self.grid.origin, self.grid.direction)).encode()
+        )
         key, box = self.digest.digest(), (self.low, self.high)
         sides = np.stack(self.sides)
         tree = LevelSet(self.grid, self.background, sides, self._leaf, self.active, box, key)

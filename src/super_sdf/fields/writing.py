@@ -1,4 +1,4 @@
-"""Writing refined fields: sparse ``.npz``, dense ``.npy`` and ``.vti``, complete or not at all."""
+"""Writing refined fields: sparse ``.npz`` and ``.vdb``, dense ``.npy`` and ``.vti``; whole or not."""
 
 from __future__ import annotations
 
@@ -182,18 +182,19 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     field : FineField
         From ``upsample``.
     path : path
-        The file: .npz for the sparse field, which ``read_field`` reads back; .npy or .vti for the
-        whole fine lattice. docs/reference/files.md describes them.
+        The file: .npz for the sparse field, which ``read_field`` reads back; .vdb for a level set
+        of OpenVDB; .npy or .vti for the whole fine lattice. docs/reference/files.md describes them.
     force : bool
         Replace an existing file.
 
     Raises
     ------
     OptionError
-        If the suffix is unknown, or the field was made without its grid.
+        If the suffix is unknown, or the field was made without its grid; if voxels are too small
+        or too large for OpenVDB.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; if the field is one from
-        a file and the format is dense, which takes the coarse samples.
+        a file and the format is not .npz: others take the coarse samples.
     OutOfMemoryError
         If a .vti would not fit in memory.
     """

