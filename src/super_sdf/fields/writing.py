@@ -1,4 +1,4 @@
-"""Writing refined fields: sparse ``.npz`` and ``.vdb``, dense ``.npy`` and ``.vti``; whole or not."""
+"""Writing refined fields: ``.npz``, ``.vdb``, dense ``.npy`` and ``.vti``, complete or not at all."""
 
 from __future__ import annotations
 
