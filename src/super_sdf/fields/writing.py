@@ -1,4 +1,4 @@
-"""Writing refined fields: ``.npz``, ``.vdb``, dense ``.npy`` and ``.vti``, complete or not at all."""
+"""Writing refined fields: ``.npz``, ``.vdb``, ``.npy`` and ``.vti``, complete or not at all."""
 
 from __future__ import annotations
 
