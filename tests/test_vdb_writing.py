@@ -25,8 +25,8 @@ from super_sdf import (
 from super_sdf.errors import OptionError
 from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
-from super_sdf.files.readers.vdb import ACTIVE_MASK
 from super_sdf.files.vdb_writer import (
+    ACTIVE_MASK,
     INSIDE,
     MIXED,
     OUTSIDE,

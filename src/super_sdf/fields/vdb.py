@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from array import array
 from contextlib import ExitStack
-from hashlib import blake2b
 from pathlib import Path
 from typing import IO
 
@@ -23,8 +22,16 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray
 from ..errors import NoSurfaceError, OptionError
 from ..files.output import little_endian, spool_beside
-from ..files.readers.vdb import LEAF
-from ..files.vdb_writer import INSIDE, MIXED, OUTSIDE, LevelSet, Sides, leaf_bytes, write_level_set
+from ..files.vdb_writer import (
+    INSIDE,
+    LEAF,
+    MIXED,
+    OUTSIDE,
+    LevelSet,
+    Sides,
+    leaf_bytes,
+    write_level_set,
+)
 from ..grid.sdf_grid import SdfGrid
 from ..steps.field import FineField, fine_grid, own_planes
 
@@ -38,6 +45,8 @@ class VdbWriter:
     """Gathers the leaves of a level set slab by slab, and writes the file at the end."""
 
     def __init__(self, part: Path, shape: tuple[int, int, int], files: ExitStack) -> None:
+        from hashlib import blake2b  # loads OpenSSL, and few fields are written
+
         self.file: IO[bytes] = files.enter_context(part.open("wb"))
         self.leaves: IO[bytes] = files.enter_context(spool_beside(part))
         self.starts = array("q", [0])  # of the leaves, in bytes

@@ -1,4 +1,4 @@
-"""Writing OpenVDB level sets: the file, which ``readers.vdb`` describes and reads.
+"""OpenVDB files: numbers of the format, and writing a level set, as ``readers.vdb`` describes it.
 
 Of a node the active values are stored, and the signs of the others. Nothing is packed: zlib would
 take long and save about a fifth. OpenVDB 5 and later read the file.
@@ -18,8 +18,14 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, FloatArray
 from ..grid.sdf_grid import SdfGrid
 from .output import little_endian
-from .readers.vdb import ACTIVE_MASK, EDGES, LEAF, MAGIC, MASKED, MINUS_BACKGROUND
 
+MAGIC = 0x56444220
+ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
+# How the inactive values of a node are stored: the first three have one, and a mask chooses between
+# two in the next three; the last stores every value.
+MINUS_BACKGROUND, ONE_VALUE, MASKED, MASKED_ONE, MASKED_TWO, ALL = 1, 2, 3, 4, 5, 6
+EDGES = (4096, 128)  # voxels along a child of the root, and along a child of that
+LEAF = 8
 OUTSIDE, INSIDE, MIXED = 0, 1, 2  # a cube of voxels: all background, all minus that, or neither
 WIDTHS = EDGES[0] // EDGES[1], EDGES[1] // LEAF  # children along an edge of the two inner nodes
 MASK_BYTES = LEAF**3 // 8

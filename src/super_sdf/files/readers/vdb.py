@@ -24,6 +24,19 @@ from numpy.typing import NDArray
 from ...arrays import BoolArray
 from ...errors import FileError, GridError
 from ...grid.planes import InputFile
+from ..vdb_writer import (
+    ACTIVE_MASK,
+    ALL,
+    BLOSC,
+    EDGES,
+    LEAF,
+    MAGIC,
+    MASKED,
+    MASKED_ONE,
+    MASKED_TWO,
+    ONE_VALUE,
+    ZIP,
+)
 from ..volume import Box, Request, Volume, from_affine
 
 Ints = NDArray[np.int64]
@@ -31,12 +44,6 @@ Tiles = tuple[Ints, Ints, NDArray[Any], BoolArray]  # corners, edges, values, wh
 Leaves = tuple[Ints, NDArray[np.uint8]]  # corners, masks of active voxels
 Entry = tuple[str, str, str, int]  # a grid's name, type, whose tree it shares, first byte
 
-ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
-# How the inactive values of a node are stored: the first three have one, and a mask chooses between
-# two in the next three; the last stores every value.
-MINUS_BACKGROUND, ONE_VALUE, MASKED, MASKED_ONE, MASKED_TWO, ALL = 1, 2, 3, 4, 5, 6
-EDGES = (4096, 128)  # voxels along a child of the root, and along a child of that
-LEAF = 8
 PIECE = 1 << 20  # bytes read at a time
 ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(1)  # bits of a byte
 
@@ -264,7 +271,6 @@ def _put(box: NDArray[Any], values: NDArray[Any], start: Ints) -> None:
     box[there] = values[tuple(slice(a, b) for a, b in zip(low - start, high - start))]
 
 
-MAGIC = 0x56444220
 OLDEST = 222  # version of the file format, of OpenVDB 3
 MARGIN = 2  # voxels of background around the others, so that the border is outside
 TYPES: dict[str, np.dtype[Any]] = {
