@@ -1,5 +1,6 @@
 """OpenVDB files: those in ``data`` were written by OpenVDB 10.0.1, others here, byte by byte."""
 
+import json
 import re
 import struct
 import uuid
@@ -14,7 +15,7 @@ from super_sdf import read_grid
 from super_sdf.errors import FileError, GridError
 from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
-from super_sdf.files.readers.vdb import ACTIVE_MASK, ZIP
+from super_sdf.files.vdb_writer import ACTIVE_MASK, ZIP
 
 DATA = Path(__file__).parent / "data"
 
@@ -191,3 +192,28 @@ def test_a_file_that_ends_early_or_is_another_one(tmp_path):
 def test_a_grid_is_named_where_there_are_several():
     said = refusal(FileError, read_grid, DATA / "picogk.vdb:b")
     assert "has no grid of floating-point values 'b': it holds surf" in said
+
+
+def test_info_lists_the_grids_of_a_file(command):
+    """Shape and place are those of the first that can be read, or of the one that is named."""
+    listed = [
+        "grid: density, float, fog volume, 64 active voxels",
+        "grid: surface, float, level set, 619 active voxels",
+        "grid: velocity, vec3s, unknown, 8 active voxels",
+    ]
+    path = DATA / "three-grids.vdb"
+    for name, member, shape in (("density", "", "8, 8, 8"), ("surface", ":surface", "15, 15, 15")):
+        code, out, _ = command("info", f"{path}{member}")
+        lines = out.splitlines()
+        note = f"note: shape and place are those of {name!r}: give {path}:NAME for another grid"
+        assert code == 0 and f"shape: {shape}" in lines
+        assert lines[-4:] == [*listed, note]
+    code, out, _ = command("info", str(path), "--json")
+    assert json.loads(out)["grids"][1] == {
+        "name": "surface",
+        "type": "float",
+        "class": "level set",
+        "active_voxels": 619,
+    }
+    said = refusal(FileError, read_grid, path)
+    assert said.endswith(f"holds several arrays, density, surface: give {path}:density, say")

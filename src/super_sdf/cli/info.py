@@ -19,6 +19,7 @@ Examples:
   super-sdf info --check
   super-sdf info --check --device cuda
   super-sdf info scan.zarr
+  super-sdf info fire.vdb
 """
 
 
@@ -42,7 +43,7 @@ def info_command(source: str | None, check: bool, device: Device, as_json: bool)
     """Show versions, devices, and the shipped networks with their metadata.
 
     With GRID, show instead what that grid file states: shape, type, spacing, origin, and
-    how it is stored, such as the chunks of a Zarr array.
+    how it is stored, such as the chunks of a Zarr array; of an OpenVDB file, all its grids.
 
     With --check, test instead whether they work on this machine: each network is run on a ball,
     whose distances are known, on the CPU and on CUDA. What is missing is listed with the command
@@ -65,9 +66,11 @@ def print_grid(source: str, as_json: bool) -> None:
     if as_json:
         print_stdout(json.dumps(found, indent=2))
         return
-    notes = found.pop("notes", ())
+    notes, grids = found.pop("notes", ()), found.pop("grids", ())
     for key, value in found.items():
         print_stdout(f"{key}: {_in_words(value)}")
+    for grid in grids:
+        print_stdout(f"grid: {_grid_in_words(grid)}")
     for note in notes:
         print_stdout(f"note: {note}")
 
@@ -78,6 +81,14 @@ def _in_words(value: Any) -> str:
     if isinstance(value, list):
         return ", ".join(f"{x:.10g}" for x in value)
     return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _grid_in_words(grid: dict[str, Any]) -> str:
+    """Return one of the grids that a file of OpenVDB holds."""
+    words = [grid["name"] or "without a name", grid["type"], grid["class"]]
+    if grid["active_voxels"] is not None:
+        words.append(f"{grid['active_voxels']:,} active voxels")
+    return ", ".join(words)
 
 
 def print_checks(device: Device, as_json: bool) -> bool:

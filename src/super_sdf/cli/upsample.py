@@ -78,8 +78,8 @@ NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 @click.option(
     "--save-field",
     metavar="FIELD",
-    help="Also write the refined field: .npz for the values near the surface, .npy or .vti for "
-    "the whole fine lattice. A .vti needs the extra vti.",
+    help="Also write the refined field: .npz for the values near the surface, .vdb for a level set "
+    "of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti.",
 )
 @report_option
 @cluster_option

@@ -1,4 +1,4 @@
-"""Writing refined fields: sparse ``.npz``, dense ``.npy`` and ``.vti``, complete or not at all."""
+"""Writing refined fields: ``.npz``, ``.vdb``, ``.npy`` and ``.vti``, complete or not at all."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import IO, Any
 import numpy as np
 from numpy.lib import format as npy
 
-from ..arrays import FloatArray
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
 from ..files.output import check_free, free_space, little_endian, naming, replacing
 from ..grid.sdf_grid import SdfGrid
@@ -19,10 +18,10 @@ from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..steps.cap import check_all_seen
-from ..steps.field import FineField, FineLattice, fine_grid, lattice_shape
+from ..steps.field import FineField, fine_grid, lattice_shape, own_planes
 from .sparse import SparseWriter
+from .vdb import VdbWriter
 
-CHUNK = 1 << 20  # values at a time, but at least a plane
 BYTES = 4  # of a value
 Shape = tuple[int, int, int]
 
@@ -37,7 +36,7 @@ class NpyWriter:
 
     def add(self, field: FineField) -> None:
         """Write the planes of nodes of a slab."""
-        for _, planes in _own_planes(field):
+        for _, planes in own_planes(field):
             self.file.write(little_endian(planes))
 
     def finish(self) -> None:
@@ -59,7 +58,7 @@ class VtiWriter:
     def add(self, field: FineField) -> None:
         """Copy the planes of nodes of a slab."""
         self.grid = fine_grid(field)
-        for first, planes in _own_planes(field):
+        for first, planes in own_planes(field):
             self.values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
 
     def finish(self) -> None:
@@ -93,33 +92,24 @@ class VtiWriter:
             raise OSError(f"VTK says {reason!r}")
 
 
-def _own_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
-    """Yield planes of a slab and their number; one between two slabs belongs to the second."""
-    lattice, factor = FineLattice(field), field.factor
-    first, last = (factor * plane for plane in field.planes)
-    last += field.planes[1] == field.shape[0]
-    step = max(CHUNK // (lattice.shape[1] * lattice.shape[2]), 1)
-    for start in range(first, last, step):
-        yield start, lattice.read(start, min(start + step, last))
-
-
-WRITERS: dict[str, Any] = {".npz": SparseWriter, ".npy": NpyWriter, ".vti": VtiWriter}
+WRITERS: dict[str, Any] = {
+    ".npz": SparseWriter,
+    ".vdb": VdbWriter,
+    ".npy": NpyWriter,
+    ".vti": VtiWriter,
+}
 """Each takes the path, the nodes along each axis of the lattice, and what closes files at the end.
 
-A writer has the methods ``add`` and ``finish``. All but the sparse one write every node.
+A writer has the methods ``add`` and ``finish``. Those not in ``SPARSE`` write every node.
 """
 FIELD_SUFFIXES = tuple(WRITERS)
+SPARSE = (".npz", ".vdb")
 
 
 def check_field_target(path: str | Path, *, force: bool = False) -> Path:
     """Return the path if a field can be written there; called before the work starts."""
     path = check_path(path, "path")
     suffix = path.suffix.lower()
-    if suffix == ".vdb":
-        raise OptionError(
-            f"{path} cannot be written: OpenVDB's own module cannot be installed with pip; write "
-            ".npz, and convert it with that module as docs/reference/files.md shows"
-        )
     if suffix not in WRITERS:
         raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_SUFFIXES)}")
     if suffix == ".vti":
@@ -130,7 +120,7 @@ def check_field_target(path: str | Path, *, force: bool = False) -> Path:
 def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) -> None:
     """Raise an error if a dense file of a lattice does not fit on the disk, or .vti in memory."""
     suffix = path.suffix.lower()
-    if suffix == ".npz":
+    if suffix in SPARSE:
         return
     size = BYTES * prod(shape)
     what = f"{' x '.join(map(str, shape))} values take {in_words(size)}"
@@ -192,18 +182,19 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     field : FineField
         From ``upsample``.
     path : path
-        The file: .npz for the sparse field, which ``read_field`` reads back; .npy or .vti for the
-        whole fine lattice. docs/reference/files.md describes them.
+        The file: .npz for the sparse field, which ``read_field`` reads back; .vdb for a level set
+        of OpenVDB; .npy or .vti for the whole fine lattice. docs/reference/files.md describes them.
     force : bool
         Replace an existing file.
 
     Raises
     ------
     OptionError
-        If the suffix is unknown, or the field was made without its grid.
+        If the suffix is unknown, or the field was made without its grid; if voxels are too small
+        or too large for OpenVDB.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; if the field is one from
-        a file and the format is dense, which takes the coarse samples.
+        a file and the format is not .npz: others take the coarse samples.
     OutOfMemoryError
         If a .vti would not fit in memory.
     """

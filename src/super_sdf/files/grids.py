@@ -115,18 +115,24 @@ def read_array(
 
 @contextmanager
 def open_volume(
-    path: Path, format_: GridFormat, axes: str, memory: tuple[int, int | None]
+    path: Path,
+    format_: GridFormat,
+    axes: str,
+    memory: tuple[int, int | None],
+    *,
+    describes: bool = False,
 ) -> Iterator[Volume]:
     """Yield the volume in a file; whatever its library raises is an error of one line.
 
-    ``memory`` is how many bytes the unpacked array may take, and the process in all.
+    ``memory`` is how many bytes the unpacked array may take, and the process in all. ``describes``
+    says that no sample will be read.
     """
     file, member = split_member(path)
     check_grid_file(path)
     check_library(format_)
     watched = None if file.is_dir() else InputFile.open(file)
     with one_line_errors(path, format_, watched), ExitStack() as files:
-        request = Request(file, member, axes, *memory, files)
+        request = Request(file, member, axes, *memory, files, describes)
         if format_.is_apart:
             from .apart import volume_apart  # loads what talks to other processes
 
@@ -228,7 +234,8 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     """
     path = check_path(path, "path")
     format_ = find_format(path)
-    with open_volume(path, format_, choose_axes(format_, None), (0, None)) as volume:
+    order = choose_axes(format_, None)
+    with open_volume(path, format_, order, (0, None), describes=True) as volume:
         if len(volume.shape) != 3:
             raise FileError(f"its array has shape {volume.shape}: give three axes")
         placement = find_placement(volume, str(path))

@@ -48,6 +48,7 @@ class Request:
     room: int  # bytes of memory that the unpacked array may take
     left: int | None  # bytes that the process may still take; None if unknown
     files: ExitStack  # closes what the reader opens, once the volume is copied
+    describes: bool = False  # no sample will be read: the file is described
 
     def check_loads(self, size: int, library: str) -> None:
         """Raise OutOfMemoryError if an array that is loaded whole would not fit in memory."""

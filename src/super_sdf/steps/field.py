@@ -7,6 +7,7 @@ the outermost ones), with the sign of the sample whose voxel the node lies in.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,6 +32,8 @@ from .nodes import (
     part_of_node,
     part_sizes,
 )
+
+CHUNK = 1 << 20  # values of the lattice at a time, but at least a plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,6 +306,16 @@ class FineLattice(SamplePlanes):
             here = np.flatnonzero((plane >= 0) & (plane < len(planes)))
             corner = (plane[here] * ny + at[here, 1]) * nz + at[here, 2]
             flat[corner + face[:, None]] = values[:, here]
+
+
+def own_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
+    """Yield planes of a slab and their number; one between two slabs belongs to the second."""
+    lattice, factor = FineLattice(field), field.factor
+    first, last = (factor * plane for plane in field.planes)
+    last += field.planes[1] == field.shape[0]
+    step = max(CHUNK // (lattice.shape[1] * lattice.shape[2]), 1)
+    for start in range(first, last, step):
+        yield start, lattice.read(start, min(start + step, last))
 
 
 def _places_of_nodes(

@@ -14,7 +14,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -24,18 +24,26 @@ from numpy.typing import NDArray
 from ...arrays import BoolArray
 from ...errors import FileError, GridError
 from ...grid.planes import InputFile
+from ..vdb_writer import (
+    ACTIVE_MASK,
+    ALL,
+    BLOSC,
+    EDGES,
+    LEAF,
+    MAGIC,
+    MASKED,
+    MASKED_ONE,
+    MASKED_TWO,
+    ONE_VALUE,
+    ZIP,
+)
 from ..volume import Box, Request, Volume, from_affine
 
 Ints = NDArray[np.int64]
 Tiles = tuple[Ints, Ints, NDArray[Any], BoolArray]  # corners, edges, values, which are active
 Leaves = tuple[Ints, NDArray[np.uint8]]  # corners, masks of active voxels
+Entry = tuple[str, str, str, int]  # a grid's name, type, whose tree it shares, first byte
 
-ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
-# How the inactive values of a node are stored: the first three have one, and a mask chooses between
-# two in the next three; the last stores every value.
-MINUS_BACKGROUND, ONE_VALUE, MASKED, MASKED_ONE, MASKED_TWO, ALL = 1, 2, 3, 4, 5, 6
-EDGES = (4096, 128)  # voxels along a child of the root, and along a child of that
-LEAF = 8
 PIECE = 1 << 20  # bytes read at a time
 ONES = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(1)  # bits of a byte
 
@@ -263,7 +271,6 @@ def _put(box: NDArray[Any], values: NDArray[Any], start: Ints) -> None:
     box[there] = values[tuple(slice(a, b) for a, b in zip(low - start, high - start))]
 
 
-MAGIC = 0x56444220
 OLDEST = 222  # version of the file format, of OpenVDB 3
 MARGIN = 2  # voxels of background around the others, so that the border is outside
 TYPES: dict[str, np.dtype[Any]] = {
@@ -294,8 +301,10 @@ def read_vdb(request: Request) -> Volume:
     entries = _entries(file)
     usable = [entry for entry in entries if entry[1].removesuffix(HALF) in TYPES]
     names = [name for name, *_ in usable]
+    if request.describes and request.member is None:
+        names = names[:1]
     chosen = names.index(request.choose(names, "grid of floating-point values"))
-    _, kind, parent, place = usable[chosen]
+    name, kind, parent, place = usable[chosen]
     flags, metadata, affine, place = _read_head(file, place)
     if parent:  # whose tree it shares
         places = [place for name, _, _, place in entries if name == parent]
@@ -311,10 +320,24 @@ def read_vdb(request: Request) -> Volume:
             f"{file.name} is damaged: it has {tree.active_count:,} active voxels and states "
             f"{stated:,}"
         )
-    return _volume(file, tree, metadata, affine)
+    volume = _volume(file, tree, metadata, affine)
+    return _with_grids(volume, file, entries, name) if request.describes else volume
 
 
-def _entries(file: InputFile) -> list[tuple[str, str, str, int]]:
+def _with_grids(volume: Volume, file: InputFile, entries: list[Entry], read: str) -> Volume:
+    """Return a volume that says which grids its file holds, and which of them it is."""
+    grids = []
+    for name, kind, _, place in entries:
+        metadata = _read_metadata(_Cursor(file, place + 4))
+        kind = kind.removeprefix("Tree_").split("_")[0]
+        grids.append({"name": name, "type": kind, "class": metadata.get("class", "unknown")})
+        grids[-1]["active_voxels"] = metadata.get("file_voxel_count")
+    other = f"shape and place are those of {read!r}: give {file.name}:NAME for another grid"
+    notes = volume.notes + (other,) * (len(grids) > 1)
+    return replace(volume, about={"grids": grids}, notes=notes)
+
+
+def _entries(file: InputFile) -> list[Entry]:
     cursor = _Cursor(file)
     if file.size < 12 or cursor.number("q") != MAGIC:
         raise FileError(f"{file.name} is no .vdb file: its first bytes are not OpenVDB's")
