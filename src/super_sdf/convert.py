@@ -237,6 +237,10 @@ def convert_grid(
     check_can_close(grid, cap=options.cap)
     check_apart(target, files_of(source))
     check_target(target, force=force, unit=options.unit)
+    if options.keep_volume:
+        from .volumes import check_has_volume, keep_volumes, volume_of_samples
+
+        check_has_volume(grid, cap=options.cap)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, options.factor)
     expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
@@ -251,6 +255,9 @@ def convert_grid(
     tally, simplified = Tally(options.cap), None
     shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
     meshes = tally.count(make(expected, shown), watch)
+    if options.keep_volume:
+        volumes = [volume_of_samples(grid)]
+        meshes = tally.instead(*keep_volumes([join_meshes(list(meshes))], volumes, grid.voxel_size))
     if options.goals():
         simplified = simplify_mesh(
             join_meshes(list(meshes)),
@@ -259,8 +266,7 @@ def convert_grid(
             max_memory=options.max_memory,
             progress=share_of(part_of(progress, SHARE_BEFORE, 1)),
         )
-        meshes = iter([simplified.mesh])
-        tally.replace(simplified.mesh)
+        meshes = tally.instead(simplified.mesh)
         watch.lap("simplify")
     meshes = keeper.copies(meshes) if keeper else meshes
     write_pieces(
@@ -354,11 +360,12 @@ class Tally:
         if self.last and self.is_open and (self.cap or not self.is_cut):
             raise torn(len(self.edges), "in", self.last)
 
-    def replace(self, mesh: Mesh) -> None:
-        """Count another mesh instead of what was written; the open edges stay."""
+    def instead(self, mesh: Mesh) -> Iterator[Mesh]:
+        """Count another mesh instead of those so far, and return it; the open edges stay."""
         self.counts["vertices"], self.counts["triangles"] = len(mesh.vertices), len(mesh.faces)
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self._extend_box(mesh.vertices)
+        return iter([mesh])
 
     def _count_edges(self, piece: Piece) -> None:
         """Count the edges of a piece; MeshError if edges before it stay open."""

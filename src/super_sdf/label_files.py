@@ -6,6 +6,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from os import SEEK_END
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,11 +29,12 @@ from .files.regular import files_of
 from .files.volume import PLACE
 from .label_names import LabelName, Names, in_file_name, numbers_of
 from .labels import LabelPiece, find_image, in_order, label_slabs
-from .mesh import Mesh
+from .mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import ALL, LABELS, MARCHING, OPTIONS, ConvertOptions
 from .progress import Progress
 from .topology import OpenEdges, vertex_components
+from .volumes import keep_volumes
 
 MOST_FILES = 500  # each is held open until all are complete
 
@@ -52,11 +54,20 @@ class LabelMesh:
 
     def add(self, piece: LabelPiece) -> None:
         """Add a piece of the mesh."""
-        vertices, faces = piece.mesh.vertices, piece.mesh.faces
-        self.places.append((self.waiting.tell(), len(vertices), len(faces)))
-        self.waiting.write(vertices.tobytes() + faces.tobytes())
-        self.edges.add(faces)
-        self.volume, self.dtype = self.volume + piece.volume, vertices.dtype
+        self._put(piece.mesh)
+        self.edges.add(piece.mesh.faces)
+        self.volume += piece.volume
+
+    def replace(self, mesh: Mesh) -> None:
+        """Take a mesh with other vertices instead of the pieces so far."""
+        self.places, self.volume = [], mesh.volume()
+        self._put(mesh)
+
+    def _put(self, mesh: Mesh) -> None:
+        start = self.waiting.seek(0, SEEK_END)
+        self.places.append((start, len(mesh.vertices), len(mesh.faces)))
+        self.waiting.write(mesh.vertices.tobytes() + mesh.faces.tobytes())
+        self.dtype = mesh.vertices.dtype
 
     def pieces(self) -> Iterator[Mesh]:
         """Yield the mesh piece by piece."""
@@ -145,6 +156,12 @@ def convert_labels(
         slabs = label_slabs(image, network, options.factor, max_memory=bound, progress=progress)
         for piece in slabs:
             meshes[piece.label].add(piece)
+        volumes = image.volumes()
+        if options.keep_volume:
+            whole = [join_meshes(list(mesh.pieces())) for mesh in meshes.values()]
+            moved = keep_volumes(whole, volumes, grid.voxel_size)
+            for mesh, instead in zip(meshes.values(), moved):
+                mesh.replace(instead)
         torn = [label for label, mesh in meshes.items() if len(mesh.edges)]
         if torn:
             raise MeshError(f"the mesh of label {torn[0]} is torn: run it again, and report it")
@@ -152,10 +169,9 @@ def convert_labels(
         files: dict[Path, dict[str, Iterator[Mesh]]] = {path: {} for path in paths}
         for mesh in meshes.values():
             files[mesh.path][mesh.name] = mesh.pieces()
-        cell, counts = float(np.prod(grid.spacing)), image.counts()
         rows = [
-            {**mesh.report(), "sample_volume": cell * count}
-            for mesh, count in zip(meshes.values(), counts)
+            {**mesh.report(), "sample_volume": volume}
+            for mesh, volume in zip(meshes.values(), volumes)
         ]
         write_together(files, force=force, world=world, about=about, before_rename=before_rename)
     return {

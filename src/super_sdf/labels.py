@@ -36,6 +36,7 @@ from .network.network import network_for
 from .options import (
     ALL,
     MASK,
+    OPTIONS,
     AxisOrder,
     Space,
     check_factor,
@@ -51,6 +52,7 @@ from .slabs.cutting import Slab, equal_parts, slab_bytes, slab_of
 from .steps.nodes import VoxelIndex
 from .steps.survey import Band, survey
 from .steps.walls import Labels, Part, absent_parts, extract_walls, put_together
+from .volumes import keep_volumes
 
 MOST_LABELS = 1000  # more values than these are densities
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
@@ -126,6 +128,10 @@ class LabelImage:
             for part, label in zip(parts, self.labels)
         ]
 
+    def volumes(self) -> list[float]:
+        """Return the volume of each label's samples, each of which counts as a box."""
+        return [count * float(np.prod(self.grid.spacing)) for count in self.counts()]
+
     def border(self, planes: tuple[int, int]) -> IntArray:
         """Return indices of border samples in some planes and the number of their mask, (b, 4)."""
         parts = [np.empty((0, 4), np.int64)]
@@ -161,6 +167,7 @@ def reconstruct_labels(
     origin: Any = None,
     direction: Any = None,
     axes: AxisOrder | None = None,
+    keep_volume: bool = False,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, Mesh]:
@@ -183,6 +190,9 @@ def reconstruct_labels(
         Where the samples lie in the world, as in ``make_grid``; by default as the file says.
     axes : {"xyz", "zyx"}, optional
         The axis order of a file that does not state it.
+    keep_volume : bool
+        Move each surface along its normals until the volume is that of the samples, see
+        ``keep_volumes``.
     max_memory : int, optional
         Bytes that the process may hold in all, besides the meshes; by default a share of the free
         memory.
@@ -215,7 +225,10 @@ def reconstruct_labels(
     found: dict[int, list[Mesh]] = {label: [] for label in image.names()}
     for piece in label_slabs(image, network, factor, max_memory=max_memory, progress=progress):
         found[piece.label].append(piece.mesh)
-    return {label: join_meshes(pieces) for label, pieces in found.items()}
+    meshes = [join_meshes(pieces) for pieces in found.values()]
+    if OPTIONS["keep_volume"].check(keep_volume):
+        meshes = keep_volumes(meshes, image.volumes(), image.grid.voxel_size)
+    return dict(zip(found, meshes))
 
 
 def find_image(

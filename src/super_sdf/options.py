@@ -441,6 +441,13 @@ class ConvertOptions(ReadOptions):
         "Default: a .3mf says millimetres, a .glb metres. Coordinates stay as they are.",
         get_args(Unit),
     )
+    keep_volume: bool = _option(
+        False,
+        "For masks and labels: move each surface along its normals, by a small part of a voxel, "
+        "until the volume of the mesh is that of its samples, each of which counts as a box.",
+        _flag,
+        bool,
+    )
     labels: str | tuple[int | str, ...] | None = _option(
         None,
         "Mesh all labels of a label image but 0, or those listed, each with a closed mesh; "
@@ -516,14 +523,15 @@ MESH = ("factor", *GRID, "offset", "cap", "mesher")
 UPSAMPLE = (
     *(*MESH, "quality", "precision", "model", "device", "max_memory", "threads"),
     *GOALS,
+    "keep_volume",
     "unit",
 )
 """What ``upsample``, ``batch`` and ``view`` take, in the order of their help."""
-BATCH_LISTS = (*MESH, *GOALS, "unit", "labels")
+BATCH_LISTS = (*MESH, *GOALS, "keep_volume", "unit", "labels")
 """What a line of a batch's list may say."""
 LABELS = (
     *("labels", "factor", "spacing", "origin", "direction", "axes", "space"),
-    *("max_memory", "unit"),
+    *("max_memory", "keep_volume", "unit"),
 )
 """What of ``ConvertOptions`` goes with ``--labels``."""
 

@@ -23,7 +23,6 @@ from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
-from ..grid.planes import in_blocks
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words, memory_bound
 from ..machine.resources import allot, useful_threads
@@ -31,6 +30,7 @@ from ..mesh import Mesh
 from ..options import LENGTHS, MASK, ConvertOptions, check_distance, check_max_memory
 from ..steps.survey import Band, no_surface, survey
 from ..truth.mesh_files import merged, read_mesh
+from ..volumes import volume_of_samples
 from .search import search
 from .surface import Surface, examine_surface
 from .touching import (
@@ -271,15 +271,6 @@ def check_kept(
         strays = find_strays(mesh.vertices, grid, band, offset, slack)
     volume = volume_of_samples(kept.grid, offset) if is_mask else None
     return Certificate(mesh, grid, surface, touching, strays, volume)
-
-
-def volume_of_samples(grid: SdfGrid, offset: float) -> float:
-    """Return the volume of the samples inside, each of which counts as a box."""
-    inside = sum(
-        int(np.count_nonzero(grid.planes(first, last) <= offset))
-        for first, last in in_blocks(grid.samples)
-    )
-    return inside * float(np.prod(grid.spacing))
 
 
 def band_of(kept: Kept, options: ConvertOptions) -> Band:

@@ -34,7 +34,17 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 GROUPS = {
     "The grid": ("spacing", "origin", "direction", "axes", "space"),
     "Its values": ("inside", "field", "label", "labels", "names", "level", "scale"),
-    "The mesh": ("factor", "offset", "cap", "mesher", "simplify", "tolerance", "triangles", "unit"),
+    "The mesh": (
+        "factor",
+        "offset",
+        "cap",
+        "mesher",
+        "simplify",
+        "tolerance",
+        "triangles",
+        "keep_volume",
+        "unit",
+    ),
     "The work": (
         *("quality", "precision", "model", "device", "max_memory", "threads"),
         *("cluster", "jobs", "fail_fast", "retry", "dry_run"),
@@ -92,6 +102,8 @@ def _from_table(option: Option) -> Decorator:
     word = f"--{option.name.replace('_', '-')}"
     if option.off:
         return click.option(f"{word}/--{option.off}", default=option.default, help=option.help)
+    if option.parse is bool:
+        return click.option(word, is_flag=True, help=option.help)
     kind: Any = option.parse
     if option.choices:
         kind = click.Choice(option.choices)
