@@ -216,6 +216,8 @@ def test_a_number_of_triangles_is_not_exceeded_and_what_the_shape_does_not_allow
     left = len(found.mesh.faces)
     assert left > 4 and found.mesh.is_closed()
     assert found.warnings == (f"{UNREACHED.format(4)}{left}",)
+    diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+    assert max(vars(found.deviation).values()) <= 0.05 * diagonal
 
 
 @pytest.mark.parametrize(
