@@ -34,8 +34,6 @@ PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0, 2.0
 ROUNDS, RISE = 30, 3.0  # of the threshold to its end; from more rounds, meshes get no smaller
 LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly as well
 FEW_ROUNDS, STEEP_RISE = 8, 5.0
-# Errors that are tried for a number of triangles, in sides of a triangle.
-RISING_ERRORS = 0.05 * 2.0 ** np.array([-2, -1, *np.arange(0, 12, 0.5)])
 MOST_REPEATS = 16  # of passes, before smaller distances are tried
 HALVINGS = 3
 LEFT = 0.85  # share of the work that is left after passes: a guess
@@ -88,9 +86,12 @@ class Passes:
             wrong = self._faults(result)
             if self.original:
                 wrong = np.concatenate([wrong, self.original.beyond(result, self.error)])
-            if not len(wrong):
-                return result if same_topology(result, self.meshes[0]) else None
-            first = self._keep(wrong)
+            if len(wrong):
+                first = self._keep(wrong)
+            elif same_topology(result, self.meshes[0]):
+                return result
+            else:
+                first = self._keep_lost(result)
             if first < 0:
                 return None
         return None
@@ -122,6 +123,17 @@ class Passes:
             self.since = np.append(self.since, np.full(np.count_nonzero(~before), first))
             wrong = wrong[before]
         return -1 if len(wrong) else first
+
+    def _keep_lost(self, result: Mesh) -> int:
+        """Keep the components of which nothing is left, in all passes; -1 if there are none."""
+        base = self.meshes[0]
+        component = vertex_components(base.faces, len(base.vertices))[base.faces[:, 0]]
+        first = np.unique(vertex_components(result.faces, len(result.vertices))[result.faces[:, 0]])
+        found = component[self.solids[0].nearest_face(result.vertices[first])]
+        lost = base.vertices[np.unique(base.faces[~np.isin(component, found)])]
+        self.places = np.concatenate([self.places, lost])
+        self.since = np.append(self.since, np.zeros(len(lost), np.intp))
+        return 0 if len(lost) else -1
 
     def _faults(self, result: Mesh) -> Points:
         """Return points, (n, 3), where a mesh is no manifold and the first one is, or is open."""
@@ -156,29 +168,6 @@ def within(
             return result, ()
     return mesh, ("the mesh was not simplified: none of its triangles can be spared within the "
                   "error",)  # fmt: skip
-
-
-def down_to(
-    mesh: Mesh, original: Original, triangles: int, rounds: Rounds
-) -> tuple[Mesh, tuple[str, ...]]:
-    """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning.
-
-    Errors rise until there are no more, and what the last one made is compared to what is collapsed
-    to the number, whatever the error.
-    """
-    finer = coarser = mesh
-    for error in mean_side(mesh) * RISING_ERRORS:
-        if len(coarser.faces) <= triangles:
-            break
-        finer, (coarser, _) = coarser, within(coarser, original, error, rounds)
-    passes = [partial(collapse_to, triangles=triangles)] * len(PLANE_DISTANCES)
-    exact = Passes(finer, passes).result(rounds) or finer
-    reached = [some for some in (exact, coarser) if len(some.faces) <= triangles]
-    if reached:
-        return min(reached, key=lambda some: max(original.deviation(some)[::2])), ()
-    least = min(exact, coarser, key=lambda some: len(some.faces))
-    return least, (f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of "
-                   f"the same topology: it has {len(least.faces):,}",)  # fmt: skip
 
 
 def same_topology(one: Mesh, other: Mesh) -> bool:

@@ -119,7 +119,8 @@ def simplify_mesh(
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
     check_room(len(mesh.faces), check_max_memory(max_memory))
-    from .collapsing import Rounds, down_to, within
+    from .collapsing import Rounds, within
+    from .counting import down_to
     from .measuring import Original
 
     if not len(mesh.faces):
