@@ -144,7 +144,7 @@ def test_no_process_runs_files_of_the_current_folder(tmp_path, flag):
 if __name__ == "__main__":
     import test_pool
     test_pool.pool.SAFE_PATH = {flag!r}
-    print(test_pool.work([2, 3], test_pool.square))
+    print(sorted(test_pool.work([2, 3], test_pool.square).items()))
 """
     done, ran = run_beside_planted_files(tmp_path, code)
-    assert (done.stdout, done.stderr, ran) == ("{2: 4, 3: 9}\n", "", [])
+    assert (done.stdout, done.stderr, ran) == ("[(2, 4), (3, 9)]\n", "", [])

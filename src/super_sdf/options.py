@@ -48,6 +48,7 @@ LENGTHS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3
 FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
 MESHERS: tuple[MesherName, ...] = get_args(MesherName)
 DEVICES: tuple[Device, ...] = get_args(Device)
+PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 AUTO_PRECISION: Final = AUTO
 FLOAT32: Final = "float32"
 INT8: Final = "int8"
@@ -493,7 +494,7 @@ class NetworkOptions:
         AUTO_PRECISION,
         "Arithmetic of the network: auto is int8 on the CPU if the network has it, otherwise "
         "float32. On the CPU int8 takes about half as long.",
-        get_args(Precision),
+        PRECISIONS,
     )
     model: str | None = _option(
         None,

@@ -103,7 +103,7 @@ def _from_table(option: Option) -> Decorator:
     if option.off:
         return click.option(f"{word}/--{option.off}", default=option.default, help=option.help)
     if option.parse is bool:
-        return click.option(word, is_flag=True, help=option.help)
+        return click.option(word, is_flag=True, default=option.default, help=option.help)
     kind: Any = option.parse
     if option.choices:
         kind = click.Choice(option.choices)
