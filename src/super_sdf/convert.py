@@ -238,9 +238,9 @@ def convert_grid(
     check_apart(target, files_of(source))
     check_target(target, force=force, unit=options.unit)
     if options.keep_volume:
-        from .volumes import check_has_volume, keep_volumes, volume_of_samples
+        from .volumes import check_has_volume
 
-        check_has_volume(grid, cap=options.cap)
+        check_has_volume(grid, options.offset, cap=options.cap)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, options.factor)
     expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
@@ -256,8 +256,11 @@ def convert_grid(
     shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
     meshes = tally.count(make(expected, shown), watch)
     if options.keep_volume:
-        volumes = [volume_of_samples(grid)]
-        meshes = tally.instead(*keep_volumes([join_meshes(list(meshes))], volumes, grid.voxel_size))
+        from .volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
+
+        volume = volume_of_samples(grid)
+        (kept,) = keep_volumes([join_meshes(list(meshes))], [volume], mean_spacing(grid))
+        meshes = tally.instead(kept)
     if options.goals():
         simplified = simplify_mesh(
             join_meshes(list(meshes)),
@@ -268,6 +271,10 @@ def convert_grid(
         )
         meshes = tally.instead(simplified.mesh)
         watch.lap("simplify")
+    off = []
+    if options.keep_volume:
+        last = simplified.mesh if simplified else kept
+        off = volume_notes({"the mesh": (last.volume(), volume)})
     meshes = keeper.copies(meshes) if keeper else meshes
     write_pieces(
         meshes,
@@ -289,7 +296,10 @@ def convert_grid(
         capped=options.cap and tally.leaves,
         warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
-        notes=(*lattice.notes, *edges_note(lattice, options), *local_origin_note(target, about)),
+        notes=(
+            *(*lattice.notes, *edges_note(lattice, options), *local_origin_note(target, about)),
+            *off,
+        ),
         seconds=watch.seconds,
         kept=keeper.kept(grid) if keeper else None,
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
+from numbers import Real
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -37,7 +38,8 @@ class DistanceFunction:
     function : callable
         Takes world positions, (n, 3) float64, and returns n distances, (n,) or (n, 1): an array, or
         a tensor of PyTorch or JAX on any device, with or without gradients. Any continuous
-        function that is 0 on the surface will do; it may be positive inside.
+        function that is 0 on the surface will do; it may be positive inside. If it is much steeper
+        near a part of the surface than elsewhere, sample it with an infinite ``reach``.
 
     Attributes
     ----------
@@ -71,6 +73,10 @@ class DistanceFunction:
             )
         return values.reshape(-1)
 
+    def _on(self, low: Points, step: Points) -> Callable[[NDArray[Any]], Numbers]:
+        """Return the values at samples (n, 3) of a lattice."""
+        return lambda indices: self(low + step * indices)
+
     def sample(self, bounds: ArrayLike, spacing: ArrayLike, reach: float | None = None) -> SdfGrid:
         """Return the samples on a lattice that covers a box. The surface is where they are 0.
 
@@ -99,8 +105,10 @@ class DistanceFunction:
         shape = np.ceil((high - low) / step - 1e-9).astype(np.int64) + 1
         if np.prod(shape.astype(float)) > MOST_SAMPLES:
             raise OptionError(f"spacing is {seen(spacing)}: the box takes more than 2^31 samples")
-        reach = REACH * float(step.max()) if reach is None else reach
-        samples, cut = sample_near(lambda ijk: self(low + step * ijk), tuple(shape), step, reach)
+        reach = REACH * float(step.max()) if reach is None else check_reach(reach)
+        samples, cut = sample_near(self._on(low, step), tuple(shape), step, reach)
+        if not ((samples < 0).any() and (samples > 0).any()):  # it may be steeper than seen
+            samples, cut = sample_near(self._on(low, step), tuple(shape), step, np.inf)
         _check_sides(samples)
         np.clip(samples, -cut, cut, out=samples)
         make = partial(make_grid, samples, spacing=spacing, origin=low)
@@ -112,14 +120,23 @@ class DistanceFunction:
             raise
 
 
+def check_reach(reach: Any) -> float:
+    """Return a distance; OptionError unless it is a number above 0."""
+    if not isinstance(reach, Real) or not float(reach) > 0:
+        raise OptionError(f"reach is {seen(reach)}: give a number greater than 0, or infinity")
+    return float(reach)
+
+
 def _check_sides(samples: NDArray[np.float32]) -> None:
     """Raise GridError unless some samples are below 0 and some above."""
     known = samples[np.isfinite(samples)]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    if not len(known):
+        raise GridError("the function has no finite value at any sample: give other bounds")
+    low, high = float(known.min()), float(known.max())
     if not low < 0 < high:
         raise GridError(
             f"the function goes from {low:.6g} to {high:.6g} at {len(known):,} samples, and its "
-            "surface is where it is 0: give a finer spacing or other bounds, or subtract a level"
+            "surface is where it is 0: subtract a level, or give a finer spacing or other bounds"
         )
 
 

@@ -34,7 +34,7 @@ from .network.decoder import Decoder
 from .options import ALL, LABELS, MARCHING, OPTIONS, ConvertOptions
 from .progress import Progress
 from .topology import OpenEdges, vertex_components
-from .volumes import keep_volumes
+from .volumes import keep_volumes, mean_spacing, volume_notes
 
 MOST_FILES = 500  # each is held open until all are complete
 
@@ -159,7 +159,7 @@ def convert_labels(
         volumes = image.volumes()
         if options.keep_volume:
             whole = [join_meshes(list(mesh.pieces())) for mesh in meshes.values()]
-            moved = keep_volumes(whole, volumes, grid.voxel_size)
+            moved = keep_volumes(whole, volumes, mean_spacing(grid))
             for mesh, instead in zip(meshes.values(), moved):
                 mesh.replace(instead)
         torn = [label for label, mesh in meshes.items() if len(mesh.edges)]
@@ -173,6 +173,8 @@ def convert_labels(
             {**mesh.report(), "sample_volume": volume}
             for mesh, volume in zip(meshes.values(), volumes)
         ]
+        pairs = {row["name"]: (row["volume"], row["sample_volume"]) for row in rows}
+        off = volume_notes(pairs) if options.keep_volume else []
         write_together(files, force=force, world=world, about=about, before_rename=before_rename)
     return {
         **describe_place(grid),
@@ -181,7 +183,7 @@ def convert_labels(
             {"label": label, "name": entry.name}
             for label, entry in names_of(image.missing(wanted), known).items()
         ],
-        "inferred": [*grid.notes, *local_origin_note(target, about)],
+        "inferred": [*grid.notes, *local_origin_note(target, about), *off],
     }
 
 

@@ -52,7 +52,7 @@ from .slabs.cutting import Slab, equal_parts, slab_bytes, slab_of
 from .steps.nodes import VoxelIndex
 from .steps.survey import Band, survey
 from .steps.walls import Labels, Part, absent_parts, extract_walls, put_together
-from .volumes import keep_volumes
+from .volumes import keep_volumes, mean_spacing
 
 MOST_LABELS = 1000  # more values than these are densities
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
@@ -227,7 +227,7 @@ def reconstruct_labels(
         found[piece.label].append(piece.mesh)
     meshes = [join_meshes(pieces) for pieces in found.values()]
     if OPTIONS["keep_volume"].check(keep_volume):
-        meshes = keep_volumes(meshes, image.volumes(), image.grid.voxel_size)
+        meshes = keep_volumes(meshes, image.volumes(), mean_spacing(image.grid))
     return dict(zip(found, meshes))
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -28,7 +27,7 @@ from .machine.memory import give_back
 from .mesh import Mesh, join_meshes
 from .neighbourhood import CENTRE
 from .network.decoder import Decoder, decode
-from .network.network import Where, given_or_loaded
+from .network.network import given_or_loaded
 from .progress import STEPS, Progress, StepCounter
 from .slabs.cutting import Slab
 from .slabs.preparing import Piece, Run, describe_piece, prepare
@@ -42,9 +41,6 @@ from .steps.meshers import extract_pieces
 from .steps.spheres import fit_to_spheres, spheres_of_band
 from .steps.spline import interpolate
 from .steps.survey import Band, no_surface
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 
 def refine(
@@ -172,7 +168,9 @@ def reconstruct(
     mesher: options.MesherName = options.DEFAULT_MESHER,
     max_memory: int | None = None,
     progress: Progress | None = None,
-    **where: Unpack[Where],
+    device: options.Device | None = None,
+    precision: options.Precision | None = None,
+    threads: int | None = None,
 ) -> Mesh:
     """Turn a coarse grid, or a function, into a fine mesh.
 
@@ -216,7 +214,7 @@ def reconstruct(
     """
     exact = None if function is None else as_function(function)
     grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
-    network = given_or_loaded(network, quality, **where)
+    network = given_or_loaded(network, quality, device=device, precision=precision, threads=threads)
     pieces = reconstruct_slabs(
         grid,
         network,

@@ -11,7 +11,7 @@ shared. It is the mean of the normals near each node of a lattice, and linear be
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ from .steps.zero import face_normals
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
 ROUNDS = 8
-GOOD = 1e-6  # of a volume
+GOOD, NOTED = 1e-6, 1e-3  # of a volume
 CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
 Rows = NDArray[np.intp]
 
@@ -40,8 +40,12 @@ class Normals(NamedTuple):
     vectors: Vectors
 
 
-def check_has_volume(grid: SdfGrid, *, cap: bool) -> None:
+def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
+    if offset:
+        raise OptionError(
+            f"keep-volume is for the surface of the samples, offset is {offset:g}: give one only"
+        )
     if grid.field.kind != MASK:
         raise OptionError(
             f"keep-volume is for masks and labels, the values are {grid.field.kind}: leave it out"
@@ -59,6 +63,18 @@ def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
     return inside * float(np.prod(grid.spacing))
 
 
+def mean_spacing(grid: SdfGrid) -> float:
+    """Return the edge of a cube with the volume of a box round a sample."""
+    return float(np.prod(grid.spacing) ** (1 / 3))
+
+
+def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Return a note on meshes whose volume is not that of their samples, both by a name."""
+    off = {name: mesh / samples - 1 for name, (mesh, samples) in volumes.items()}
+    far = [f"{name} {share:+.1%}" for name, share in off.items() if abs(share) > NOTED]
+    return [f"volumes that are off those of the samples: {', '.join(far)}"] * bool(far)
+
+
 def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: float) -> list[Mesh]:
     """Return closed meshes moved along their normals until they have the given volumes.
 
@@ -69,8 +85,8 @@ def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: floa
     volumes : sequence of float
         In cubic world units.
     spacing : float
-        Of the samples, in world units. No surface moves by more than an eighth of it, so the volume
-        of a speck may stay another one.
+        Mean spacing of the samples, in world units. No surface moves by more than an eighth of it,
+        so the volume of a speck may stay another one.
     """
     kind, places, rows = meshes[0].vertices.dtype, *_joined(meshes)
     middle = places.mean(0)
@@ -83,8 +99,9 @@ def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: floa
         if (np.abs(off) <= GOOD * np.abs(volumes)).all():
             break
         effects = np.stack([_effect(field, slopes, rows, len(start)) for field in normals], 1)
-        distances = distances + np.linalg.lstsq(effects, off, rcond=None)[0]
-        distances = np.clip(distances, -MOST * spacing, MOST * spacing)
+        free = np.abs(distances) < MOST * spacing  # the others have moved as far as they may
+        step = np.linalg.lstsq(effects[np.ix_(free, free)], off[free], rcond=None)[0]
+        distances[free] = np.clip(distances[free] + step, -MOST * spacing, MOST * spacing)
         points = start + _moves(distances, normals, len(start))
     return [
         Mesh((middle + points[own]).astype(kind), mesh.faces) for own, mesh in zip(rows, meshes)

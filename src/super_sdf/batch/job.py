@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -38,6 +38,7 @@ class Settings:
     items: Path | None = None  # the folder for what a page shows of each mesh
     cluster: str | None = None  # "local", or the address of a scheduler: where files are converted
     names: Names | None = None  # of labels
+    began: float = field(default_factory=time.time)  # what is newer was not there before
 
     def load_network(self, threads: int) -> Network:
         """Return the network of a worker."""
@@ -131,13 +132,22 @@ class Prints(dict[str, Fingerprint]):
         for path, part in parts.items():
             if (made := fingerprint(part)) is None:
                 raise WriteError(f"{part} cannot be read again")
-            name = self.name(path)
-            is_kept = os.path.lexists(path) and not (self.settings.force or name in self.replace)
-            if is_kept and made["sha256"] != (fingerprint(path) or {}).get("sha256"):
-                raise WriteError(
-                    f"{path} exists and is not what this batch makes: remove it or use --force"
-                )
-            self[name] = made
+            if os.path.lexists(path):
+                self._check_may_replace(path, made["sha256"])
+            self[self.name(path)] = made
+
+    def _check_may_replace(self, path: Path, made: str) -> None:
+        """Raise WriteError unless a file of this content may replace the one that is there."""
+        if path.is_symlink():
+            raise WriteError(f"{path} is a link: remove it")
+        may = self.settings.force or self.name(path) in self.replace
+        is_new = path.stat().st_mtime > self.settings.began
+        if (is_new or not may) and made != (fingerprint(path) or {}).get("sha256"):
+            raise WriteError(
+                f"{path} was written while this batch ran: give its inputs other names (out)"
+                if is_new
+                else f"{path} exists and is not what this batch makes: remove it or use --force"
+            )
 
 
 def _convert(

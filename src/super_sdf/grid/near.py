@@ -7,7 +7,8 @@ Barr, "Guaranteed ray intersections with implicit surfaces" (1989).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from itertools import combinations
 from typing import Any, TypeAlias
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 STRIDE = 8  # spacings along the largest cells; a power of two
+AT_ONCE = 1 << 18  # samples
 STEEPER = 1.25  # than seen between samples may the function be
 CORNERS = np.indices((2, 2, 2), np.int32).reshape(3, 8).T
 
@@ -44,13 +46,13 @@ def sample_near(
     samples = np.full(shape, np.nan, np.float32)
     last = np.array(shape, np.int32) - 1
     cells = (STRIDE * np.argwhere(np.ones(-(-last // STRIDE), bool))).astype(np.int32)
-    stride, steepest = STRIDE, 0.0
+    stride, steepest = STRIDE, _steepest_at(samples, at, cells, step)
     while len(cells):
-        corners = np.stack([np.minimum(cells + stride * corner, last) for corner in CORNERS])
-        _evaluate(samples, at, corners)
+        corners = [partial(_corner, cells, stride * corner, last) for corner in CORNERS]
+        _evaluate(samples, at, (corner() for corner in corners))
         if stride == 1:
             break
-        values = np.stack([samples[tuple(corner.T)] for corner in corners], 1)
+        values = np.stack([samples[tuple(corner().T)] for corner in corners], 1)
         steepest = max(steepest, _steepest(values, corners, step))
         least = STEEPER * steepest * (reach + stride / 2 * float(np.linalg.norm(step)))
         far = np.abs(values).min(1) > least  # not where a value is unknown
@@ -61,21 +63,46 @@ def sample_near(
     return samples, steepest * reach if steepest else np.inf
 
 
+def _steepest_at(samples: Samples, at: At, cells: Cells, step: NDArray[Any]) -> float:
+    """Return the largest slope at the lowest samples of cells, by their neighbours on either side.
+
+    Of the two slopes of a sample the lesser counts: beside a kink the other one is too large.
+    """
+    last, axes = np.array(samples.shape, np.int32) - 1, np.eye(3, dtype=np.int32)
+    sides = [[np.clip(cells + side * axis, 0, last) for axis in axes] for side in (-1, 1)]
+    _evaluate(samples, at, [cells, *sides[0], *sides[1]])
+    rises = [[samples[tuple(c.T)] - samples[tuple(cells.T)] for c in side] for side in sides]
+    with np.errstate(invalid="ignore"):
+        slopes = [np.linalg.norm(np.stack(rise, 1) / step, axis=1) for rise in rises]
+    on_border = ((cells == 0) | (cells == last)).any(1)  # has no neighbour on one side
+    slope = np.where(on_border, np.maximum(*slopes), np.minimum(*slopes))
+    return float(slope[np.isfinite(slope)].max(initial=0))
+
+
 def _evaluate(samples: Samples, at: At, corners: Iterable[NDArray[Any]]) -> None:
     """Fill in the samples at corners that are not known yet."""
     wanted = np.zeros(samples.shape, bool)
     for corner in corners:
         wanted[tuple(corner.T)] = True
     places = np.flatnonzero(wanted & np.isnan(samples))
-    indices = np.stack(np.unravel_index(places, samples.shape), 1)
-    samples.reshape(-1)[places] = at(indices)
+    for first in range(0, len(places), AT_ONCE):
+        some = places[first : first + AT_ONCE]
+        samples.reshape(-1)[some] = at(np.stack(np.unravel_index(some, samples.shape), 1))
 
 
-def _steepest(values: NDArray[Any], corners: NDArray[Any], step: NDArray[Any]) -> float:
-    """Return the largest slope between two corners, (n, 8) and (8, n, 3), of the same cell."""
+def _corner(cells: Cells, beside: Cells, last: Cells) -> Cells:
+    """Return the samples some way from the lowest ones of cells, or on the border."""
+    corner: Cells = np.minimum(cells + beside, last)
+    return corner
+
+
+def _steepest(
+    values: NDArray[Any], corners: Sequence[Callable[[], Cells]], step: NDArray[Any]
+) -> float:
+    """Return the largest slope between two corners of a cell; ``values`` are (n, 8)."""
     steepest = 0.0
     for one, other in combinations(range(8), 2):
-        length = np.linalg.norm((corners[one] - corners[other]) * step, axis=1)
+        length = np.linalg.norm((corners[one]() - corners[other]()) * step, axis=1)
         with np.errstate(invalid="ignore"):  # between corners that were left out
             slopes = np.abs(values[:, one] - values[:, other]) / length
         steepest = max(steepest, float(slopes[np.isfinite(slopes)].max(initial=0)))

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypedDict
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -43,9 +43,6 @@ from .contract import EXACT_DISTANCES, INPUTS, MASKS, one_voxel, read_card
 from .decoder import Decoder
 from .device import open_session
 from .onnx import CUDA_CHUNK, LONG_RUN, Pace, Poll, ort, run_bound, run_on_cpu, work_of
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 MODELS = Path(__file__).parent.parent / "models"
 # Memory of a run, measured: of each voxel that it sees, its patch and its row of the neighbour
@@ -299,23 +296,18 @@ def load_network(
     return Network(*loaded, shipped=shipped, path=path)
 
 
-class Where(TypedDict, total=False):
-    """Keywords of ``load_network``, where a function loads one itself."""
-
-    device: Device
-    precision: Precision
-    threads: int
-
-
 def given_or_loaded(
-    network: Decoder | None, quality: Quality | str | Path | None, **where: Unpack[Where]
+    network: Decoder | None, quality: Quality | str | Path | None, **where: Any
 ) -> Decoder:
-    """Return a network, or load one if it is None; OptionError if both are asked for."""
+    """Return a network, or load one if it is None; OptionError if both are asked for.
+
+    ``where`` are keywords of ``load_network``, None for its defaults.
+    """
+    asked = {name: value for name, value in where.items() if value is not None}
     if network is None:
-        return load_network(DEFAULT_QUALITY if quality is None else quality, **where)
-    asked = {"quality": quality, **where} if quality is not None else dict(where)
-    if asked:
-        raise OptionError(f"a network and {' and '.join(asked)} are given: give only one of them")
+        return load_network(DEFAULT_QUALITY if quality is None else quality, **asked)
+    for name in (*["quality"] * (quality is not None), *asked):
+        raise OptionError(f"a network and {name} are given: give only one of them")
     return network
 
 
