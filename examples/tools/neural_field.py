@@ -2,7 +2,7 @@
 
     pip install torch && python examples/tools/neural_field.py [OUT.ply]
 
-A small network learns the distances of a ring for a few seconds. ``reconstruct`` then asks it at
+A small network learns the distances of a ring for half a minute. ``reconstruct`` then asks it at
 coarse samples and at the vertices, instead of at every node of a fine lattice.
 """
 

@@ -133,7 +133,7 @@ names_option = click.option(
     type=click.Path(path_type=Path),
     metavar="TABLE",
     help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP or "
-    "FreeSurfer, CSV or JSON. --labels takes names then.",
+    "FreeSurfer, CSV, or JSON such as nnU-Net's dataset.json. --labels takes names then.",
 )
 cluster_option = click.option(
     "--cluster",

@@ -312,7 +312,8 @@ def upsample_labels(
     for row in made["labels"]:
         print_stderr(
             f"{row['output']}: {row['name']}, {row['vertices']:,} vertices, "
-            f"{row['triangles']:,} triangles, {row['components']:,} closed components, "
+            f"{row['triangles']:,} triangles, "
+            f"{row['components']:,} closed component{'s' * (row['components'] != 1)}, "
             f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
         )
     print_stderr(f"{len(made['labels'])} labels, {sum(watch.seconds.values()):.1f} s")
