@@ -279,3 +279,30 @@ def test_what_does_not_go_with_labels_is_refused_before_the_work(words, line, co
     code, out, err = command("batch", "cases", "--out", "out", *words)
     assert (code, out, err.splitlines()[-1]) == (2, "", f"Error: {line}")
     assert not Path("out").exists() and "labels" in LABELS
+
+
+def test_a_link_in_place_of_a_mesh_is_not_followed(command):
+    Path("out").mkdir()
+    Path("out/case00-liver.stl").symlink_to("../cases/case01.nii.gz")
+    before = Path("cases/case01.nii.gz").read_bytes()
+    run = "batch", "cases/case00.nii.gz", "cases/case01.nii.gz", "--out", "out", "--format", "stl"
+    code, _, err = command(*run, *ALL, "--force")
+    assert code == 1 and "out/case00-liver.stl is a link: remove it\n" in err
+    assert Path("cases/case01.nii.gz").read_bytes() == before
+    assert not list(Path("out").glob("case00-[!l]*"))
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)])
+def test_two_inputs_that_make_the_same_file_are_not_lost(command, force):
+    lines = (
+        {"in": f"cases/case0{n}.nii.gz", "out": out} for n, out in ((0, "a-1.stl"), (1, "a.stl"))
+    )
+    more = {"label": 1}, {"labels": "all"}
+    text = "\n".join(json.dumps({**line, **each}) for line, each in zip(lines, more))
+    Path("list.jsonl").write_text(text)
+    run = "batch", "list.jsonl", "--out", "out", *QUICK, "--jobs", 1
+    code, _, err = command(*run, *force)
+    assert (
+        code == 1 and "was written while this batch ran: give its inputs other names (out)" in err
+    )
+    assert "1 done, 1 failed" in err
