@@ -161,6 +161,17 @@ def test_any_function_that_changes_sign_there_will_do(sign):
     assert mesh.is_closed() and mesh.volume() > 0
 
 
+def test_a_jump_within_a_voxel_is_found():
+    def occupancy(points):
+        return np.tanh(block(points) / (0.05 * H))
+
+    plain = reconstruct(DistanceFunction(occupancy).sample(BOX, H))
+    mesh = reconstruct(function=occupancy, bounds=BOX, spacing=H)
+    assert off(block, plain).mean() > 0.05
+    assert np.median(off(block, mesh)) < 4e-3 and off(block, mesh).mean() < 0.01
+    assert check_mesh(mesh, DistanceFunction(occupancy).sample(BOX, H)).surface.faults() == []
+
+
 def cubes(points, gap):
     """Two cubes apart, shifted along their walls."""
     one, other = ((np.abs(points - [x, y, z]) - 0.4) for x, y, z in

@@ -2,10 +2,11 @@
 
 1. A vertex goes along its normal: a Newton step, then a secant step.
 2. Where that does not lead to the surface, it goes down the gradient, which changes at an edge.
+   Where values are no distances, the sign changes along the normal instead, up to four spacings on.
 3. Where triangles turn, the vertex goes to where the planes of the surface beside it meet.
 
-The lattice says how the surface is joined, so triangles stay as they are: a vertex moves by at most
-half a fine spacing, and only if it finds the surface.
+The lattice says how the surface is joined, so triangles stay as they are: but for the second half
+of 2, a vertex moves by at most half a fine spacing, and only if it finds the surface.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ ONE_WAY = 0.1  # least cosine by which a triangle may have turned
 IN_PLANE, TOUCHING = 1e-7, 1e-5  # fine spacings off a plane, and by which triangles may overlap
 FLAT = 1e-6  # twice the area of triangles, in squared fine spacings, whose vertices may coincide
 COMPARED, MOST_OTHER = 1000, 0.25  # samples at which function and grid are compared
+DISTANCES, HALVINGS = (0.5, 1.0, 2.0, 4.0), 10  # fine spacings to a surface farther off, and then
 ROUNDS = 4  # of steps along the gradient
 LEAST_SLOPE = 1e-9
 REACHED = 0.25  # of the value at the start, above which the surface is not in reach
@@ -102,8 +104,13 @@ def put_on_surface(
     if not exact:
         slope = (value(start[rows] + STEP * normals[rows]) - before) / STEP
     found, off = step_along(value, start[rows], before, normals[rows], slope)
-    left = np.flatnonzero(np.abs(off) > GOOD * np.abs(slope))
-    found[left], off[left] = step_down(value, start[rows[left]], before[left])
+    left = np.abs(off) > GOOD * np.abs(slope)
+    if not exact:  # saturated values show from afar to half a spacing only where the surface is
+        far = np.flatnonzero(np.abs(off) > REACHED * np.abs(before))
+        points[rows[far]] = cross_over(value, start[rows[far]], before[far], normals[rows[far]])
+        left[far] = False
+    near = np.flatnonzero(left)
+    found[near], off[near] = step_down(value, start[rows[near]], before[near])
     reached = np.abs(off) <= REACHED * np.abs(before)
     points[rows[reached]] = found[reached]
     return points
@@ -134,6 +141,27 @@ def step_along(
     closer = np.abs(last) < np.abs(after[again])
     way[again[closer]], after[again[closer]] = second[again[closer]], last[closer]
     return start + way[:, None] * direction, after
+
+
+def cross_over(value: Value, start: Vectors, before: Numbers, normals: Vectors) -> Vectors:
+    """Return points (n, 3) where values change sign along normals, those at the start if nowhere.
+
+    The surface is sought in doubled steps, to the side that the sign says, and then by halving.
+    """
+    ways = -np.sign(before)[:, None] * normals
+    low, high = np.zeros(len(start)), np.full(len(start), np.nan)
+    for distance in DISTANCES:
+        left = np.flatnonzero(np.isnan(high))
+        crossed = value(start[left] + distance * ways[left]) * before[left] <= 0
+        high[left[crossed]], low[left[~crossed]] = distance, distance
+    rows = np.flatnonzero(~np.isnan(high))
+    for _ in range(HALVINGS):
+        middle = (low[rows] + high[rows]) / 2
+        crossed = value(start[rows] + middle[:, None] * ways[rows]) * before[rows] <= 0
+        high[rows[crossed]], low[rows[~crossed]] = middle[crossed], middle[~crossed]
+    points = start.copy()
+    points[rows] += (low[rows] + high[rows])[:, None] / 2 * ways[rows]
+    return points
 
 
 def step_down(value: Value, start: Vectors, before: Numbers) -> tuple[Vectors, Numbers]:
