@@ -22,6 +22,7 @@ from ..errors import OptionError
 from ..functions import DistanceFunction
 from ..grid.sdf_grid import SdfGrid
 from ..mesh import Mesh
+from ..options import EXACT
 from .sharp.patches import Numbers, Vectors, cross, dot, length, sums_at, unit
 from .sharp.triangle_pairs import intersecting, overlapping_boxes
 
@@ -68,7 +69,7 @@ def put_on_zero(
     start = (mesh.vertices - middle) / fine
     free = _is_within(grid, mesh.vertices, REACH / factor)
     with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
-        points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.has_exact)
+        points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.kind == EXACT)
         points = put_on_edges(value, points, mesh.faces, free)
     points = without_folds(points, start, mesh.faces, rounded)
     return Mesh((middle + fine * points).astype(kind), mesh.faces)
