@@ -50,6 +50,7 @@ from .topology import OpenEdges
 
 if TYPE_CHECKING:
     from .fields.writing import FieldFile
+    from .simplification.simplify import Simplified
 
 CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
@@ -238,43 +239,27 @@ def convert_grid(
     check_apart(target, files_of(source))
     check_target(target, force=force, unit=options.unit)
     if options.keep_volume:
-        from .volumes import check_has_volume
+        from .volumes import check_has_volume  # imported here, as few conversions need it
 
         check_has_volume(grid, options.offset, cap=options.cap)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, options.factor)
     expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
     if options.goals():  # imported here, as few conversions need it
-        from .simplification.simplify import check_room, simplify_mesh
+        from .simplification.simplify import check_room
 
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
     elif announce and (sentence := expected.warning(target)):
         announce(sentence)
     watch.lap("read")
-    tally, simplified = Tally(options.cap), None
+    tally, simplified, off = Tally(options.cap), None, list[str]()
     shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
     meshes = tally.count(make(expected, shown), watch)
-    if options.keep_volume:
-        from .volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
-
-        volume = volume_of_samples(grid)
-        (kept,) = keep_volumes([join_meshes(list(meshes))], [volume], mean_spacing(grid))
-        meshes = tally.instead(kept)
-    if options.goals():
-        simplified = simplify_mesh(
-            join_meshes(list(meshes)),
-            error=options.error(grid.voxel_size),
-            triangles=options.triangles,
-            max_memory=options.max_memory,
-            progress=share_of(part_of(progress, SHARE_BEFORE, 1)),
-        )
-        meshes = tally.instead(simplified.mesh)
-        watch.lap("simplify")
-    off = []
-    if options.keep_volume:
-        last = simplified.mesh if simplified else kept
-        off = volume_notes({"the mesh": (last.volume(), volume)})
+    if options.keep_volume or options.goals():
+        whole, simplified, off = _reworked(join_meshes(list(meshes)), grid, options, progress)
+        meshes = tally.instead(whole)
+        watch.lap("simplify" if simplified else "isosurface")
     meshes = keeper.copies(meshes) if keeper else meshes
     write_pieces(
         meshes,
@@ -303,6 +288,31 @@ def convert_grid(
         seconds=watch.seconds,
         kept=keeper.kept(grid) if keeper else None,
     )
+
+
+def _reworked(
+    mesh: Mesh, grid: SdfGrid, options: ConvertOptions, progress: Progress | None
+) -> tuple[Mesh, Simplified | None, list[str]]:
+    """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
+    from .volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
+
+    simplified, volume = None, 0.0
+    if options.keep_volume:
+        volume = volume_of_samples(grid)
+        (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))
+    if options.goals():
+        from .simplification.simplify import simplify_mesh
+
+        simplified = simplify_mesh(
+            mesh,
+            error=options.error(grid.voxel_size),
+            triangles=options.triangles,
+            max_memory=options.max_memory,
+            progress=share_of(part_of(progress, SHARE_BEFORE, 1)),
+        )
+        mesh = simplified.mesh
+    off = volume_notes({"the mesh": (mesh.volume(), volume)}) if options.keep_volume else []
+    return mesh, simplified, off
 
 
 class Keeper:
