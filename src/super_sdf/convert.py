@@ -294,10 +294,10 @@ def _reworked(
     mesh: Mesh, grid: SdfGrid, options: ConvertOptions, progress: Progress | None
 ) -> tuple[Mesh, Simplified | None, list[str]]:
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
-    from .volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
-
-    simplified, volume = None, 0.0
+    simplified, off = None, list[str]()
     if options.keep_volume:
+        from .volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
+
         volume = volume_of_samples(grid)
         (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))
     if options.goals():
@@ -311,7 +311,8 @@ def _reworked(
             progress=share_of(part_of(progress, SHARE_BEFORE, 1)),
         )
         mesh = simplified.mesh
-    off = volume_notes({"the mesh": (mesh.volume(), volume)}) if options.keep_volume else []
+    if options.keep_volume:  # simplifying may have changed it
+        off = volume_notes({"the mesh": (mesh.volume(), volume)})
     return mesh, simplified, off
 
 

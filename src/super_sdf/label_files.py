@@ -156,15 +156,12 @@ def convert_labels(
         slabs = label_slabs(image, network, options.factor, max_memory=bound, progress=progress)
         for piece in slabs:
             meshes[piece.label].add(piece)
-        volumes = image.volumes()
-        if options.keep_volume:
-            whole = [join_meshes(list(mesh.pieces())) for mesh in meshes.values()]
-            moved = keep_volumes(whole, volumes, mean_spacing(grid))
-            for mesh, instead in zip(meshes.values(), moved):
-                mesh.replace(instead)
         torn = [label for label, mesh in meshes.items() if len(mesh.edges)]
         if torn:
             raise MeshError(f"the mesh of label {torn[0]} is torn: run it again, and report it")
+        volumes, off = image.volumes(), list[str]()
+        if options.keep_volume:
+            off = _move(list(meshes.values()), volumes, mean_spacing(grid))
         world = World(options.unit, grid.space, colours_of(called.values()))
         files: dict[Path, dict[str, Iterator[Mesh]]] = {path: {} for path in paths}
         for mesh in meshes.values():
@@ -173,8 +170,6 @@ def convert_labels(
             {**mesh.report(), "sample_volume": volume}
             for mesh, volume in zip(meshes.values(), volumes)
         ]
-        pairs = {row["name"]: (row["volume"], row["sample_volume"]) for row in rows}
-        off = volume_notes(pairs) if options.keep_volume else []
         write_together(files, force=force, world=world, about=about, before_rename=before_rename)
     return {
         **describe_place(grid),
@@ -185,6 +180,14 @@ def convert_labels(
         ],
         "inferred": [*grid.notes, *local_origin_note(target, about), *off],
     }
+
+
+def _move(meshes: Sequence[LabelMesh], volumes: Sequence[float], spacing: float) -> list[str]:
+    """Give meshes the volumes of their samples; return a note on those that stay off."""
+    whole = [join_meshes(list(mesh.pieces())) for mesh in meshes]
+    for mesh, moved in zip(meshes, keep_volumes(whole, volumes, spacing)):
+        mesh.replace(moved)
+    return volume_notes({m.name: (m.volume, v) for m, v in zip(meshes, volumes)})
 
 
 def with_numbers(options: ConvertOptions, names: Names | None) -> ConvertOptions:

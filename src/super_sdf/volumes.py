@@ -21,6 +21,7 @@ from .errors import OptionError
 from .grid.planes import in_blocks
 from .grid.sdf_grid import SdfGrid
 from .mesh import Mesh
+from .neighbourhood import CORNERS
 from .options import MASK
 from .steps.sharp.patches import Numbers, Vectors, dot, length, sums_at
 from .steps.zero import face_normals
@@ -29,7 +30,6 @@ CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
 ROUNDS = 8
 GOOD, NOTED = 1e-6, 1e-3  # of a volume
-CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
 Rows = NDArray[np.intp]
 
 

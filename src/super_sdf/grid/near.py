@@ -7,18 +7,18 @@ Barr, "Guaranteed ray intersections with implicit surfaces" (1989).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable
 from itertools import combinations
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..neighbourhood import CORNERS
+
 STRIDE = 8  # spacings along the largest cells; a power of two
 AT_ONCE = 1 << 18  # samples
 STEEPER = 1.25  # than seen between samples may the function be
-CORNERS = np.indices((2, 2, 2), np.int32).reshape(3, 8).T
 
 Cells: TypeAlias = NDArray[np.int32]  # (n, 3) the lowest sample of each
 Samples: TypeAlias = NDArray[np.float32]
@@ -48,12 +48,13 @@ def sample_near(
     cells = (STRIDE * np.argwhere(np.ones(-(-last // STRIDE), bool))).astype(np.int32)
     stride, steepest = STRIDE, _steepest_at(samples, at, cells, step)
     while len(cells):
-        corners = [partial(_corner, cells, stride * corner, last) for corner in CORNERS]
-        _evaluate(samples, at, (corner() for corner in corners))
+        sizes = np.minimum(stride, last - cells)  # on the border cells are smaller
+        _evaluate(samples, at, (cells + sizes * corner for corner in CORNERS))
         if stride == 1:
             break
-        values = np.stack([samples[tuple(corner().T)] for corner in corners], 1)
-        steepest = max(steepest, _steepest(values, corners, step))
+        corners = [cells + sizes * corner for corner in CORNERS]
+        values = np.stack([samples[tuple(corner.T)] for corner in corners], 1)
+        steepest = max(steepest, _steepest(values, sizes * step))
         least = STEEPER * steepest * (reach + stride / 2 * float(np.linalg.norm(step)))
         far = np.abs(values).min(1) > least  # not where a value is unknown
         _leave_out(samples, cells[far], stride, values[far, 0])
@@ -90,19 +91,11 @@ def _evaluate(samples: Samples, at: At, corners: Iterable[NDArray[Any]]) -> None
         samples.reshape(-1)[some] = at(np.stack(np.unravel_index(some, samples.shape), 1))
 
 
-def _corner(cells: Cells, beside: Cells, last: Cells) -> Cells:
-    """Return the samples some way from the lowest ones of cells, or on the border."""
-    corner: Cells = np.minimum(cells + beside, last)
-    return corner
-
-
-def _steepest(
-    values: NDArray[Any], corners: Sequence[Callable[[], Cells]], step: NDArray[Any]
-) -> float:
-    """Return the largest slope between two corners of a cell; ``values`` are (n, 8)."""
+def _steepest(values: NDArray[Any], sizes: NDArray[Any]) -> float:
+    """Return the largest slope between two corners of a cell, from values (n, 8), sizes (n, 3)."""
     steepest = 0.0
     for one, other in combinations(range(8), 2):
-        length = np.linalg.norm((corners[one]() - corners[other]()) * step, axis=1)
+        length = np.linalg.norm((CORNERS[one] - CORNERS[other]) * sizes, axis=1)
         with np.errstate(invalid="ignore"):  # between corners that were left out
             slopes = np.abs(values[:, one] - values[:, other]) / length
         steepest = max(steepest, float(slopes[np.isfinite(slopes)].max(initial=0)))

@@ -20,11 +20,11 @@ from ..arrays import FloatArray
 from ..certificate.check import FULL, Certificate
 from ..grid.sdf_grid import SdfGrid
 from ..mesh import CLEARANCE, Mesh
-from ..neighbourhood import CENTRE, STRIDES
+from ..neighbourhood import CENTRE, CORNERS, STRIDES
 from ..simplification.collapsing import collapse_to
 from ..simplification.measuring import points_within
 from ..simplification.simplify import check_room
-from ..steps.cell_cases import CORNERS, EDGE_AXIS, EDGE_START, triangle_table
+from ..steps.cell_cases import EDGE_AXIS, EDGE_START, triangle_table
 from ..steps.survey import Band
 
 MOST_TRIANGLES = 200_000  # of a mesh in a page: 1 to 2 MB, and fluent without a GPU

@@ -15,9 +15,8 @@ from ..arrays import FloatArray, IntArray
 from ..errors import GridError
 from ..grid.planes import SampleArray
 from ..grid.sdf_grid import SdfGrid
-from ..neighbourhood import NEIGHBOURHOOD
+from ..neighbourhood import CORNERS, NEIGHBOURHOOD
 from .band import neighbour_table, plane_blocks, rescale
-from .cell_cases import CORNERS
 from .field import FineField, border_is_crossed
 from .nodes import (
     BARELY_INSIDE,

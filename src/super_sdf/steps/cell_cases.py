@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from ..arrays import IntArray
 
-CORNERS: IntArray = np.indices((2, 2, 2)).reshape(3, 8).T.astype(np.int32)
 # Edge e runs from corner EDGE_START[e] one step along EDGE_AXIS[e].
 EDGE_START = (0, 1, 2, 3, 0, 1, 4, 5, 0, 2, 4, 6)
 EDGE_AXIS = (0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2)

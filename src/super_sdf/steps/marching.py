@@ -31,9 +31,9 @@ from ..arrays import BoolArray, IntArray
 from ..grid.sdf_grid import SdfGrid
 from ..machine.resources import check_count, map_chunks, map_threads, rows_in_chunk
 from ..mesh import CLEARANCE, Mesh, vertex_type
-from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from ..neighbourhood import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES
 from .cap import octant_of_cells
-from .cell_cases import CORNERS, EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
+from .cell_cases import EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
 from .field import FineField
 from .nodes import block_ijk, part_of_node
 

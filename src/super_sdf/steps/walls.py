@@ -32,9 +32,9 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
 from ..mesh import CLEARANCE
-from ..neighbourhood import NEIGHBOURHOOD
+from ..neighbourhood import CORNERS, NEIGHBOURHOOD
 from .cap import outer_voxels
-from .cell_cases import CORNERS, EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate
+from .cell_cases import EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate
 from .marching import CAP_HEIGHT, cells_low_nodes, strides
 from .nodes import SHARING, VoxelIndex, block_ijk, part_of_node
 
