@@ -15,8 +15,8 @@ import numpy as np
 
 from export.dataset import Sample, fill_shard
 from super_sdf.grid.derived import mask_distances
-from super_sdf.neighbourhood import cube_symmetries, turn
-from super_sdf.steps.band import find_band, gather_patches, neighbour_table
+from super_sdf.network.neighbourhood import cube_symmetries, turn
+from super_sdf.refine.band import find_band, gather_patches, neighbour_table
 
 
 @dataclass(frozen=True)

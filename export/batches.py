@@ -16,8 +16,8 @@ from torch import Tensor
 
 from export.augment import Prepared, batch_table
 from export.network import Encoded, SuperSdfNet
-from super_sdf.neighbourhood import CENTRE, STRIDES
-from super_sdf.steps.nodes import rows_among
+from super_sdf.network.neighbourhood import CENTRE, STRIDES
+from super_sdf.refine.nodes import rows_among
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,8 +37,8 @@ from export.shapes.solid import FAMILIES, random_solid
 from super_sdf import Mesh, SdfGrid
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
-from super_sdf.steps.band import DECODE_LIMIT, find_band, rescale
-from super_sdf.steps.nodes import block_offsets
+from super_sdf.refine.band import DECODE_LIMIT, find_band, rescale
+from super_sdf.refine.nodes import block_offsets
 from super_sdf.truth.mesh_files import read_mesh
 from super_sdf.truth.sampling import sample_grid
 from super_sdf.truth.solid import Solid

@@ -23,8 +23,8 @@ from export.recipe import RECIPE, Errors, batch_losses, sample_errors
 from export.store import Store
 from export.to_onnx import read_network
 from super_sdf.errors import OptionError
-from super_sdf.neighbourhood import CENTRE
-from super_sdf.steps.band import DECODE_LIMIT
+from super_sdf.network.neighbourhood import CENTRE
+from super_sdf.refine.band import DECODE_LIMIT
 
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0)
 NEVER = 1e9  # a threshold that nothing exceeds

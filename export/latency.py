@@ -13,8 +13,8 @@ import numpy as np
 
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import load_network
-from super_sdf.steps.nodes import block_offsets
-from super_sdf.steps.survey import survey
+from super_sdf.refine.nodes import block_offsets
+from super_sdf.refine.survey import survey
 
 RUNS = 5
 RADIUS = 35.0  # of the ball, voxels

@@ -26,8 +26,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from super_sdf.neighbourhood import CENTRE
-from super_sdf.steps.band import DECODE_LIMIT, MAX_DIFFERENCE
+from super_sdf.network.neighbourhood import CENTRE
+from super_sdf.refine.band import DECODE_LIMIT, MAX_DIFFERENCE
 
 
 @dataclass(frozen=True)

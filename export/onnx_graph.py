@@ -24,9 +24,9 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from export.network import SuperSdfNet
-from super_sdf.neighbourhood import CENTRE
+from super_sdf.network.neighbourhood import CENTRE
 from super_sdf.network.onnx import CHUNK_INPUT
-from super_sdf.steps.band import DECODE_LIMIT, MAX_DIFFERENCE
+from super_sdf.refine.band import DECODE_LIMIT, MAX_DIFFERENCE
 
 CHUNK = 512  # voxels at a time; the runtime chooses its own, see ``cpu_chunk``
 EARLY = "_early"  # the block for voxels that go no deeper

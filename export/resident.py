@@ -17,7 +17,7 @@ from torch import Tensor
 from export.augment import Prepared
 from export.batches import Batch, copies_of_queries, neighbours_with_targets
 from export.dataset import ANYWHERE, CORNERS, FINE_NODES
-from super_sdf.neighbourhood import cube_symmetries, turned_places
+from super_sdf.network.neighbourhood import cube_symmetries, turned_places
 
 # A corner and its three neighbours have at most 8 + 3 * 4 copies (``dataset.draw_offsets``).
 MOST_COPIES = 20 * CORNERS + 8 * FINE_NODES + ANYWHERE

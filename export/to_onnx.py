@@ -30,8 +30,8 @@ from export.onnx_graph import build_graph
 from super_sdf.errors import ModelError
 from super_sdf.network.contract import EXACT_DISTANCES, FORMAT_VERSION, MASKS
 from super_sdf.network.network import load_network
-from super_sdf.steps.band import find_band, gather_patches, neighbour_table
-from super_sdf.steps.nodes import block_offsets
+from super_sdf.refine.band import find_band, gather_patches, neighbour_table
+from super_sdf.refine.nodes import block_offsets
 
 OPSET = 18
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel

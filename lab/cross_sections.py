@@ -18,7 +18,7 @@ from super_sdf.errors import OptionError
 from super_sdf.grid.cubic import cubic_grid
 from super_sdf.grid.placement import as_triple
 from super_sdf.grid.sdf_grid import SdfGrid
-from super_sdf.steps.field import FineField
+from super_sdf.refine.field import FineField
 
 from .drawing import AXES, SIZE, write_picture
 

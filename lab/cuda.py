@@ -23,8 +23,8 @@ from super_sdf.errors import DeviceError
 from super_sdf.network.device import describe_gpu, onnxruntime_version, query_gpu
 from super_sdf.network.network import Network
 from super_sdf.options import QUALITIES
-from super_sdf.steps.nodes import block_offsets
-from super_sdf.steps.survey import survey
+from super_sdf.refine.nodes import block_offsets
+from super_sdf.refine.survey import survey
 
 from . import parser_of
 from .tables import markdown

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from super_sdf.errors import DeviceError, OptionError
 from super_sdf.files.output import replacing
-from super_sdf.mesh import Mesh
+from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.solid import Distances, Points, Solid
 
 from .metrics import face_vectors

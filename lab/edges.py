@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from super_sdf.arrays import BoolArray, IntArray
-from super_sdf.mesh import Mesh
+from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.solid import Distances, Points, Solid
 
 from .metrics import (

@@ -25,7 +25,7 @@ from pathlib import Path
 
 from super_sdf.errors import FileError, OptionError, SuperSdfError, seen
 from super_sdf.files.output import replacing
-from super_sdf.machine.resources import count_cores
+from super_sdf.threads import count_cores
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY, PRECISIONS
 
 from . import parser_of

@@ -27,7 +27,7 @@ import numpy as np
 
 from super_sdf.errors import FileError, OptionError
 from super_sdf.files.output import replacing
-from super_sdf.machine.resources import count_cores
+from super_sdf.threads import count_cores
 from super_sdf.network.network import find_model
 from super_sdf.options import DEFAULT_QUALITY, QUALITIES
 

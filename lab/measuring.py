@@ -14,19 +14,13 @@ from typing import Any
 import numpy as np
 
 import super_sdf
-from super_sdf.certificate.surface import count_components
+from super_sdf.check.surface import count_components
 from super_sdf.errors import SuperSdfError
 from super_sdf.files.regular import check_regular_file
 from super_sdf.machine.memory import forget_peak, held_memory
-from super_sdf.mesh import Mesh
+from super_sdf.surface.mesh import Mesh
 from super_sdf.network.decoder import Decoder
-from super_sdf.network.network import (
-    KIND_MODELS,
-    find_model,
-    float32_name,
-    load_network,
-    shipped_models,
-)
+from super_sdf.network.network import (KIND_MODELS, find_model, float32_name, load_network, shipped_models)
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY
 from super_sdf.truth.solid import Solid
 

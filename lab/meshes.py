@@ -29,7 +29,7 @@ from super_sdf.network.network import Network, find_model, load_network
 from super_sdf.options import DEFAULT_QUALITY
 from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import Slab, cut
-from super_sdf.steps.survey import Band
+from super_sdf.refine.survey import Band
 
 from . import parser_of
 from .processes import write_grid

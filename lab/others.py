@@ -19,10 +19,10 @@ from scipy import ndimage
 from scipy.stats import spearmanr
 
 from super_sdf import make_grid, reconstruct
-from super_sdf.certificate.surface import count_components
+from super_sdf.check.surface import count_components
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import GridError
-from super_sdf.mesh import Mesh
+from super_sdf.surface.mesh import Mesh
 from super_sdf.network.decoder import Decoder
 from super_sdf.truth.solid import Solid
 
@@ -183,7 +183,7 @@ def rank(one: Sequence[float], other: Sequence[float]) -> float:
 
 def measure_check(path: Path, size: int, bench: Bench) -> Row:
     """Return residuals and true errors of a shape's mesh, in voxels."""
-    from super_sdf.certificate.check import check_files
+    from super_sdf.check.check import check_files
 
     shape = Shape.read(path)
     with tempfile.TemporaryDirectory() as folder:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from super_sdf.errors import SuperSdfError
-from super_sdf.machine.resources import count_cores
+from super_sdf.threads import count_cores
 from super_sdf.machine.system import described, processor_name
 from super_sdf.truth.sampling import sample_solid, unit_layout
 

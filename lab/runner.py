@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from super_sdf.machine.pool import Death, Pool, Work
+from super_sdf.batch.pool import Death, Pool, Work
 
 from .measuring import Measurement, Task, measure_task, reason_of
 from .rows import Rows

@@ -22,9 +22,9 @@ from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.files.regular import check_regular_file
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.machine.memory import check_fits
-from super_sdf.mesh import Mesh
+from super_sdf.surface.mesh import Mesh
 from super_sdf.options import check_factor
-from super_sdf.steps.band import find_band, rescale
+from super_sdf.refine.band import find_band, rescale
 from super_sdf.truth.sampling import sample_grid, unit_layout
 from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
 

@@ -13,7 +13,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 
 from super_sdf.arrays import FloatArray
-from super_sdf.mesh import Mesh
+from super_sdf.surface.mesh import Mesh
 
 NUDGE = np.float32(1e-9)  # replaces exact zeros: a vertex on a node can open the surface
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))

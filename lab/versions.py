@@ -25,7 +25,7 @@ from concurrent.futures import ThreadPoolExecutor
 from itertools import product
 from pathlib import Path
 
-from super_sdf.machine.resources import count_cores
+from super_sdf.threads import count_cores
 
 from . import parser_of
 from .tables import markdown

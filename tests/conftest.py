@@ -14,10 +14,10 @@ from batches import FAST, PLAIN
 from hypothesis import HealthCheck, settings
 
 from super_sdf import SdfGrid
-from super_sdf.neighbourhood import NEIGHBOURHOOD
+from super_sdf.network.neighbourhood import NEIGHBOURHOOD
 from super_sdf.network.onnx import ort
 from super_sdf.slabs import cutting
-from super_sdf.steps import survey
+from super_sdf.refine import survey
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])

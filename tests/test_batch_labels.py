@@ -18,8 +18,8 @@ from test_labels import corners_of
 
 from super_sdf import load_network
 from super_sdf.convert import ConvertOptions
-from super_sdf.label_files import convert_labels
-from super_sdf.label_names import read_names
+from super_sdf.labels.files import convert_labels
+from super_sdf.labels.names import read_names
 from super_sdf.options import LABELS
 
 CASES, SIDE = 20, 12

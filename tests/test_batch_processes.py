@@ -21,8 +21,8 @@ from super_sdf.batch.job import Settings
 from super_sdf.batch.run import Queue, Run, choose_workers, useful_workers
 from super_sdf.convert import ConvertOptions
 from super_sdf.machine.memory import held_memory
-from super_sdf.machine.pool import Death, Pool
-from super_sdf.machine.resources import Resources, allot_each, count_cores
+from super_sdf.batch.pool import Death, Pool
+from super_sdf.threads import Resources, allot_each, count_cores
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 SMALL = (*FAST, "--factor", 2, "--spacing", 1)

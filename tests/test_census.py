@@ -7,7 +7,7 @@ from test_field_kinds import box
 from super_sdf import make_grid
 from super_sdf.grid import census
 from super_sdf.grid.planes import SamplePlanes
-from super_sdf.steps.survey import survey
+from super_sdf.refine.survey import survey
 
 RANDOM = np.random.default_rng(0)
 

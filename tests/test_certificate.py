@@ -13,10 +13,11 @@ from batches import rows
 from conftest import ball
 from solids import cube, inverted, joined, saved, torus
 
-from super_sdf import Mesh, SdfGrid, topology
-from super_sdf.certificate import check, surface
-from super_sdf.certificate import search as slabs
-from super_sdf.certificate.check import LIMITS, check_mesh, exceeded, stated_triangles
+from super_sdf import Mesh, SdfGrid
+from super_sdf.surface import topology
+from super_sdf.check import check, surface
+from super_sdf.check import search as slabs
+from super_sdf.check.check import LIMITS, check_mesh, exceeded, stated_triangles
 from super_sdf.files import mesh_writers
 from super_sdf.machine import extras
 

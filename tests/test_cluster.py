@@ -27,8 +27,8 @@ from super_sdf.cluster.checking import Expected, Needs, check_some, check_worker
 from super_sdf.cluster.connecting import connect
 from super_sdf.cluster.crew import Crew
 from super_sdf.errors import ClusterError
-from super_sdf.machine.pool import Death
-from super_sdf.machine.resources import Resources
+from super_sdf.batch.pool import Death
+from super_sdf.threads import Resources
 from super_sdf.network.network import Fingerprint
 
 pytestmark = pytest.mark.usefixtures("grid_folder")

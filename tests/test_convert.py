@@ -15,7 +15,7 @@ from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import FileError, GridError, MeshError, WriteError
 from super_sdf.files import meshes
 from super_sdf.files.meshes import MESH_SUFFIXES
-from super_sdf.mesh import Mesh
+from super_sdf.surface.mesh import Mesh
 
 
 class Close:

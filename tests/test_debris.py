@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from super_sdf import load_network, make_grid, reconstruct
-from super_sdf.certificate.surface import count_components
+from super_sdf.check.surface import count_components
 from super_sdf.network.network import Network
-from super_sdf.steps.debris import count_between, drop_debris
-from super_sdf.steps.field import SampleSpheres
-from super_sdf.steps.nodes import VoxelIndex, block_ijk, share_parts
+from super_sdf.refine.debris import count_between, drop_debris
+from super_sdf.refine.field import SampleSpheres
+from super_sdf.refine.nodes import VoxelIndex, block_ijk, share_parts
 
 K, SIZE = 4, 6
 VOXELS = np.indices((SIZE,) * 3).reshape(3, -1).T.astype(np.int32)

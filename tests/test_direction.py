@@ -15,7 +15,7 @@ from super_sdf import SdfGrid, make_grid, read_grid, reconstruct
 from super_sdf.errors import GridError
 from super_sdf.files.grids import write_grid
 from super_sdf.files.meshes import check_format_holds
-from super_sdf.mesh import vertex_type
+from super_sdf.surface.mesh import vertex_type
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 ORIGIN = np.array([10.0, -20.0, 5.0])

@@ -5,7 +5,7 @@ import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, reconstruct, upsample
-from super_sdf.steps.field import border_is_crossed
+from super_sdf.refine.field import border_is_crossed
 
 
 def cut_ball() -> SdfGrid:

@@ -18,14 +18,14 @@ from super_sdf.grid import planes
 from super_sdf.grid.census import Census
 from super_sdf.grid.derived import mask_distances, mask_planes
 from super_sdf.grid.field import weigh
-from super_sdf.machine.resources import Resources
-from super_sdf.mesh import join_meshes
+from super_sdf.threads import Resources
+from super_sdf.surface.mesh import join_meshes
 from super_sdf.network.network import network_for, shipped_models
 from super_sdf.options import FIELDS
-from super_sdf.steps import spline
-from super_sdf.steps.nodes import block_ijk
-from super_sdf.steps.spline import network_share, spline_blocks
-from super_sdf.steps.survey import plan_reading, survey
+from super_sdf.refine import spline
+from super_sdf.refine.nodes import block_ijk
+from super_sdf.refine.spline import network_share, spline_blocks
+from super_sdf.refine.survey import plan_reading, survey
 
 PLACE = {"spacing": 1.0, "origin": 0.0}
 

@@ -6,11 +6,12 @@ from conftest import refusal, trilinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from super_sdf import DistanceFunction, extract_mesh, functions, make_grid, reconstruct, upsample
-from super_sdf.certificate.check import check_mesh
+from super_sdf import DistanceFunction, extract_mesh, make_grid, reconstruct, upsample
+from super_sdf.functions import function as functions
+from super_sdf.check.check import check_mesh
 from super_sdf.errors import GridError, OptionError, OptionTypeError
 from super_sdf.grid.near import sample_near
-from super_sdf.steps import zero
+from super_sdf.functions import zero
 
 H = 2 / 19
 BOX = (-1.0, 1.0)

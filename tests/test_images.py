@@ -11,7 +11,7 @@ import pyvista
 from conftest import refusal, trilinear
 from vtkmodules.vtkCommonDataModel import vtkImageData
 
-import super_sdf.pyvista  # noqa: F401  (registers the accessor)
+from super_sdf.functions import pyvista as _accessor
 from super_sdf import grid_from_image, load_network, read_grid, reconstruct
 from super_sdf.errors import GridError, OptionError, OptionTypeError
 from super_sdf.truth.mesh_files import read_mesh
@@ -193,11 +193,11 @@ def test_other_mistakes_are_one_line():
 def test_an_old_pyvista_is_named(monkeypatch):
     script = (
         "import pyvista; del pyvista.register_dataset_accessor; pyvista.__version__ = '0.44.1'\n"
-        "try:\n    import super_sdf.pyvista\nexcept OSError as error:\n    print(error)"
+        "try:\n    import super_sdf.functions.pyvista\nexcept OSError as error:\n    print(error)"
     )
     done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
     assert done.stdout.decode() == (
-        "super_sdf.pyvista needs PyVista 0.48 or later, this is 0.44.1: "
+        "super_sdf.functions.pyvista needs PyVista 0.48 or later, this is 0.44.1: "
         "pip install -e '.[pyvista]' in a clone of super-sdf\n"
     )
 
@@ -212,11 +212,11 @@ def test_pyvista_finds_the_accessor_and_super_sdf_does_not_load_pyvista(tmp_path
     script = (
         f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
         "import super_sdf; super_sdf.make_grid, super_sdf.reconstruct, super_sdf.grid_from_image\n"
-        "assert not {'pyvista', 'vtkmodules', 'super_sdf.pyvista'} & set(sys.modules)\n"
+        "assert not {'pyvista', 'vtkmodules', 'super_sdf.functions.pyvista'} & set(sys.modules)\n"
         "import pyvista\n"
-        "assert 'super_sdf.pyvista' not in sys.modules\n"
+        "assert 'super_sdf.functions.pyvista' not in sys.modules\n"
         "print(pyvista.ImageData().super_sdf, hasattr(pyvista.PolyData(), 'super_sdf'))"
     )
     done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
-    assert done.stdout.startswith(b"<super_sdf.pyvista.ImageAccessor object at ")
+    assert done.stdout.startswith(b"<super_sdf.functions.pyvista.ImageAccessor object at ")
     assert done.stdout.endswith(b" False\n")

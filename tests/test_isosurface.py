@@ -10,18 +10,12 @@ from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
 from super_sdf import SdfGrid, extract_mesh, load_network, reconstruct, upsample
-from super_sdf.certificate.surface import count_components
-from super_sdf.mesh import CLEARANCE
-from super_sdf.steps.band import neighbour_table
-from super_sdf.steps.cell_cases import (
-    EDGE_AXIS,
-    EDGE_START,
-    FACES,
-    choices,
-    triangle_table,
-)
-from super_sdf.steps.field import FineField
-from super_sdf.steps.nodes import block_ijk, share_parts
+from super_sdf.check.surface import count_components
+from super_sdf.surface.mesh import CLEARANCE
+from super_sdf.refine.band import neighbour_table
+from super_sdf.surface.cell_cases import EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
+from super_sdf.refine.field import FineField
+from super_sdf.refine.nodes import block_ijk, share_parts
 
 
 def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGrid]:

@@ -16,8 +16,8 @@ from skimage.measure import marching_cubes
 
 from super_sdf import Mesh, load_network, make_grid, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
-from super_sdf.label_files import MOST_FILES, label_paths
-from super_sdf.labels import Work, reconstruct_labels
+from super_sdf.labels.files import MOST_FILES, label_paths
+from super_sdf.labels.reconstruct import Work, reconstruct_labels
 from super_sdf.slabs.cutting import equal_parts
 
 

@@ -7,17 +7,7 @@ import pytest
 from conftest import ball, trilinear
 
 import super_sdf
-from super_sdf import (
-    SdfGrid,
-    SuperSdfError,
-    extract_mesh,
-    load_network,
-    make_grid,
-    read_grid,
-    reconstruct,
-    upsample,
-    write_mesh,
-)
+from super_sdf import (SdfGrid, SuperSdfError, extract_mesh, load_network, make_grid, read_grid, reconstruct, upsample, write_mesh)
 from super_sdf.convert import in_percent
 from super_sdf.errors import GridError, OptionError
 

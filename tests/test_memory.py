@@ -21,12 +21,12 @@ from super_sdf.grid.census import Census
 from super_sdf.grid.field import weigh
 from super_sdf.grid.planes import Few, changed, ranks_of
 from super_sdf.machine import memory
-from super_sdf.machine.resources import Resources
+from super_sdf.threads import Resources
 from super_sdf.pipeline import reconstruct_slabs
-from super_sdf.steps import band as band_step
-from super_sdf.steps import spline
-from super_sdf.steps import survey as survey_step
-from super_sdf.steps.survey import look_at_band, survey
+from super_sdf.refine import band as band_step
+from super_sdf.refine import spline
+from super_sdf.refine import survey as survey_step
+from super_sdf.refine.survey import look_at_band, survey
 
 # Arrays of 4 MB in a row, of which the last stays: the C library keeps what is freed before it.
 # Arrays of 4 MB in a row, of which the last stays: the C library keeps what is freed before it.

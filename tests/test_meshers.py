@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from test_slabs import assert_same, in_pieces, joined, rod
 
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
-from super_sdf.machine import resources
-from super_sdf.mesh import join_meshes
+from super_sdf import threads as resources
+from super_sdf.surface.mesh import join_meshes
 from super_sdf.slabs import cutting
-from super_sdf.steps import meshers
-from super_sdf.steps.marching import extract_pieces
-from super_sdf.steps.sharp import mesher as sharp
+from super_sdf.surface import meshers
+from super_sdf.surface.marching import extract_pieces
+from super_sdf.surface.sharp import mesher as sharp
 
 
 @pytest.fixture(scope="module")

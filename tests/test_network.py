@@ -11,13 +11,13 @@ from onnx_files import DOUBLE, FLOAT, metadata, write_network
 
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
-from super_sdf.neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
+from super_sdf.network.neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
 from super_sdf.network.decoder import check_output, to_blocks
 from super_sdf.network.network import KIND_MODELS, Network, shipped_models, small_ball
 from super_sdf.network.onnx import CORE_CHUNK, CPU_CHUNK, cpu_chunk
 from super_sdf.options import QUALITIES
-from super_sdf.steps.band import find_band, gather_patches, neighbour_table, rescale
-from super_sdf.steps.nodes import block_offsets
+from super_sdf.refine.band import find_band, gather_patches, neighbour_table, rescale
+from super_sdf.refine.nodes import block_offsets
 
 
 def network_inputs(grid):

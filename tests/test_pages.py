@@ -15,22 +15,14 @@ from PIL import Image
 from skimage.measure import marching_cubes
 
 from super_sdf import Mesh, SdfGrid, reconstruct
-from super_sdf.certificate.check import FULL, check_mesh
+from super_sdf.check.check import FULL, check_mesh
 from super_sdf.convert import ConvertOptions, Kept
 from super_sdf.grid.cubic import cubic_grid
 from super_sdf.pages import meshes
 from super_sdf.pages.html import is_page, make_page, write_page
-from super_sdf.pages.items import (
-    Item,
-    certificate_facts,
-    entry_of,
-    item_of,
-    read_head,
-    read_meshes,
-    write_item,
-)
+from super_sdf.pages.items import (Item, certificate_facts, entry_of, item_of, read_head, read_meshes, write_item)
 from super_sdf.pages.meshes import coarse_surface, packed_mesh, residual_bytes, thumbnail
-from super_sdf.steps.survey import survey
+from super_sdf.refine.survey import survey
 
 NASTY = '</script><img src=x onerror=alert(1)> & "quoted" \u2028\udcff'
 

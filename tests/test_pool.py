@@ -10,8 +10,8 @@ import pytest
 from planted import run_beside_planted_files
 
 from super_sdf.errors import SuperSdfError
-from super_sdf.machine import pool
-from super_sdf.machine.pool import Death, Pool, describe_exit
+from super_sdf.batch import pool
+from super_sdf.batch.pool import Death, Pool, describe_exit
 
 KILLED = Death("was killed by SIGKILL (most likely out of memory)")
 

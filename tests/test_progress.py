@@ -18,7 +18,7 @@ from super_sdf import load_network, reconstruct, upsample
 from super_sdf.network import network, onnx
 from super_sdf.network.onnx import LINEAR_UP_TO, share_of_time
 from super_sdf.progress import StepCounter
-from super_sdf.steps.nodes import block_offsets
+from super_sdf.refine.nodes import block_offsets
 
 
 @pytest.fixture

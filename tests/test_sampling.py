@@ -8,13 +8,7 @@ from solids import TORUS, cube, inverted, joined, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError, load_network, reconstruct
 from super_sdf.truth import sampling
-from super_sdf.truth.sampling import (
-    fitted_layout,
-    grid_points,
-    sample_grid,
-    sample_solid,
-    unit_layout,
-)
+from super_sdf.truth.sampling import (fitted_layout, grid_points, sample_grid, sample_solid, unit_layout)
 from super_sdf.truth.solid import Solid, examine, load_solid
 
 

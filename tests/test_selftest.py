@@ -6,11 +6,11 @@ import re
 import numpy as np
 import pytest
 
-from super_sdf import selftest
+from super_sdf.cli import selftest
 from super_sdf.machine import extras
 from super_sdf.machine.extras import EXTRAS
 from super_sdf.network import network
-from super_sdf.selftest import Finding, run_checks
+from super_sdf.cli.selftest import Finding, run_checks
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
 

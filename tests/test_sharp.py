@@ -9,21 +9,14 @@ from test_isosurface import dense_field
 
 from lab.methods import sharp_isosurface
 from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
-from super_sdf.certificate.search import self_intersections
-from super_sdf.steps.cell_cases import loop_table, triangle_table
-from super_sdf.steps.marching import find_crossings
-from super_sdf.steps.sharp.features import Rule, is_sharp
-from super_sdf.steps.sharp.folds import without_folds
-from super_sdf.steps.sharp.patches import (
-    Patches,
-    Placed,
-    find_patches,
-    triangles_of,
-    unfolded,
-    voxels_near_kinks,
-)
-from super_sdf.steps.sharp.planes import planes_at_crossings
-from super_sdf.steps.sharp.triangle_pairs import intersecting
+from super_sdf.check.search import self_intersections
+from super_sdf.surface.cell_cases import loop_table, triangle_table
+from super_sdf.surface.marching import find_crossings
+from super_sdf.surface.sharp.features import Rule, is_sharp
+from super_sdf.surface.sharp.folds import without_folds
+from super_sdf.surface.sharp.patches import (Patches, Placed, find_patches, triangles_of, unfolded, voxels_near_kinks)
+from super_sdf.surface.sharp.planes import planes_at_crossings
+from super_sdf.surface.sharp.triangle_pairs import intersecting
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 

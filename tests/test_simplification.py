@@ -15,17 +15,17 @@ from solids import cube, joined, sphere, square, torus
 
 from lab.surfaces import isosurface
 from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
-from super_sdf.certificate.surface import count_components
+from super_sdf.check.surface import count_components
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
 from super_sdf.files.mesh_writers import write_ply
 from super_sdf.machine import extras
 from super_sdf.machine.memory import held_memory
 from super_sdf.network.network import load_network
-from super_sdf.simplification import collapsing, simplify
-from super_sdf.simplification.collapsing import collapse_within
-from super_sdf.simplification.measuring import Original
-from super_sdf.topology import irregular_places
+from super_sdf.simplify import collapsing, simplify
+from super_sdf.simplify.collapsing import collapse_within
+from super_sdf.simplify.measuring import Original
+from super_sdf.surface.topology import irregular_places
 
 QUICK = ("--quality", "fast", "--factor", 2)
 UNREACHED = (

@@ -7,34 +7,19 @@ import numpy as np
 import pytest
 from conftest import ball, trilinear
 
-from super_sdf import (
-    SdfGrid,
-    extract_mesh,
-    load_network,
-    make_grid,
-    pipeline,
-    reconstruct,
-    upsample,
-)
+from super_sdf import (SdfGrid, extract_mesh, load_network, make_grid, pipeline, reconstruct, upsample)
 from super_sdf.errors import OptionError, OutOfMemoryError
 from super_sdf.grid.field import Field
-from super_sdf.machine import resources
-from super_sdf.machine.resources import Resources
-from super_sdf.mesh import Mesh, join_meshes
+from super_sdf import threads as resources
+from super_sdf.threads import Resources
+from super_sdf.surface.mesh import Mesh, join_meshes
 from super_sdf.options import MARCHING, SHARP
 from super_sdf.pipeline import reconstruct_slabs
 from super_sdf.slabs import cutting, preparing
-from super_sdf.slabs.cutting import (
-    check_vertices,
-    cut,
-    equal_parts,
-    peak_bytes,
-    plan_slabs,
-    slab_bytes,
-)
-from super_sdf.steps.meshers import BY_NAME
-from super_sdf.steps.nodes import number_parts, share_parts
-from super_sdf.steps.survey import count_crossings, look_at_band, survey
+from super_sdf.slabs.cutting import (check_vertices, cut, equal_parts, peak_bytes, plan_slabs, slab_bytes)
+from super_sdf.surface.meshers import BY_NAME
+from super_sdf.refine.nodes import number_parts, share_parts
+from super_sdf.refine.survey import count_crossings, look_at_band, survey
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from conftest import ball
 
 from super_sdf import read_grid, write_mesh
 from super_sdf.errors import OptionError
-from super_sdf.mesh import Mesh
+from super_sdf.surface.mesh import Mesh
 
 AFFINE = np.array([[0, -0.5, 0, 10.0], [0.5, 0, 0, -20], [0, 0, 0.5, 30], [0, 0, 0, 1]])
 VALUES = ball(14, 4.0).values * np.float32(0.5)

@@ -7,11 +7,11 @@ import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
-from super_sdf.steps.band import HALF_BAND, MAX_DISTANCE, neighbour_table
-from super_sdf.steps.bounds import bounded_values, keep_within_bounds, samples_around
-from super_sdf.steps.nodes import VoxelIndex, average_shared, block_ijk, share_parts
-from super_sdf.steps.spheres import find_foot_points, fit_to_spheres, spheres_of_band
-from super_sdf.steps.survey import survey
+from super_sdf.refine.band import HALF_BAND, MAX_DISTANCE, neighbour_table
+from super_sdf.refine.bounds import bounded_values, keep_within_bounds, samples_around
+from super_sdf.refine.nodes import VoxelIndex, average_shared, block_ijk, share_parts
+from super_sdf.refine.spheres import find_foot_points, fit_to_spheres, spheres_of_band
+from super_sdf.refine.survey import survey
 
 CENTRE_OF_BALL = 10 - 0.37
 

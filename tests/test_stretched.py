@@ -5,15 +5,7 @@ import pytest
 from conftest import refusal, trilinear
 from scipy import ndimage
 
-from super_sdf import (
-    extract_mesh,
-    fine_grid,
-    make_grid,
-    read_field,
-    reconstruct,
-    upsample,
-    write_field,
-)
+from super_sdf import (extract_mesh, fine_grid, make_grid, read_field, reconstruct, upsample, write_field)
 from super_sdf.errors import GridError
 
 SPACING = np.array([1.0, 1.0, 2.5])

@@ -11,7 +11,7 @@ import pytest
 import pyvista
 from vtkmodules.vtkCommonDataModel import vtkPolyData
 
-import super_sdf.pyvista  # noqa: F401  (registers the accessor, whatever is installed)
+from super_sdf.functions import pyvista as _accessor
 from super_sdf import read_grid, reconstruct
 from super_sdf.truth.mesh_files import read_mesh
 

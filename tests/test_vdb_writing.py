@@ -12,28 +12,11 @@ from conftest import ball, refusal, trilinear
 from test_fields import TURNED, cut_ball, tip
 from test_vdb import text
 
-from super_sdf import (
-    SdfGrid,
-    extract_mesh,
-    fine_grid,
-    make_grid,
-    read_grid,
-    reconstruct,
-    upsample,
-    write_field,
-)
+from super_sdf import (SdfGrid, extract_mesh, fine_grid, make_grid, read_grid, reconstruct, upsample, write_field)
 from super_sdf.errors import OptionError
 from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
-from super_sdf.files.vdb_writer import (
-    ACTIVE_MASK,
-    INSIDE,
-    MIXED,
-    OUTSIDE,
-    LevelSet,
-    leaf_bytes,
-    write_level_set,
-)
+from super_sdf.files.vdb_writer import (ACTIVE_MASK, INSIDE, MIXED, OUTSIDE, LevelSet, leaf_bytes, write_level_set)
 
 PAD = 8  # voxels that are looked at beyond the lattice
 

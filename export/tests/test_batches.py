@@ -9,9 +9,9 @@ from export.augment import prepare
 from export.batches import Batch, batch_of, copies_of_queries, encode, predict
 from export.dataset import Sample
 from export.tests.small_net import small_net
-from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
+from super_sdf.network.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.decoder import to_blocks
-from super_sdf.steps.nodes import average_shared, block_offsets, rows_among, share_parts
+from super_sdf.refine.nodes import average_shared, block_offsets, rows_among, share_parts
 
 
 def ball_sample(factor=4):

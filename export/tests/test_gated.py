@@ -20,11 +20,11 @@ from export.tests.small_net import SMALL
 from export.tests.test_resident import turned_one_by_one
 from export.to_onnx import make_card, noisy_ball, parity, read_network, write_model
 from super_sdf.errors import OptionError
-from super_sdf.neighbourhood import CENTRE
+from super_sdf.network.neighbourhood import CENTRE
 from super_sdf.network.contract import INPUTS
 from super_sdf.network.network import load_network, shipped_models
 from super_sdf.network.onnx import CHUNK_INPUT, ort
-from super_sdf.steps.band import DECODE_LIMIT
+from super_sdf.refine.band import DECODE_LIMIT
 
 CONFIG = replace(SMALL, channels=16, hidden=32, blocks=4, gated=2)
 ALWAYS, NEVER = -1e9, 1e9

@@ -11,7 +11,7 @@ from export.recipe import RECIPE, window_losses
 from export.resident import MOST_COPIES, Residents, gather_samples
 from export.tests.small_net import small_net
 from export.tests.test_batches import ball_sample
-from super_sdf.neighbourhood import cube_symmetries, turn
+from super_sdf.network.neighbourhood import cube_symmetries, turn
 
 DRAWN, TURNS = [2, 0, 1, 2], [0, 5, 17, 40]
 

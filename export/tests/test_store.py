@@ -14,7 +14,7 @@ from export.recipe import RECIPE
 from export.store import ResidentStore, Sampler, Store, chances, divide, read_changed
 from export.tests.small_net import SMALL
 from export.train import Run, take_step
-from super_sdf.neighbourhood import CENTRE
+from super_sdf.network.neighbourhood import CENTRE
 
 
 def shown(sampler: Sampler, count: int, spread: float = 3.0) -> list[int]:

@@ -22,12 +22,12 @@ from export.tests.small_net import SMALL, small_net
 from export.train import Run, autocast, take_step, train
 from super_sdf import Mesh, load_network
 from super_sdf.errors import FileError, OptionError
-from super_sdf.neighbourhood import CENTRE, NEIGHBOURHOOD
+from super_sdf.network.neighbourhood import CENTRE, NEIGHBOURHOOD
 from super_sdf.network.contract import EXACT_DISTANCES, INPUTS
 from super_sdf.network.network import shipped_models
 from super_sdf.network.onnx import CHUNK_INPUT
-from super_sdf.steps.band import is_lipschitz, neighbour_table
-from super_sdf.steps.nodes import block_offsets
+from super_sdf.refine.band import is_lipschitz, neighbour_table
+from super_sdf.refine.nodes import block_offsets
 from super_sdf.truth.solid import Solid
 
 LOW = np.array([[-0.3, -0.2, -0.1], [-0.1, -0.1, -0.05]])

@@ -19,16 +19,7 @@ from numpy.typing import NDArray
 from .arrays import Triple
 from .errors import MeshError
 from .files.grids import read_grid
-from .files.meshes import (
-    CERTAIN_SHARE,
-    Expectation,
-    World,
-    check_format_holds,
-    check_target,
-    expect,
-    local_origin_note,
-    write_pieces,
-)
+from .files.meshes import (CERTAIN_SHARE, Expectation, World, check_format_holds, check_target, expect, local_origin_note, write_pieces)
 from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.cubic import cubic_grid
@@ -36,21 +27,21 @@ from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
 from .machine.extras import check_modules
 from .machine.memory import memory_bound
-from .mesh import Mesh, join_meshes
+from .surface.mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP
 from .options import ConvertOptions as ConvertOptions
 from .pipeline import reconstruct_slabs
 from .progress import Progress, Stopwatch, part_of, share_of
 from .slabs.preparing import Piece
-from .steps.cap import check_can_close
-from .steps.field import lattice_shape
-from .steps.survey import Band
-from .topology import OpenEdges
+from .surface.cap import check_can_close
+from .refine.field import lattice_shape
+from .refine.survey import Band
+from .surface.topology import OpenEdges
 
 if TYPE_CHECKING:
-    from .fields.writing import FieldFile
-    from .simplification.simplify import Simplified
+    from .files.fields import FieldFile
+    from .simplify.simplify import Simplified
 
 CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
@@ -208,7 +199,7 @@ def _field_file(
     if path is None:
         return nullcontext()
     # imported here, since few conversions write a field, and the start is part of each
-    from .fields.writing import check_field_fits, check_field_target, saving_field
+    from .files.fields import check_field_fits, check_field_target, saving_field
 
     check_can_close(grid, cap=options.cap)
     path, shape = check_field_target(path, force=force), lattice_shape(grid.shape, options.factor)
@@ -239,14 +230,14 @@ def convert_grid(
     check_apart(target, files_of(source))
     check_target(target, force=force, unit=options.unit)
     if options.keep_volume:
-        from .volumes import check_has_volume  # imported here, as few conversions need it
+        from .labels.volumes import check_has_volume  # imported here, as few conversions need it
 
         check_has_volume(grid, options.offset, cap=options.cap)
     lattice = cubic_grid(grid, options.offset)
     about = check_format_holds(target, lattice, options.factor)
     expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
     if options.goals():  # imported here, as few conversions need it
-        from .simplification.simplify import check_room
+        from .simplify.simplify import check_room
 
         least = int(expected.triangles * CERTAIN_SHARE)
         check_room(least, options.max_memory, estimated=True)
@@ -296,12 +287,12 @@ def _reworked(
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
     simplified, off = None, list[str]()
     if options.keep_volume:
-        from .volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
+        from .labels.volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
 
         volume = volume_of_samples(grid)
         (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))
     if options.goals():
-        from .simplification.simplify import simplify_mesh
+        from .simplify.simplify import simplify_mesh
 
         simplified = simplify_mesh(
             mesh,

@@ -21,26 +21,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
-from .functions import Function, as_function, sampled
+from .functions.function import Function, as_function, sampled
 from .grid.sdf_grid import SdfGrid, check_grid
 from .machine.memory import give_back
-from .mesh import Mesh, join_meshes
-from .neighbourhood import CENTRE
+from .surface.mesh import Mesh, join_meshes
+from .network.neighbourhood import CENTRE
 from .network.decoder import Decoder, decode
 from .network.network import given_or_loaded
 from .progress import STEPS, Progress, StepCounter
 from .slabs.cutting import Slab
 from .slabs.preparing import Piece, Run, describe_piece, prepare
-from .steps import nodes
-from .steps.band import BandSummary
-from .steps.bounds import keep_within_bounds
-from .steps.cap import check_can_close, close, seen_octants
-from .steps.debris import count_between, drop_debris
-from .steps.field import FineField, SampleSpheres
-from .steps.meshers import extract_pieces
-from .steps.spheres import fit_to_spheres, spheres_of_band
-from .steps.spline import interpolate
-from .steps.survey import Band, no_surface
+from .refine import nodes
+from .refine.band import BandSummary
+from .refine.bounds import keep_within_bounds
+from .surface.cap import check_can_close, close, seen_octants
+from .refine.debris import count_between, drop_debris
+from .refine.field import FineField, SampleSpheres
+from .surface.meshers import extract_pieces
+from .refine.spheres import fit_to_spheres, spheres_of_band
+from .refine.spline import interpolate
+from .refine.survey import Band, no_surface
 
 
 def refine(
@@ -228,7 +228,7 @@ def reconstruct(
     mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
     if exact is None:
         return mesh
-    from .steps.zero import put_on_zero  # imported here, as few call it
+    from .functions.zero import put_on_zero  # imported here, as few call it
 
     return put_on_zero(mesh, exact, grid, factor, offset)
 

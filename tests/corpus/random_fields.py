@@ -12,7 +12,7 @@ from conftest import count_fans
 from super_sdf import Mesh, SdfGrid, pipeline, reconstruct
 from super_sdf.cluster.bricks import Meshed, joined
 from super_sdf.convert import Tally
-from super_sdf.mesh import join_meshes
+from super_sdf.surface.mesh import join_meshes
 from super_sdf.network.network import Network
 from super_sdf.options import DEFAULT_MESHER
 from super_sdf.pipeline import Decoder
@@ -20,8 +20,8 @@ from super_sdf.progress import Stopwatch
 from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import cut, equal_parts
 from super_sdf.slabs.preparing import Piece
-from super_sdf.steps.marching import CAP_HEIGHT
-from super_sdf.steps.survey import look_at_band
+from super_sdf.surface.marching import CAP_HEIGHT
+from super_sdf.refine.survey import look_at_band
 
 from .case import ball, rng_of
 

@@ -18,8 +18,8 @@ from ..errors import FileError, OptionError
 from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import check_mesh_suffix
 from ..files.regular import is_store, reason_of
-from ..label_files import with_numbers
-from ..label_names import Names
+from ..labels.files import with_numbers
+from ..labels.names import Names
 from ..options import ConvertOptions
 from .job import Job
 from .ledger import LOCK_NAME, NAME, STARTED_NAME

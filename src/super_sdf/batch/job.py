@@ -13,8 +13,8 @@ from ..convert import Conversion, ConvertOptions, convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.meshes import format_of
 from ..files.regular import check_grid_file
-from ..label_files import convert_labels
-from ..label_names import Names
+from ..labels.files import convert_labels
+from ..labels.names import Names
 from ..network.network import Network, load_network
 from ..options import AUTO, AUTO_PRECISION, Device, Precision
 from ..progress import Progress
@@ -195,7 +195,7 @@ def _certify(job: Job, done: Conversion, mesh: Fingerprint, settings: Settings) 
 
     What a page shows of the mesh is written into the folder for that, if there is one.
     """
-    from ..certificate.check import check_files
+    from ..check.check import check_files
 
     files = settings.folder / job.target, job.source, job.options
     try:

@@ -26,7 +26,7 @@ from ..errors import FileError, WriteError
 from ..files.formats import split_member
 from ..files.output import remove_abandoned_parts
 from ..files.regular import files_of, is_store
-from ..machine.records import RecordFile, parse_line
+from .records import RecordFile, parse_line
 
 NAME, STARTED_NAME, LOCK_NAME = "report.jsonl", ".super-sdf-batch", ".super-sdf-batch.lock"
 Fingerprint = dict[str, Any]

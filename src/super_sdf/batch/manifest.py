@@ -19,8 +19,8 @@ from typing import Any
 from ..errors import FileError, OptionError
 from ..files.formats import mesh_path
 from ..files.meshes import MESH_SUFFIXES
-from ..label_files import with_numbers
-from ..label_names import Names
+from ..labels.files import with_numbers
+from ..labels.names import Names
 from ..options import BATCH_LISTS, GOALS, OPTIONS, ConvertOptions
 from .job import Job
 

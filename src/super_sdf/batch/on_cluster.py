@@ -13,8 +13,8 @@ from ..cluster.connecting import connect
 from ..cluster.crew import CheckWanted, ClusterWork, Crew
 from ..files.formats import find_format, split_member
 from ..machine.extras import EXTRAS, missing_modules
-from ..machine.pool import Death, Tasks
-from ..machine.resources import Resources
+from .pool import Death, Tasks
+from ..threads import Resources
 from ..network.network import find_model, shipped_models
 from .job import Job, Settings, attempt, failed_row
 from .ledger import Row

@@ -15,16 +15,7 @@ from .. import __version__
 from ..files.regular import files_of
 from ..network.network import find_model
 from .job import Job, Result, Settings, failed_row
-from .ledger import (
-    Fingerprint,
-    Ledger,
-    Row,
-    asked_of,
-    file_state,
-    fingerprint,
-    is_unchanged,
-    outputs_of,
-)
+from .ledger import (Fingerprint, Ledger, Row, asked_of, file_state, fingerprint, is_unchanged, outputs_of)
 
 
 @dataclass

@@ -14,8 +14,8 @@ from dataclasses import replace
 from functools import partial
 
 from ..machine.memory import free_memory
-from ..machine.pool import Death, Pool, Work
-from ..machine.resources import allot_each, count_cores
+from .pool import Death, Pool, Work
+from ..threads import allot_each, count_cores
 from ..network.device import available_devices
 from .job import Job, Result, Settings, attempt, failed_row
 from .ledger import Ledger, Row

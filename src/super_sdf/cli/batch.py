@@ -13,33 +13,8 @@ from ..errors import SuperSdfError, WriteError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
 from ..options import MESH_FORMATS
-from .batch_report import (
-    made_again_lines,
-    print_plan,
-    print_summary,
-    progress_line,
-    sentence,
-    summary,
-)
-from .common import (
-    CONTEXT,
-    GroupedCommand,
-    InterruptedCommand,
-    check_can_check,
-    check_cluster,
-    check_names,
-    check_option,
-    check_page,
-    chosen_model,
-    cluster_option,
-    conversion_options,
-    labels_option,
-    make_options,
-    names_option,
-    one_line_errors,
-    print_stderr,
-    report_option,
-)
+from .batch_report import (made_again_lines, print_plan, print_summary, progress_line, sentence, summary)
+from .common import (CONTEXT, GroupedCommand, InterruptedCommand, check_can_check, check_cluster, check_names, check_option, check_page, chosen_model, cluster_option, conversion_options, labels_option, make_options, names_option, one_line_errors, print_stderr, report_option)
 from .interrupts import describe_interrupt, exit_code, raising_interrupts
 
 if TYPE_CHECKING:
@@ -129,8 +104,8 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     from ..batch.job import Settings
     from ..batch.ledger import Ledger
     from ..batch.plan import Planner
-    from ..label_files import check_options
-    from ..label_names import read_names
+    from ..labels.files import check_options
+    from ..labels.names import read_names
     from ..network.network import find_model
 
     if options["check"]:

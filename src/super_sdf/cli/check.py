@@ -11,15 +11,7 @@ import click
 
 from ..machine.extras import check_modules
 from ..options import GRID, LENGTHS, ConvertOptions, parse_size
-from .common import (
-    CHECK_MODULES,
-    CONTEXT,
-    Parsed,
-    one_line_errors,
-    print_stderr,
-    print_stdout,
-    table_options,
-)
+from .common import (CHECK_MODULES, CONTEXT, Parsed, one_line_errors, print_stderr, print_stdout, table_options)
 from .interrupts import raising_interrupts
 
 EXAMPLES = """\b
@@ -123,14 +115,7 @@ def check_command(mesh: Path, grid: Path, **options: Any) -> None:
 
 def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
     """Check the files, print the certificate, write the coloured mesh; return exceeded limits."""
-    from ..certificate.check import (
-        LIMITS,
-        check_coloured,
-        check_files,
-        check_limits,
-        exceeded,
-        write_coloured,
-    )
+    from ..check.check import (LIMITS, check_coloured, check_files, check_limits, exceeded, write_coloured)
     from ..files.output import check_apart
     from ..files.regular import files_of
 

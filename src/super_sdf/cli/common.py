@@ -320,12 +320,12 @@ def load_chosen(options: dict[str, Any], meanwhile: Callable[[], None] = lambda:
     with ThreadPoolExecutor(1) as pool:
         loading = pool.submit(load_network, chosen_model(options), **chosen)
         from .. import convert  # noqa: F401  # onnxruntime needs no interpreter while it loads
-        from ..steps.cell_cases import loop_table, triangle_table
+        from ..surface.cell_cases import loop_table, triangle_table
 
         meanwhile()
         triangle_table()  # it is kept
         if options.get("mesher") != MARCHING:
-            from ..steps.sharp import mesher  # noqa: F401
+            from ..surface.sharp import mesher  # noqa: F401
 
             loop_table()
         return loading.result()

@@ -93,7 +93,7 @@ def _grid_in_words(grid: dict[str, Any]) -> str:
 
 def print_checks(device: Device, as_json: bool) -> bool:
     """Run the checks and print each result as it comes; return whether none failed."""
-    from ..selftest import FAILED, run_checks
+    from .selftest import FAILED, run_checks
 
     findings = []
     for finding in run_checks(device):

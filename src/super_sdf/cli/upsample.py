@@ -15,31 +15,11 @@ from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
 from ..options import MESH_FORMATS, QUALITIES, ConvertOptions
 from ..progress import Progress, Stopwatch
-from .common import (
-    CONTEXT,
-    GroupedCommand,
-    check_can_check,
-    check_cluster,
-    check_names,
-    check_option,
-    check_page,
-    chosen_model,
-    cluster_option,
-    conversion_options,
-    labels_option,
-    load_chosen,
-    make_options,
-    names_option,
-    one_line_errors,
-    print_stderr,
-    print_stdout,
-    progress_bar,
-    report_option,
-)
+from .common import (CONTEXT, GroupedCommand, check_can_check, check_cluster, check_names, check_option, check_page, chosen_model, cluster_option, conversion_options, labels_option, load_chosen, make_options, names_option, one_line_errors, print_stderr, print_stdout, progress_bar, report_option)
 from .interrupts import raising_interrupts
 
 if TYPE_CHECKING:
-    from ..certificate.check import Certificate
+    from ..check.check import Certificate
     from ..convert import Conversion
     from ..network.network import Network
 
@@ -146,7 +126,7 @@ class Upsampling:
         check_target(self.target, force=force, unit=self.chosen.unit)
         outputs: list[str] = [self.target]
         if options["save_field"] is not None:
-            from ..fields.writing import check_field_target
+            from ..files.fields import check_field_target
 
             check_field_target(options["save_field"], force=force)
             outputs.append(options["save_field"])
@@ -210,7 +190,7 @@ class Upsampling:
 
     def _check(self) -> None:
         """Check the finished mesh against its samples."""
-        from ..certificate.check import check_files
+        from ..check.check import check_files
 
         watch, threads = Stopwatch(), self.options["threads"]
         files = self.target, self.source, self.chosen
@@ -278,8 +258,8 @@ def upsample_labels(
     source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
 ) -> None:
     """Convert the labels of an image to meshes, and print what was made."""
-    from ..label_files import check_options, convert_labels, missing_note
-    from ..label_names import read_names
+    from ..labels.files import check_options, convert_labels, missing_note
+    from ..labels.names import read_names
 
     watch, model = Stopwatch(), chosen_model(options)
     check_options(chosen, [name for name in NOT_WITH_LABELS if options[name]])

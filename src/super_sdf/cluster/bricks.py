@@ -29,18 +29,18 @@ from ..grid.cubic import check_has_offsets
 from ..grid.planes import Ranges, Result, SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid
 from ..machine.memory import give_back, held_memory, memory_bound
-from ..machine.pool import Death
-from ..machine.resources import Resources, check_count
-from ..mesh import vertex_type
+from ..batch.pool import Death
+from ..threads import Resources, check_count
+from ..surface.mesh import vertex_type
 from ..network.network import Network, load_network
 from ..options import ConvertOptions
 from ..pipeline import reconstruct_planes
 from ..progress import TOTAL, Progress, Stopwatch
 from ..slabs.cutting import check_crossings, equal_parts
 from ..slabs.preparing import Piece
-from ..steps.band import BandSummary
-from ..steps.cap import check_all_seen
-from ..steps.survey import BYTES_PER_VOXEL, Glance, look_at_band, no_surface
+from ..refine.band import BandSummary
+from ..surface.cap import check_all_seen
+from ..refine.survey import BYTES_PER_VOXEL, Glance, look_at_band, no_surface
 from .checking import Needs
 from .connecting import Cluster
 from .crew import CheckWanted, Crew

@@ -28,8 +28,8 @@ from .. import __version__
 from ..errors import ClusterError, SuperSdfError, WriteError
 from ..machine.extras import missing_modules
 from ..machine.memory import SHARE, free_memory, reuse_freed
-from ..machine.pool import settle_signals
-from ..machine.resources import Resources
+from ..batch.pool import settle_signals
+from ..threads import Resources
 from ..network.device import onnxruntime_version
 from ..network.network import Fingerprint, find_model, fingerprint_of, shipped_models
 from ..options import AUTO, AUTO_PRECISION, Device, Precision

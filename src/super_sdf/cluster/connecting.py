@@ -22,8 +22,8 @@ from distributed.comm import core as comm
 from distributed.security import Security
 
 from ..errors import ClusterError
-from ..machine.pool import ending_signals_blocked, python_flags
-from ..machine.resources import Resources, allot_each, count_cores
+from ..batch.pool import ending_signals_blocked, python_flags
+from ..threads import Resources, allot_each, count_cores
 
 LOCAL = "local"
 CONNECT_SECONDS = 5  # that a scheduler has to answer

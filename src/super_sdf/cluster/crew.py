@@ -23,8 +23,8 @@ from distributed import Future, KilledWorker, Worker, get_worker, wait
 from distributed.core import Status
 
 from ..errors import ClusterError, SuperSdfError
-from ..machine.pool import Death, Tasks
-from ..machine.resources import Resources
+from ..batch.pool import Death, Tasks
+from ..threads import Resources
 from .checking import Needs, check_some, check_workers, first_of
 from .connecting import Cluster
 

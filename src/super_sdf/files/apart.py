@@ -52,7 +52,7 @@ class _Process:
         self.left = request.left
         if self.left is None and bound is not None:
             self.left = bound - self.start
-        from ..machine.pool import isolated_python  # imports multiprocessing, for 10 ms
+        from ..batch.pool import isolated_python  # imports multiprocessing, for 10 ms
 
         self.process = Popen(isolated_python(START), stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         threading.Thread(target=self._watch, daemon=True).start()

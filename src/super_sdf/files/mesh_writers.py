@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, Triple
 from ..errors import FileError
-from ..mesh import Mesh
+from ..surface.mesh import Mesh
 from ..options import LENGTHS
 from .output import append_spool, little_endian, replacing, spool_beside
 

@@ -22,17 +22,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, GridError, OutOfMemoryError
 from ..grid.planes import InputFile, PlaneFile
 from .streams import CODECS, Read, Unpacker, bytes_from, next_planes
-from .volume import (
-    PLACE,
-    ZYX,
-    Request,
-    Volume,
-    axes_direction,
-    in_short,
-    in_words_of,
-    kept_axes,
-    triple,
-)
+from .volume import (PLACE, ZYX, Request, Volume, axes_direction, in_short, in_words_of, kept_axes, triple)
 
 LONGEST = 10_000  # bytes of a header, NumPy's limit
 LARGEST = 10**18  # samples along an axis

@@ -17,29 +17,9 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .planes import (
-    Few,
-    Ranges,
-    SampleArray,
-    SamplePlanes,
-    lowest,
-    over_planes,
-    ranks_of,
-    spread_planes,
-)
+from .planes import (Few, Ranges, SampleArray, SamplePlanes, lowest, over_planes, ranks_of, spread_planes)
 from .regions import Regions, runs_of_plane
-from .slopes import (
-    ENOUGH,
-    MOST_BESIDE,
-    STRAIGHT,
-    Floats,
-    Gradients,
-    as_clamped,
-    as_float64,
-    gradients_beside_surface,
-    gradients_where_straight,
-    mark_crossings,
-)
+from .slopes import (ENOUGH, MOST_BESIDE, STRAIGHT, Floats, Gradients, as_clamped, as_float64, gradients_beside_surface, gradients_where_straight, mark_crossings)
 
 Extremes: TypeAlias = tuple[float, float]
 """The smallest and the largest sample."""

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
 from ..errors import GridError
-from ..neighbourhood import NEIGHBOURHOOD
+from ..network.neighbourhood import NEIGHBOURHOOD
 from .placement import EQUAL_SPACING
 from .planes import SampleArray, SamplePlanes
 from .sdf_grid import SdfGrid, with_fields

@@ -16,17 +16,7 @@ from ..errors import GridError
 from ..options import AUTO, NOISY, SCALED, TRUNCATED
 from .census import Census, Extremes
 from .derived import filled_planes, normalised_planes, without_plateaus
-from .field import (
-    NONE_EXACT,
-    SLOPE_OFF,
-    Case,
-    Evidence,
-    Field,
-    Interpreted,
-    is_projective,
-    slope_within,
-    weigh,
-)
+from .field import (NONE_EXACT, SLOPE_OFF, Case, Evidence, Field, Interpreted, is_projective, slope_within, weigh)
 from .placement import LEAST_SPACING, MOST_SPACING, check_spacing, is_cubic, steps_of
 from .planes import changed
 from .refusals import SNAP, UNSIGNED, find_fault, is_density, refusal, way_out

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
 from ..errors import GridError
-from ..machine.resources import chunks_of
-from ..neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from ..threads import chunks_of
+from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .census import CUT_OFF, Census
 from .planes import SampleArray, changed, spread_planes
 

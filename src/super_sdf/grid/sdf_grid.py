@@ -16,18 +16,7 @@ from .census import Census, Extremes, not_finite
 from .distances import check_negative_inside, choose_spacing
 from .field import Field
 from .interpret import interpret
-from .placement import (
-    STRAIGHT,
-    Direction,
-    as_samples,
-    as_triple,
-    check_direction,
-    check_kind,
-    check_spacing,
-    in_rows,
-    is_cubic,
-    placed,
-)
+from .placement import (STRAIGHT, Direction, as_samples, as_triple, check_direction, check_kind, check_spacing, in_rows, is_cubic, placed)
 from .planes import NoPlanes, SampleArray, SamplePlanes
 
 MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"

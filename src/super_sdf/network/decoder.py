@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
-from ..machine.resources import map_chunks
+from ..threads import map_chunks
 from ..progress import ShareCallback
 
 # In half voxels; squares of sums of such values are still finite in single precision.

@@ -19,25 +19,10 @@ import numpy as np
 from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..files.regular import check_regular_file
-from ..machine.resources import cores_of_system, useful_threads
+from ..threads import cores_of_system, useful_threads
 from ..machine.system import lacks_avx2, processor_name
-from ..neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
-from ..options import (
-    AUTO,
-    AUTO_PRECISION,
-    DEFAULT_QUALITY,
-    FLOAT32,
-    INT8,
-    MASK,
-    NOISY,
-    OPTIONS,
-    QUALITIES,
-    Device,
-    Precision,
-    Quality,
-    check_path,
-    check_threads,
-)
+from .neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
+from ..options import (AUTO, AUTO_PRECISION, DEFAULT_QUALITY, FLOAT32, INT8, MASK, NOISY, OPTIONS, QUALITIES, Device, Precision, Quality, check_path, check_threads)
 from ..progress import ShareCallback
 from .contract import EXACT_DISTANCES, INPUTS, MASKS, one_voxel, read_card
 from .decoder import Decoder

@@ -25,7 +25,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import DeviceError
-from ..machine.resources import count_cores
+from ..threads import count_cores
 from ..progress import ShareCallback
 
 SWITCH = "ORT_DISABLE_TELEMETRY"  # a variable that onnxruntime reads once, when it is imported

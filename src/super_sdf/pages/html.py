@@ -17,8 +17,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from .. import __version__
-from ..certificate import check
-from ..certificate.check import Certificate
+from ..check import check
+from ..check.check import Certificate
 from ..convert import ConvertOptions, Kept, convert
 from ..files.formats import is_grid
 from ..files.output import replacing

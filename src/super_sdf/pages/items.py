@@ -15,12 +15,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..certificate.check import Certificate, band_of, check_kept, read_for_check
+from ..check.check import Certificate, band_of, check_kept, read_for_check
 from ..convert import ConvertOptions, Kept
 from ..errors import SuperSdfError
 from ..files.output import naming, replacing
 from ..grid.cubic import cubic_grid
-from ..mesh import Mesh
+from ..surface.mesh import Mesh
 from .meshes import coarse_surface, packed_mesh, thumbnail
 
 RESULT, COARSE = "super-sdf", "marching cubes of the samples"

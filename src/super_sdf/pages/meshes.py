@@ -17,15 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
-from ..certificate.check import FULL, Certificate
+from ..check.check import FULL, Certificate
 from ..grid.sdf_grid import SdfGrid
-from ..mesh import CLEARANCE, Mesh
-from ..neighbourhood import CENTRE, CORNERS, STRIDES
-from ..simplification.collapsing import collapse_to
-from ..simplification.measuring import points_within
-from ..simplification.simplify import check_room
-from ..steps.cell_cases import EDGE_AXIS, EDGE_START, triangle_table
-from ..steps.survey import Band
+from ..surface.mesh import CLEARANCE, Mesh
+from ..network.neighbourhood import CENTRE, CORNERS, STRIDES
+from ..simplify.collapsing import collapse_to
+from ..simplify.measuring import points_within
+from ..simplify.simplify import check_room
+from ..surface.cell_cases import EDGE_AXIS, EDGE_START, triangle_table
+from ..refine.survey import Band
 
 MOST_TRIANGLES = 200_000  # of a mesh in a page: 1 to 2 MB, and fluent without a GPU
 STEPS = 65535  # along the longest side of the box

@@ -22,23 +22,16 @@ from numpy.typing import NDArray
 
 from ..errors import OutOfMemoryError
 from ..grid.sdf_grid import SdfGrid
-from ..machine import resources as limits
+from .. import threads as limits
 from ..machine.memory import ROOM_SHARE, advised, give_back, held_memory, in_words
-from ..machine.resources import CHUNK, Resources, rows_in_chunk
+from ..threads import CHUNK, Resources, rows_in_chunk
 from ..network.decoder import NETWORK_BYTES
 from ..options import MARCHING, SHARP, MesherName
-from ..steps import bounds, debris, spheres
-from ..steps.marching import LOOKUP_BYTES, lookups_at_once
-from ..steps.meshers import BY_NAME, Mesher
-from ..steps.spline import spline_bytes
-from ..steps.survey import (
-    Band,
-    band_bytes,
-    count_crossings,
-    look_at_band,
-    outline,
-    plan_reading,
-)
+from ..refine import bounds, debris, spheres
+from ..surface.marching import LOOKUP_BYTES, lookups_at_once
+from ..surface.meshers import BY_NAME, Mesher
+from ..refine.spline import spline_bytes
+from ..refine.survey import (Band, band_bytes, count_crossings, look_at_band, outline, plan_reading)
 
 DEFAULT = BY_NAME[MARCHING]
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
@@ -304,7 +297,7 @@ def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads:
 
 def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
     """Return the bytes of the sharp mesher: every voxel beside a group may be near an edge."""
-    from ..steps.sharp.mesher import GROUP_BYTES, groups_at_once, voxel_bytes
+    from ..surface.sharp.mesher import GROUP_BYTES, groups_at_once, voxel_bytes
 
     beside = BY_NAME[SHARP].planes_beside(factor)
     before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside + 1]

@@ -9,16 +9,16 @@ from typing import TypeAlias
 from ..errors import OptionError
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
-from ..machine.resources import Resources, allot
-from ..mesh import Mesh, vertex_type
+from ..threads import Resources, allot
+from ..surface.mesh import Mesh, vertex_type
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import network_for
 from ..options import MARCHING, MesherName
 from ..progress import StepCounter
-from ..steps.band import BandSummary
-from ..steps.field import FineField, border_is_crossed
-from ..steps.meshers import Mesher, find_mesher
-from ..steps.survey import Band, BandTooLargeError, no_surface, survey
+from ..refine.band import BandSummary
+from ..refine.field import FineField, border_is_crossed
+from ..surface.meshers import Mesher, find_mesher
+from ..refine.survey import Band, BandTooLargeError, no_surface, survey
 from .cutting import Slab, peak_bytes, plan_slabs, planes_needed, refuse_band
 
 Plan: TypeAlias = tuple[int, int | None, Resources, tuple[float, float], Mesher]

@@ -19,7 +19,7 @@ from ..arrays import FloatArray
 from ..errors import MeshError, OptionError, seen
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import check_fits
-from ..mesh import Mesh
+from ..surface.mesh import Mesh
 from .solid import Points, Solid
 
 EDGE = 8  # samples along a cube

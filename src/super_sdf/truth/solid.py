@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MeshError
-from ..mesh import Mesh
+from ..surface.mesh import Mesh
 from .mesh_files import read_mesh
 
 Points = NDArray[np.float64]

@@ -19,16 +19,7 @@ from ...grid.planes import InputFile
 from ...options import LPS, RAS
 from ..regular import check_beside
 from ..streams import TextValues, planes_behind
-from ..volume import (
-    MOST_NAMED,
-    XYZ,
-    Planes,
-    Request,
-    Volume,
-    from_affine,
-    in_words_of,
-    reversed_axes,
-)
+from ..volume import (MOST_NAMED, XYZ, Planes, Request, Volume, from_affine, in_words_of, reversed_axes)
 from .axes import Axes, in_one_unit
 
 LONGEST = 1 << 20  # bytes of a header

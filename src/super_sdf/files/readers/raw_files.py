@@ -31,15 +31,7 @@ from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
 from ...options import LPS
 from ..regular import check_beside
-from ..streams import (
-    CODECS,
-    TextValues,
-    Unpacker,
-    bytes_from,
-    next_planes,
-    planes_behind,
-    raw_planes,
-)
+from ..streams import (CODECS, TextValues, Unpacker, bytes_from, next_planes, planes_behind, raw_planes)
 from ..volume import XYZ, ZYX, Planes, Request, Volume, kept_axes, reversed_axes, triple
 
 LONGEST = 1 << 20  # bytes of a header, with a list of files

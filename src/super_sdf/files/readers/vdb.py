@@ -24,19 +24,7 @@ from numpy.typing import NDArray
 from ...arrays import BoolArray
 from ...errors import FileError, GridError
 from ...grid.planes import InputFile
-from ..vdb_writer import (
-    ACTIVE_MASK,
-    ALL,
-    BLOSC,
-    EDGES,
-    LEAF,
-    MAGIC,
-    MASKED,
-    MASKED_ONE,
-    MASKED_TWO,
-    ONE_VALUE,
-    ZIP,
-)
+from ..vdb_writer import (ACTIVE_MASK, ALL, BLOSC, EDGES, LEAF, MAGIC, MASKED, MASKED_ONE, MASKED_TWO, ONE_VALUE, ZIP)
 from ..volume import Box, Request, Volume, from_affine
 
 Ints = NDArray[np.int64]

@@ -1,0 +1,96 @@
+"""Whether a mesh is closed, oriented, a manifold, free of self-intersections; and its size."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import IntArray
+from ..surface.mesh import Mesh
+from ..surface.topology import (Edges, count_fans, pair_edges, vertex_components, without_collapsed)
+
+FACES_AT_ONCE = 1 << 18  # for area and volume
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a mesh is as a surface; triangles that have the same vertex twice are left out."""
+
+    vertices: int
+    triangles: int
+    edges: Edges
+    pinched_vertices: int  # at which several fans of triangles meet: not manifold
+    components: int  # that share no vertex
+    self_intersections: int | None  # pairs that meet off a common vertex or edge; None: not counted
+    volume: float  # in cubic world units, negative if the triangles face inward
+    area: float
+
+    @property
+    def closed(self) -> bool:
+        """Whether no edge is open."""
+        return self.edges.open_edges == 0
+
+    @property
+    def oriented(self) -> bool:
+        """Whether neighbouring triangles have the same orientation, and the volume is positive."""
+        return self.edges.flipped_edges == 0 and self.volume > 0
+
+    @property
+    def manifold(self) -> bool:
+        """Whether all edges and vertices are manifold; open edges are allowed."""
+        return self.edges.crowded_edges == 0 and self.pinched_vertices == 0
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether the mesh is one closed sheet with an inside, known not to meet itself."""
+        whole = self.closed and self.oriented and self.manifold and self.components == 1
+        return whole and self.self_intersections == 0
+
+    def faults(self) -> list[str]:
+        """Return what keeps the mesh from being the boundary of a solid, in words."""
+        edges = self.edges
+        counts = {
+            "open edges": edges.open_edges,
+            "edges of more than two triangles": edges.crowded_edges,
+            "edges between triangles of opposite orientation": edges.flipped_edges,
+            "vertices where several fans of triangles meet": self.pinched_vertices,
+            "pairs of triangles that intersect": self.self_intersections or 0,
+        }
+        found = [f"{count:,} {what}" for what, count in counts.items() if count]
+        return found + ["triangles that face inward"] * (self.volume <= 0)
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures as they stand in JSON."""
+        figures = asdict(self)
+        edges = figures.pop("edges")
+        said = {"closed": self.closed, "oriented": self.oriented, "manifold": self.manifold}
+        return {**said, **edges, **figures}
+
+
+def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surface:
+    """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
+    faces, count = without_collapsed(mesh.faces), len(mesh.vertices)
+    opposite, edges = pair_edges(faces, count)
+    pinched = int(np.count_nonzero(count_fans(faces, opposite) > 1))
+    del opposite
+    pieces, size = count_components(faces, count), measure(mesh.vertices, faces)
+    return Surface(count, len(faces), edges, pinched, pieces, self_intersections, *size)
+
+
+def count_components(faces: IntArray, count: int) -> int:
+    """Return the number of pieces of a mesh that share no vertex; unused vertices do not count."""
+    return len(np.unique(vertex_components(faces, count)[faces[:, 0]]))
+
+
+def measure(vertices: NDArray[Any], faces: IntArray) -> tuple[float, float]:
+    """Return the enclosed volume and the area, in cubic and square world units."""
+    middle = vertices.mean(0, dtype=np.float64)
+    volume = area = 0.0
+    for first in range(0, len(faces), FACES_AT_ONCE):
+        a, b, c = vertices[faces[first : first + FACES_AT_ONCE].T] - middle
+        volume += float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
+        area += float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    return volume, area

@@ -1,0 +1,1 @@
+"""A function of points in place of samples."""

@@ -1,0 +1,198 @@
+"""Signed distances by a function of points, and its samples on a lattice.
+
+>>> from super_sdf import reconstruct
+>>> mesh = reconstruct(function=f, bounds=(-1, 1), spacing=0.05)   # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from functools import partial
+from numbers import Real
+from typing import Any, TypeAlias, cast
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..arrays import without_device
+from ..errors import GridError, OptionError, OptionTypeError, seen
+from ..grid.near import sample_near
+from ..grid.placement import as_triple, check_spacing
+from ..grid.sdf_grid import SdfGrid, check_grid, make_grid
+from ..options import SCALED
+
+Points = NDArray[np.float64]  # (n, 3)
+Numbers = NDArray[np.float64]  # (n,)
+
+BATCH = 1 << 18  # points of a call at most
+MOST_SAMPLES = 1 << 31
+REACH = 4  # spacings from the surface: the network sees samples that are 3.2 off
+
+
+class DistanceFunction:
+    """Signed distances by a function of points, called in batches.
+
+    Parameters
+    ----------
+    function : callable
+        Takes world positions, (n, 3) float64, and returns n distances, (n,) or (n, 1): an array, or
+        a tensor of PyTorch or JAX on any device, with or without gradients. Any continuous
+        function that is 0 on the surface will do; it may be positive inside. If it is much steeper
+        near a part of the surface than elsewhere, sample it with an infinite ``reach``.
+
+    Attributes
+    ----------
+    evaluations : int
+        At how many points it was evaluated so far.
+
+    Raises
+    ------
+    OptionTypeError
+        If it is not callable; in a call, if it does not return one number for each point.
+    """
+
+    def __init__(self, function: Callable[[Points], Any]) -> None:
+        if not callable(function):
+            raise OptionTypeError(f"function is {seen(function)}: give a function of points (n, 3)")
+        self.function, self.evaluations = function, 0
+
+    def __call__(self, points: Points) -> Numbers:
+        """Return the distances at points (n, 3), (n,)."""
+        self.evaluations += len(points)
+        starts = range(0, len(points), BATCH)
+        parts = [self._batch(points[start : start + BATCH]) for start in starts]
+        return np.concatenate([np.zeros(0), *parts])
+
+    def _batch(self, points: Points) -> Numbers:
+        values = as_numbers(self.function(points))
+        if values.size != len(points):
+            raise OptionTypeError(
+                f"the function returns an array of shape {values.shape} for {len(points)} points: "
+                "return one number for each"
+            )
+        return values.reshape(-1)
+
+    def _on(self, low: Points, step: Points) -> Callable[[NDArray[Any]], Numbers]:
+        """Return the values at samples (n, 3) of a lattice."""
+        return lambda indices: self(low + step * indices)
+
+    def sample(self, bounds: ArrayLike, spacing: ArrayLike, reach: float | None = None) -> SdfGrid:
+        """Return the samples on a lattice that covers a box. The surface is where they are 0.
+
+        Coarse cells are asked first, so that far from the surface few points are.
+
+        Parameters
+        ----------
+        bounds : two numbers, or two points
+            The lowest and the highest coordinates of the box; the first sample is at the lowest.
+            The solid should end a few spacings inside.
+        spacing : number or three
+            World distance between neighbouring samples.
+        reach : float, optional
+            World distance from the surface at which samples are cut off, by default 4 spacings;
+            infinite for all as they are.
+
+        Raises
+        ------
+        OptionError
+            If the box is empty, or takes more than 2^31 samples.
+        GridError
+            If no sample is inside, or none is outside; else as in ``make_grid``.
+        """
+        low, high = corners_of(bounds)
+        step = np.array(check_spacing(spacing))
+        shape = np.ceil((high - low) / step - 1e-9).astype(np.int64) + 1
+        if np.prod(shape.astype(float)) > MOST_SAMPLES:
+            raise OptionError(f"spacing is {seen(spacing)}: the box takes more than 2^31 samples")
+        reach = REACH * float(step.max()) if reach is None else check_reach(reach)
+        samples, cut = sample_near(self._on(low, step), tuple(shape), step, reach)
+        if not ((samples < 0).any() and (samples > 0).any()):  # it may be steeper than seen
+            samples, cut = sample_near(self._on(low, step), tuple(shape), step, np.inf)
+        _check_sides(samples)
+        np.clip(samples, -cut, cut, out=samples)
+        make = partial(make_grid, samples, spacing=spacing, origin=low)
+        try:
+            return make()
+        except GridError:  # the spacing is right: what contradicts it is no distance
+            with suppress(GridError):
+                return make(field=SCALED)
+            raise
+
+
+def check_reach(reach: Any) -> float:
+    """Return a distance; OptionError unless it is a number above 0."""
+    if not isinstance(reach, Real) or not float(reach) > 0:
+        raise OptionError(f"reach is {seen(reach)}: give a number greater than 0, or infinity")
+    return float(reach)
+
+
+def _check_sides(samples: NDArray[np.float32]) -> None:
+    """Raise GridError unless some samples are below 0 and some above."""
+    known = samples[np.isfinite(samples)]
+    if not len(known):
+        raise GridError("the function has no finite value at any sample: give other bounds")
+    low, high = float(known.min()), float(known.max())
+    if not low < 0 < high:
+        raise GridError(
+            f"the function goes from {low:.6g} to {high:.6g} at {len(known):,} samples, and its "
+            "surface is where it is 0: subtract a level, or give a finer spacing or other bounds"
+        )
+
+
+Function: TypeAlias = DistanceFunction | Callable[[Points], Any]
+"""A function of points; one that counts what it is asked, or any other."""
+
+
+def as_function(function: Function) -> DistanceFunction:
+    """Return a function that counts at how many points it is evaluated."""
+    return function if isinstance(function, DistanceFunction) else DistanceFunction(function)
+
+
+def sampled(
+    grid: SdfGrid | None,
+    function: DistanceFunction | None,
+    bounds: ArrayLike | None,
+    spacing: ArrayLike | None,
+    offset: float,
+) -> SdfGrid:
+    """Return the grid, or samples of the function as far as an offset needs if there is none.
+
+    OptionError unless either a grid is given, or a function with bounds and spacing.
+    """
+    if grid is not None or function is None:
+        if bounds is not None or spacing is not None:
+            raise OptionError("bounds and spacing are for a function without a grid: give that")
+        check_grid(grid)
+        return cast(SdfGrid, grid)
+    if bounds is None or spacing is None:
+        raise OptionError("a function needs bounds and spacing, or a grid of its samples")
+    reach = REACH * max(check_spacing(spacing)) + abs(offset)
+    return function.sample(bounds, spacing, reach)
+
+
+def corners_of(bounds: ArrayLike) -> tuple[Points, Points]:
+    """Return the lowest and highest corners, (3,) each, of bounds; OptionError if there is none."""
+    try:
+        low, high = cast("Iterable[Any]", bounds)
+        corners = [np.array(as_triple(corner, "bounds")) for corner in (low, high)]
+    except (TypeError, ValueError, GridError):
+        raise OptionError(
+            f"bounds are {seen(bounds)}: give (lowest, highest), numbers or points"
+        ) from None
+    if not (corners[0] < corners[1]).all():
+        raise OptionError(f"bounds are {seen(bounds)}: the box is empty, give (lowest, highest)")
+    return corners[0], corners[1]
+
+
+def as_numbers(values: Any) -> Numbers:
+    """Return an array or a tensor of any library as float64."""
+    try:
+        array = np.asanyarray(without_device(values))
+        if array.dtype.kind not in "fiub" and array.dtype.name != "bfloat16":  # None is no NaN
+            raise TypeError
+        if hasattr(array, "mask"):  # what is masked is unknown
+            array = np.ma.filled(array.astype(np.float64), np.nan)
+        return np.asarray(array, np.float64)
+    except (TypeError, ValueError):
+        raise OptionTypeError(f"the function returns {seen(values)}: return numbers") from None

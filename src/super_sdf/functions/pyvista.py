@@ -1,0 +1,137 @@
+"""PyVista's accessor: a fine surface of a ``pyvista.ImageData``, in world coordinates.
+
+>>> import pyvista
+>>> image = pyvista.read("field.vti")                             # doctest: +SKIP
+>>> image.super_sdf.contour(factor=4).plot()                      # doctest: +SKIP
+
+PyVista imports this module when ``super_sdf`` is first used of a dataset, since the package has the
+entry point ``pyvista.accessors``; ``import super_sdf.functions.pyvista`` does so at once. PyVista 0.48 or
+later is needed, and is not imported by ``import super_sdf``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyvista
+
+from ..errors import FileError
+from ..files.grids import grid_from_image
+from ..grid.sdf_grid import SdfGrid
+from ..machine.extras import check_modules, how_to_install
+from ..network.decoder import Decoder
+from ..options import DEFAULT_MESHER, ConvertOptions, MesherName, Quality, Values
+from ..pipeline import reconstruct
+from ..progress import Progress
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+if not hasattr(pyvista, "register_dataset_accessor"):
+    raise FileError(
+        f"super_sdf.functions.pyvista needs PyVista 0.48 or later, this is {pyvista.__version__}: "
+        f"{how_to_install('pyvista')}"
+    )
+
+
+@pyvista.register_dataset_accessor("super_sdf", pyvista.ImageData)
+class ImageAccessor:
+    """What super-sdf makes of a ``pyvista.ImageData``: ``image.super_sdf``.
+
+    Parameters
+    ----------
+    image : pyvista.ImageData
+        Signed distances at its points, or in its cells, in the unit of its spacing. Or a mask,
+        labels, densities, or another field; see ``make_grid``.
+    """
+
+    def __init__(self, image: pyvista.ImageData) -> None:
+        self._image = image
+
+    def grid(
+        self,
+        scalars: str | None = None,
+        *,
+        max_memory: int | None = None,
+        **values: Unpack[Values],
+    ) -> SdfGrid:
+        """Return the samples as a grid, for the functions of super-sdf.
+
+        Its ``notes`` say what was inferred, its ``field`` what the values were taken as.
+
+        Parameters and errors are those of ``grid_from_image``; ``scalars`` are by default the
+        active ones.
+        """
+        name = self._image.active_scalars_name if scalars is None else scalars
+        return grid_from_image(self._image, name, max_memory=max_memory, **values)
+
+    def contour(
+        self,
+        factor: int = 4,
+        *,
+        scalars: str | None = None,
+        quality: Quality | str | Path | None = None,
+        network: Decoder | None = None,
+        residuals: bool = False,
+        offset: float = 0.0,
+        cap: bool = True,
+        mesher: MesherName = DEFAULT_MESHER,
+        max_memory: int | None = None,
+        progress: Progress | None = None,
+        **values: Unpack[Values],
+    ) -> pyvista.PolyData:
+        """Return the surface of the solid, refined, as triangles in world coordinates.
+
+        It is the mesh that ``super-sdf upsample`` makes of the image as a ``.vti`` file.
+
+        Parameters
+        ----------
+        factor, offset, mesher, max_memory, progress
+            See ``reconstruct``.
+        scalars, inside, field, label, level, scale
+            See ``grid``.
+        quality : str or path, optional
+            "fast", "base" (default) or "best", or an ONNX file; see ``load_network``.
+        network : Network, optional
+            From ``load_network``, to load it only once; instead of ``quality``.
+        residuals : bool
+            Also return the array "residual" of the points, float32: how far the surface is from
+            touching the balls of the nearest samples, in voxels of the image, negative where it
+            pierces them, NaN where no exact sample is near. Needs the extra report.
+        cap : bool
+            Close the surface along the border of the image where the solid runs out of it.
+
+        Returns
+        -------
+        pyvista.PolyData
+            Triangles, counter-clockwise seen from outside.
+
+        Raises
+        ------
+        SuperSdfError
+            As ``grid`` and ``reconstruct`` raise it; if ``quality`` and ``network`` are both given.
+        """
+        if residuals:
+            check_modules("residuals=True", "report", ("igl",))
+        grid = self.grid(scalars, max_memory=max_memory, **values)
+        mesh = reconstruct(
+            grid,
+            network,
+            factor,
+            quality=quality,
+            offset=offset,
+            cap=cap,
+            mesher=mesher,
+            max_memory=max_memory,
+            progress=progress,
+        )
+        faces: Any = mesh.faces  # PyVista takes them with any integers
+        surface = pyvista.PolyData.from_regular_faces(mesh.vertices, faces)
+        if residuals:
+            from ..check.check import check_mesh
+
+            options = ConvertOptions(offset=offset, max_memory=max_memory)
+            found = check_mesh(mesh, grid, options, intersections=False)
+            surface.point_data["residual"] = found.residuals_at(found.mesh.vertices)
+        return surface

@@ -1,0 +1,281 @@
+"""Vertices put where a function is 0, and onto its edges.
+
+1. A vertex goes along its normal: a Newton step, then a secant step.
+2. Where that does not lead to the surface, it goes down the gradient, which changes at an edge.
+   Where values are no distances, the sign changes along the normal instead, up to four spacings on.
+3. Where triangles turn, the vertex goes to where the planes of the surface beside it meet.
+
+The lattice says how the surface is joined, so triangles stay as they are: but for the second half
+of 2, a vertex moves by at most half a fine spacing, and only if it finds the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray
+from ..errors import OptionError
+from .function import DistanceFunction
+from ..grid.sdf_grid import SdfGrid
+from ..surface.mesh import Mesh
+from ..options import EXACT
+from ..surface.sharp.patches import Numbers, Vectors, cross, dot, length, sums_at, unit
+from ..surface.sharp.triangle_pairs import intersecting, overlapping_boxes
+
+Value: TypeAlias = Callable[[Vectors], Numbers]
+
+REACH = 0.5  # fine spacings that a vertex may move
+STEP = 0.02  # fine spacings in which slopes are measured
+GOOD = 1e-4  # fine spacings from the surface at which a vertex needs no other step
+HALF_WAY, BACK_ROUNDS = 3, 8  # rounds in which what folds goes half way back, and all
+ONE_WAY = 0.1  # least cosine by which a triangle may have turned
+IN_PLANE, TOUCHING = 1e-7, 1e-5  # fine spacings off a plane, and by which triangles may overlap
+FLAT = 1e-6  # twice the area of triangles, in squared fine spacings, whose vertices may coincide
+COMPARED, MOST_OTHER = 1000, 0.25  # samples at which function and grid are compared
+DISTANCES, HALVINGS = (0.5, 1.0, 2.0, 4.0), 10  # fine spacings to a surface farther off, and then
+ROUNDS = 4  # of steps along the gradient
+LEAST_SLOPE = 1e-9
+REACHED = 0.25  # of the value at the start, above which the surface is not in reach
+TURNED = 0.866  # cosine of 30 degrees
+LEAST_AREA = 0.02  # of triangles whose normals count, in squared fine spacings
+STAY = 1e-3  # weight of the vertex itself beside that of a plane, in least squares
+NEAR = 0.05  # fine spacings from the surface at which the planes' point is taken
+
+
+def put_on_zero(
+    mesh: Mesh, function: DistanceFunction, grid: SdfGrid, factor: int, offset: float = 0.0
+) -> Mesh:
+    """Return a mesh with the vertices moved to where a function is 0, or has an ``offset``.
+
+    On the border of the grid vertices stay. OptionError if there is an offset, but no distance.
+    """
+    if offset and not grid.field.has_exact:
+        raise OptionError(f"offset is {offset:g}: the function is no distance, leave it out")
+    fine, scale = grid.voxel_size / factor, unit_of(function, grid)
+    middle, kind = grid.to_world((np.array(grid.shape) - 1) / 2), mesh.vertices.dtype
+
+    def value(points: Vectors) -> Numbers:
+        """Return values at points, both in fine spacings, so that slopes of distances are 1."""
+        return (function(middle + fine * points) / scale - offset) / fine
+
+    def rounded(points: Vectors) -> Vectors:
+        """Return points as they will be written."""
+        return ((middle + fine * points).astype(kind) - middle) / fine
+
+    start = (mesh.vertices - middle) / fine
+    free = _is_within(grid, mesh.vertices, REACH / factor)
+    with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
+        points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.kind == EXACT)
+        points = put_on_edges(value, points, mesh.faces, free)
+    points = without_folds(points, start, mesh.faces, rounded)
+    return Mesh((middle + fine * points).astype(kind), mesh.faces)
+
+
+def unit_of(function: DistanceFunction, grid: SdfGrid) -> float:
+    """Return the function's value for a distance of 1, negative inside, at the grid's samples.
+
+    OptionError if it has another side than many of the samples near the surface.
+    """
+    values = grid.values
+    near = np.argwhere(np.abs(values) < 2 * grid.voxel_size)
+    near = near[:: max(len(near) // COMPARED, 1)]
+    known = values[tuple(near.T)].astype(np.float64)
+    found = function(grid.to_world(near))
+    some = np.isfinite(found) & (known != 0)
+    ratio = float(np.median(found[some] / known[some])) if some.any() else 1.0
+    other = float(np.mean(found[some] / known[some] * ratio < 0)) if some.any() else 0.0
+    if other > MOST_OTHER or ratio == 0:
+        raise OptionError(
+            f"function has another side than the grid at {other:.0%} of the samples near the "
+            "surface: give the function that the grid has samples of"
+        )
+    return ratio
+
+
+def put_on_surface(
+    value: Value, start: Vectors, faces: NDArray[Any], free: BoolArray, *, exact: bool
+) -> Vectors:
+    """Return points (n, 3), the ``free`` ones where the values are 0, if that is in reach."""
+    points, rows, normals = start.copy(), np.flatnonzero(free), vertex_normals(start, faces)
+    before, slope = value(start[rows]), np.ones(len(rows))
+    if not exact:
+        slope = (value(start[rows] + STEP * normals[rows]) - before) / STEP
+    found, off = step_along(value, start[rows], before, normals[rows], slope)
+    left = np.abs(off) > GOOD * np.abs(slope)
+    if not exact:  # saturated values show from afar to half a spacing only where the surface is
+        far = np.flatnonzero(np.abs(off) > REACHED * np.abs(before))
+        points[rows[far]] = cross_over(value, start[rows[far]], before[far], normals[rows[far]])
+        left[far] = False
+    near = np.flatnonzero(left)
+    found[near], off[near] = step_down(value, start[rows[near]], before[near])
+    reached = np.abs(off) <= REACHED * np.abs(before)
+    points[rows[reached]] = found[reached]
+    return points
+
+
+def _is_within(grid: SdfGrid, points: NDArray[Any], margin: float) -> BoolArray:
+    """Return which points, (n,), are this far inside the grid's border, in spacings."""
+    index = grid.to_index(points)
+    last = np.array(grid.shape) - 0.5
+    within: BoolArray = np.all((index > margin - 0.5) & (index < last - margin), axis=1)
+    return within
+
+
+def step_along(
+    value: Value, start: Vectors, before: Numbers, direction: Vectors, slope: Numbers
+) -> tuple[Vectors, Numbers]:
+    """Return points (n, 3) nearer to 0 along directions, and the values there, (n,).
+
+    ``before`` are the values at the start. A Newton step with a ``slope`` along the direction, then
+    a secant step from both values.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        way = np.clip(np.nan_to_num(-before / slope), -REACH, REACH)
+        after = value(start + way[:, None] * direction)
+        second = np.clip(np.nan_to_num(way - after * way / (after - before)), -REACH, REACH)
+    again = np.flatnonzero(np.abs(after) > GOOD * np.abs(slope))
+    last = value(start[again] + second[again, None] * direction[again])
+    closer = np.abs(last) < np.abs(after[again])
+    way[again[closer]], after[again[closer]] = second[again[closer]], last[closer]
+    return start + way[:, None] * direction, after
+
+
+def cross_over(value: Value, start: Vectors, before: Numbers, normals: Vectors) -> Vectors:
+    """Return points (n, 3) where values change sign along normals, those at the start if nowhere.
+
+    The surface is sought in doubled steps, to the side that the sign says, and then by halving.
+    """
+    ways = -np.sign(before)[:, None] * normals
+    low, high = np.zeros(len(start)), np.full(len(start), np.nan)
+    for distance in DISTANCES:
+        left = np.flatnonzero(np.isnan(high))
+        crossed = value(start[left] + distance * ways[left]) * before[left] <= 0
+        high[left[crossed]], low[left[~crossed]] = distance, distance
+    rows = np.flatnonzero(~np.isnan(high))
+    for _ in range(HALVINGS):
+        middle = (low[rows] + high[rows]) / 2
+        crossed = value(start[rows] + middle[:, None] * ways[rows]) * before[rows] <= 0
+        high[rows[crossed]], low[rows[~crossed]] = middle[crossed], middle[~crossed]
+    points = start.copy()
+    points[rows] += (low[rows] + high[rows])[:, None] / 2 * ways[rows]
+    return points
+
+
+def step_down(value: Value, start: Vectors, before: Numbers) -> tuple[Vectors, Numbers]:
+    """Return points (n, 3) nearer to 0, and the values there, (n,), by steps along the gradient.
+
+    Outside an edge that is the gradient of one face, then of the other.
+    """
+    at, now = start.copy(), before.copy()
+    for _ in range(ROUNDS):
+        slopes = gradient(value, at, now)
+        way = np.clip(-now / np.maximum(length(slopes), LEAST_SLOPE), -REACH, REACH)
+        shift = at + way[:, None] * unit(slopes) - start
+        new = start + np.minimum(length(shift), REACH)[:, None] * unit(shift)
+        there = value(new)
+        closer = np.abs(there) < np.abs(now)
+        at[closer], now[closer] = new[closer], there[closer]
+    return at, now
+
+
+def put_on_edges(value: Value, points: Vectors, faces: NDArray[Any], free: BoolArray) -> Vectors:
+    """Return points (n, 3), ``free`` ones of edges where the planes of points beside them meet."""
+    edges = is_on_edge(points, faces)
+    one, other = faces.ravel(), np.roll(faces, -1, 1).ravel()
+    one, other = np.concatenate([one, other]), np.concatenate([other, one])
+    pairs = edges[one] & free[one] & free[other] & ~edges[other]
+    rows, at = np.unique(one[pairs], return_inverse=True)
+    known, beside = np.unique(other[pairs], return_inverse=True)
+    normals = unit(gradient(value, points[known], value(points[known])))[beside]
+    heights = dot(normals, points[known][beside] - points[rows][at])
+    matrix = np.zeros((len(rows), 3, 3)) + STAY * np.eye(3)
+    np.add.at(matrix, at, normals[:, :, None] * normals[:, None])
+    vector = np.zeros((len(rows), 3))
+    np.add.at(vector, at, heights[:, None] * normals)
+    shift = np.linalg.solve(matrix, vector[..., None])[..., 0]
+    moved = points[rows] + shift
+    better = (np.abs(value(moved)) < NEAR) & (np.abs(shift).max(1) < REACH)
+    points = points.copy()
+    points[rows[better]] = moved[better]
+    return points
+
+
+def is_on_edge(points: Vectors, faces: NDArray[Any]) -> BoolArray:
+    """Return at which points, (n,), triangles turn by 30 degrees."""
+    normals = face_normals(points, faces)
+    large = length(normals) > 2 * LEAST_AREA
+    corners, normals = faces[large].ravel(), np.repeat(unit(normals[large]), 3, axis=0)
+    mean = unit(sums_at(corners, normals, len(points)))
+    # Two that turn by an angle are at most half of it from their mean.
+    least = np.ones(len(points))
+    np.minimum.at(least, corners, dot(normals, mean[corners]))
+    turned: BoolArray = least < np.sqrt((1 + TURNED) / 2)
+    return turned
+
+
+def without_folds(
+    points: Vectors, before: Vectors, faces: NDArray[Any], rounded: Callable[[Vectors], Vectors]
+) -> Vectors:
+    """Return points (n, 3), some back where they were before, so that no triangles intersect.
+
+    ``rounded`` returns points as they are written: of those it must hold.
+    """
+    points, original = points.copy(), unit(face_normals(before, faces))
+    suspect = np.any(points != before, axis=1)
+    for turn in range(BACK_ROUNDS):
+        now = rounded(points)
+        normals = face_normals(now, faces)
+        folded = faces[(dot(unit(normals), original) < ONE_WAY) | (length(normals) < FLAT)]
+        pairs = np.stack(overlapping_boxes(now, faces, suspect))
+        flat = faces[pairs[:, overlapping_in_plane(now, *faces[pairs])]]
+        pairs = np.concatenate(intersecting(now, *faces[pairs]), axis=1)
+        back = np.unique(np.concatenate([part.ravel() for part in (pairs, flat, folded)]))
+        back = back[(points[back] != before[back]).any(1)]
+        if not len(back):
+            break
+        way = 0.5 if turn < HALF_WAY else 1.0
+        points[back] += way * (before[back] - points[back])
+        suspect = np.zeros(len(points), bool)
+        suspect[back] = True
+    return points
+
+
+def overlapping_in_plane(points: Vectors, first: NDArray[Any], second: NDArray[Any]) -> BoolArray:
+    """Return which pairs of triangles, corners (m, 3) each, lie in one plane and overlap there.
+
+    Two convex shapes do unless a side of one of them separates them.
+    """
+    one, other = points[first], points[second]  # (m, 3, 3)
+    normals = unit(face_normals(points, first))
+    heights = dot(other - one[:, :1], normals[:, None])
+    overlap: BoolArray = np.abs(heights).max(1, initial=0) < IN_PLANE
+    rows = np.flatnonzero(overlap)
+    one, other, normals = one[rows], other[rows], normals[rows]
+    for triangle in (one, other):
+        for k in range(3):
+            across = cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
+            mine, theirs = dot(one, across), dot(other, across)
+            beyond = np.minimum(mine.max(1), theirs.max(1)) - np.maximum(mine.min(1), theirs.min(1))
+            overlap[rows] &= beyond > TOUCHING
+    return overlap
+
+
+def gradient(value: Value, points: Vectors, values: Numbers) -> Vectors:
+    """Return the gradient at points (n, 3) with values (n,), by forward differences."""
+    return np.stack([(value(points + STEP * axis) - values) / STEP for axis in np.eye(3)], 1)
+
+
+def face_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
+    """Return normals of triangles (m, 3), as long as twice their areas."""
+    a, b, c = (points[corner] for corner in faces.T)
+    return cross(b - a, c - a)
+
+
+def vertex_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
+    """Return unit normals at points (n, 3), means of the triangles' weighted by their areas."""
+    normals = np.repeat(face_normals(points, faces), 3, axis=0)
+    return unit(sums_at(faces.ravel(), normals, len(points)))

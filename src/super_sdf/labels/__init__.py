@@ -1,0 +1,1 @@
+"""All labels of a volume as meshes with shared walls."""

@@ -1,0 +1,157 @@
+"""Meshes whose volumes are those of their samples.
+
+A mask does not say where within a voxel its surface is, and the smooth surface of a convex body is
+a little smaller than its samples, each taken as a box. So each label's surface moves by one
+distance along its normals, the same all over. A wall moves by the difference of its two labels.
+
+Places move by a continuous function of space, which changes by less than the distance between two
+places: so triangles that did not intersect do not intersect afterwards, and shared walls stay
+shared. It is the mean of the normals near each node of a lattice, and linear between nodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import OptionError
+from ..grid.planes import in_blocks
+from ..grid.sdf_grid import SdfGrid
+from ..surface.mesh import Mesh
+from ..network.neighbourhood import CORNERS
+from ..options import MASK
+from ..surface.sharp.patches import Numbers, Vectors, dot, length, sums_at
+from ..functions.zero import face_normals
+
+CELL = 0.5  # spacings of the samples between nodes
+MOST = 0.125  # spacings that a surface may move
+ROUNDS = 8
+GOOD, NOTED = 1e-6, 1e-3  # of a volume
+Rows = NDArray[np.intp]
+
+
+class Normals(NamedTuple):
+    """The mean normals of a surface at some rows of all places."""
+
+    rows: Rows
+    vectors: Vectors
+
+
+def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
+    """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
+    if offset:
+        raise OptionError(
+            f"keep-volume is for the surface of the samples, offset is {offset:g}: give one only"
+        )
+    if grid.field.kind != MASK:
+        raise OptionError(
+            f"keep-volume is for masks and labels, the values are {grid.field.kind}: leave it out"
+        )
+    if not cap:
+        raise OptionError("keep-volume needs a closed mesh: leave out --open")
+
+
+def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
+    """Return the volume of the samples inside, each of which counts as a box."""
+    inside = sum(
+        int(np.count_nonzero(grid.planes(first, last) <= offset))
+        for first, last in in_blocks(grid.samples)
+    )
+    return inside * float(np.prod(grid.spacing))
+
+
+def mean_spacing(grid: SdfGrid) -> float:
+    """Return the edge of a cube with the volume of a box round a sample."""
+    return float(np.prod(grid.spacing) ** (1 / 3))
+
+
+def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Return a note on meshes whose volume is not that of their samples, both by a name."""
+    off = {name: mesh / samples - 1 for name, (mesh, samples) in volumes.items()}
+    far = [f"{name} {share:+.1%}" for name, share in off.items() if abs(share) > NOTED]
+    return [f"volumes that are off those of the samples: {', '.join(far)}"] * bool(far)
+
+
+def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: float) -> list[Mesh]:
+    """Return closed meshes moved along their normals until they have the given volumes.
+
+    Parameters
+    ----------
+    meshes : sequence of Mesh
+        With the same vertices where they touch; triangles stay as they are.
+    volumes : sequence of float
+        In cubic world units.
+    spacing : float
+        Mean spacing of the samples, in world units. No surface moves by more than an eighth of it,
+        so the volume of a speck may stay another one.
+    """
+    kind, places, rows = meshes[0].vertices.dtype, *_joined(meshes)
+    middle = places.mean(0)
+    start = points = places - middle
+    normals = _mean_normals(start / (CELL * spacing), meshes, rows)
+    distances = np.zeros(len(meshes))
+    for _ in range(ROUNDS):
+        slopes = [_slopes(points[own], mesh.faces) for own, mesh in zip(rows, meshes)]
+        off = volumes - np.array([dot(s, points[own]).sum() / 3 for s, own in zip(slopes, rows)])
+        if (np.abs(off) <= GOOD * np.abs(volumes)).all():
+            break
+        effects = np.stack([_effect(field, slopes, rows, len(start)) for field in normals], 1)
+        free = np.abs(distances) < MOST * spacing  # the others have moved as far as they may
+        step = np.linalg.lstsq(effects[np.ix_(free, free)], off[free], rcond=None)[0]
+        distances[free] = np.clip(distances[free] + step, -MOST * spacing, MOST * spacing)
+        points = start + _moves(distances, normals, len(start))
+    return [
+        Mesh((middle + points[own]).astype(kind), mesh.faces) for own, mesh in zip(rows, meshes)
+    ]
+
+
+def _joined(meshes: Sequence[Mesh]) -> tuple[Vectors, list[Rows]]:
+    """Return the places of all vertices, (n, 3) each once, and which are each mesh's."""
+    vertices = np.concatenate([mesh.vertices for mesh in meshes]) + 0  # -0 is 0
+    bits = np.ascontiguousarray(vertices).view(f"V{3 * vertices.itemsize}").ravel()
+    _, first, place = np.unique(bits, return_index=True, return_inverse=True)
+    ends = np.cumsum([len(mesh.vertices) for mesh in meshes])[:-1]
+    return vertices[first].astype(np.float64), np.split(place, ends)
+
+
+def _slopes(points: Vectors, faces: NDArray[Any]) -> Vectors:
+    """Return by how much a volume grows as its vertices move, (n, 3)."""
+    normals = np.repeat(face_normals(points, faces), 3, axis=0)
+    return sums_at(faces.ravel(), normals, len(points)) / 6
+
+
+def _mean_normals(places: Vectors, meshes: Sequence[Mesh], rows: Sequence[Rows]) -> list[Normals]:
+    """Return the mean normals of each mesh at places, in cells of the lattice."""
+    corners = np.floor(places)[:, None] + CORNERS
+    weights = np.prod(1 - np.abs(places[:, None] - corners), axis=2)  # (n, 8)
+    _, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
+    nodes, count = nodes.reshape(-1, 8), int(nodes.max()) + 1
+    found = []
+    for mesh, own in zip(meshes, rows):
+        slopes = _slopes(places[own], mesh.faces)
+        parts, at = weights[own], nodes[own].ravel()
+        sums = sums_at(at, (parts[..., None] * slopes[:, None]).reshape(-1, 3), count)
+        areas = np.bincount(at, (parts * length(slopes)[:, None]).ravel(), count)
+        means = sums / np.maximum(areas, np.finfo(float).tiny)[:, None]
+        some = np.flatnonzero((areas > 0)[nodes].any(1))
+        found.append(Normals(some, (weights[some, :, None] * means[nodes[some]]).sum(1)))
+    return found
+
+
+def _moves(distances: Numbers, normals: Sequence[Normals], count: int) -> Vectors:
+    """Return by how much each place moves, (count, 3)."""
+    moves = np.zeros((count, 3))
+    for distance, field in zip(distances, normals):
+        moves[field.rows] += distance * field.vectors
+    return moves
+
+
+def _effect(
+    field: Normals, slopes: Sequence[Vectors], rows: Sequence[Rows], count: int
+) -> NDArray[np.float64]:
+    """Return by how much each volume grows as one surface moves, (L,)."""
+    moves = _moves(np.ones(1), [field], count)
+    return np.array([dot(slope, moves[own]).sum() for slope, own in zip(slopes, rows)])

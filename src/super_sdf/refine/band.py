@@ -1,0 +1,342 @@
+"""The band of voxels near the surface: its samples and what they can be used for (Eqs. 2 and 4).
+
+Everything here is in index space with values in half voxels: a voxel has side 2, a distance of
+one spacing h is 2, and the band is ``abs(value) < 3``.
+
+Samples of the band can be taken as exact distances if they contradict no neighbour, are near the
+surface, and were not cut off. If too many contradict others, the field is noisy, and none is.
+
+Distances must reach far enough to both sides of an offset: a surface too near where they are
+truncated, or where fill values begin, would come out in loose pieces.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from ..errors import GridError
+from ..grid.sdf_grid import SdfGrid
+from ..threads import chunks_of
+from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD
+
+HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
+# Patch values are clipped to this (3 h): samples that are farther from the surface do not matter to
+# it, and a field that was truncated at 3 h or beyond gives the same result as the whole one.
+PATCH_LIMIT = 6.0
+# A voxel whose sample is farther than its corners, sqrt(3)/2 h, cannot hold the surface of an
+# exact distance. The margin, a quarter of h, is for the network's own error.
+DECODE_LIMIT = 3**0.5 + 0.5
+# Two distances differ by no more than their samples are apart (Lipschitz); slack for rounding.
+LIPSCHITZ_SLACK = 0.1
+
+JUMP = 0.2  # by which values differ more than noise makes distances differ
+
+MAX_DISTANCE = 2.8  # of exact samples: those near the band's edge, 3, may have been truncated there
+MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
+MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
+
+# Planes are worked on in blocks of about this many samples, to save memory, but of at least this
+# many planes, since a block also reads one plane more on either side.
+BLOCK_SAMPLES = 1 << 18
+BLOCK_PLANES = 4
+
+# The largest difference between a voxel's sample and that at each place of its patch, (27,).
+MAX_STEP = 2 + LIPSCHITZ_SLACK  # between neighbours along an axis
+MAX_DIFFERENCE = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
+
+
+def rescale(
+    grid: SdfGrid, offset: float = 0.0, first: int = 0, last: int | None = None
+) -> FloatArray:
+    """Return the samples in half voxels, ``(values - offset) * 2 / h`` (Eq. 4), as float32.
+
+    Values in the band then lie in [-3, 3], whatever the unit of the grid. ``offset`` is the
+    distance in world units, positive outwards, of the surface that becomes the zero level (Sec.
+    5.3). Read are planes ``first`` to before ``last``, all by default.
+    """
+    return rescale_planes(grid.planes(first, grid.shape[0] if last is None else last), grid, offset)
+
+
+def rescale_planes(planes: NDArray[Any], grid: SdfGrid, offset: float) -> FloatArray:
+    """Return planes of a grid's samples, negative inside, in half voxels: see ``rescale``."""
+    rescaled = np.empty(planes.shape, np.float32)
+    scale = 2.0 / grid.voxel_size
+    limit = float(np.finfo(np.float32).max) / 4 / scale
+    is_huge = grid.low < offset - limit or grid.high > offset + limit
+    for plane, out in zip(planes, rescaled):  # plane by plane: in cache, and no second copy
+        shifted = plane.astype(np.float64)
+        if is_huge:
+            np.clip(shifted, offset - limit, offset + limit, out=shifted)
+        if offset:
+            shifted -= offset
+        np.multiply(shifted, scale, out=out, casting="same_kind")
+    return rescaled
+
+
+def find_band(rescaled: FloatArray) -> IntArray:
+    """Return the active voxels as (V, 3) int32 in C order: see ``is_active``."""
+    return np.ascontiguousarray(np.argwhere(is_active(rescaled)), np.int32)
+
+
+def is_active(rescaled: FloatArray) -> BoolArray:
+    """Return which voxels are active, ``abs(rescaled) < 3`` (Eq. 2).
+
+    A distance cannot jump over the band, from beyond it on one side to beyond it on the other.
+    Where the input does, both voxels are added: a surface must pass between them.
+    """
+    active = np.abs(rescaled) < HALF_BAND
+    above, below = rescaled >= HALF_BAND, rescaled <= -HALF_BAND
+    corners = above.view(np.uint8) | below.view(np.uint8) << 1
+    for axis in range(3):  # of a cell
+        lines = np.moveaxis(corners, axis, 0)
+        corners = np.moveaxis(lines[1:] | lines[:-1], 0, axis)
+    if (corners == 3).any():
+        active |= (above & _dilate(below)) | (below & _dilate(above))
+    return active
+
+
+def _dilate(mask: BoolArray) -> BoolArray:
+    """Return a mask grown by one voxel in all 26 directions."""
+    grown = mask.copy()
+    for axis in range(3):
+        source = np.moveaxis(grown.copy(), axis, 0)
+        target = np.moveaxis(grown, axis, 0)
+        target[1:] |= source[:-1]
+        target[:-1] |= source[1:]
+    return grown
+
+
+def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
+    """Return the grid padded by one, extrapolated linearly but at jumps, clipped to 3 h."""
+    padded = np.pad(np.clip(rescaled, -2 * PATCH_LIMIT, 2 * PATCH_LIMIT), 1)
+    for axis in range(3):
+        planes = np.moveaxis(padded, axis, 0)
+        for outer, border, inner in ((0, 1, 2), (-1, -2, -3)):
+            planes[outer] = 2 * planes[border] - planes[inner]
+            steep = np.abs(planes[border] - planes[inner]) > MAX_STEP
+            planes[outer][steep] = planes[border][steep]
+    return np.clip(padded, -PATCH_LIMIT, PATCH_LIMIT, out=padded)
+
+
+def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
+    """Return the 27 samples round each voxel (V, 3), in the order of ``NEIGHBOURHOOD``, (V, 27)."""
+    return take_patches(pad_by_extrapolation(rescaled), voxel_ijk)
+
+
+def take_patches(padded: FloatArray, voxel_ijk: IntArray) -> FloatArray:
+    """Return the same of samples from ``pad_by_extrapolation``."""
+    nx, ny, nz = padded.shape
+    centre, steps = _flat_steps(voxel_ijk, (nx - 2, ny - 2, nz - 2))
+    patches = np.empty((len(voxel_ijk), 27), np.float32)
+    for column, step in enumerate(steps):
+        np.take(padded.ravel(), centre + step, out=patches[:, column])
+    return patches
+
+
+def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
+    """Return the neighbour table (V, 27) of voxels (V, 3), all different and in C order.
+
+    It has their rows at the 27 places of ``NEIGHBOURHOOD`` round each, -1 where there is no voxel.
+    As an index -1 is the last row, so append a row of zeros to the array that is gathered from.
+    """
+    table = np.empty((len(voxel_ijk), 27), np.int32)
+    for first, last in plane_blocks(shape):
+        start, low, high, stop = np.searchsorted(
+            voxel_ijk[:, 0], [first - 1, first, last, last + 1]
+        )
+        around = voxel_ijk[start:stop] - np.array([first, 0, 0], np.int32)
+        at, steps = _flat_steps(around, shape)
+        row_at = np.full((last - first + 2) * (shape[1] + 2) * (shape[2] + 2), -1, np.int32)
+        row_at[at] = np.arange(start, stop, dtype=np.int32)
+        for column, step in enumerate(steps):
+            np.take(row_at, at[low - start : high - start] + step, out=table[low:high, column])
+    return table
+
+
+def plane_blocks(
+    shape: tuple[int, ...], first: int = 0, last: int | None = None, least: int = BLOCK_PLANES
+) -> Iterator[tuple[int, int]]:
+    """Yield (start, stop) of blocks of ``BLOCK_SAMPLES`` samples or of ``least`` planes."""
+    step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), least)
+    end = shape[0] if last is None else last
+    for start in range(first, end, step):
+        yield start, min(start + step, end)
+
+
+def _flat_steps(
+    voxel_ijk: IntArray, shape: tuple[int, ...]
+) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], list[int]]:
+    """Return flat indices (V,) into the grid padded by one, and the 27 steps to the neighbours."""
+    strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1], np.int64)
+    return (voxel_ijk + 1) @ strides, [int(step) for step in NEIGHBOURHOOD @ strides]
+
+
+def is_lipschitz(patches: FloatArray, places: Iterable[int] = range(27)) -> BoolArray:
+    """Return which patches (V, 27) can be distances, (V,) bool: those that are 1-Lipschitz.
+
+    The distances of two points differ by no more than the points are apart. This fails nearly
+    everywhere in a noisy field, and in many places of a field that is not a distance.
+    ``places`` are those of a patch that are compared with its centre.
+    """
+    keeps = np.ones(len(patches), bool)
+    for rows in chunks_of(len(patches), 4 * 27):  # in cache
+        centre = patches[rows, CENTRE]
+        for column in places:
+            keeps[rows] &= np.abs(patches[rows, column] - centre) <= MAX_DIFFERENCE[column]
+    return keeps
+
+
+def has_both_sides(patches: FloatArray) -> BoolArray:
+    """Return in which patches (V, 27) samples lie on both sides of 0, (V,)."""
+    outside = patches[:, CENTRE] > 0
+    found = np.zeros(len(patches), bool)
+    for column in range(27):
+        found |= (patches[:, column] > 0) != outside
+    return found
+
+
+def is_filled_in(patches: FloatArray) -> BoolArray:
+    """Return which samples were filled in, as by padding with a constant, (V,) bool.
+
+    They are small, so that the surface should be near, but the field falls to none of the samples
+    around, and rises to one by more than distances and noise do.
+    """
+    size = np.abs(patches)
+    rise = size - size[:, CENTRE, None]
+    found: BoolArray = (rise > MAX_DIFFERENCE + JUMP).any(1)
+    at = np.flatnonzero(found)
+    found[at] = (rise[at] > -JUMP / 2).all(1) & ~has_both_sides(patches[at])
+    return found
+
+
+def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
+    """Return which voxels may contain a piece of the surface, (V,) bool.
+
+    If a voxel's patch can be distances (``lipschitz``, from ``is_lipschitz``), a sample farther
+    from the surface than the voxel's corners proves that the voxel holds none. Otherwise the sample
+    proves nothing, and the voxel is kept.
+    """
+    near: BoolArray = np.abs(patches[:, CENTRE]) <= DECODE_LIMIT
+    return near | ~lipschitz
+
+
+@dataclass(frozen=True)
+class BandSummary:
+    """What the band of a whole grid says of its samples, whichever part of it is worked on."""
+
+    voxels: int  # they tell by their samples whether the field is noisy
+    noisy: int  # those round which samples differ by more than distances can
+    low: float  # the lowest and the highest sample, in half voxels
+    high: float
+    leaves: bool = False  # whether a sample on the border of the grid is inside
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether no sample can be taken as exact."""
+        return not self.voxels or self.noisy / self.voxels > MAX_NOISY_SHARE
+
+
+def summarise(sample: FloatArray, lipschitz: BoolArray, leaves: bool = False) -> BandSummary:
+    """Return the summary of samples, some of which tell by ``lipschitz`` how noisy they are."""
+    noisy = len(lipschitz) - int(np.count_nonzero(lipschitz))
+    low, high = float(sample.min(initial=np.inf)), float(sample.max(initial=-np.inf))
+    return BandSummary(len(lipschitz), noisy, low, high, leaves)
+
+
+def exact_samples(patches: FloatArray, lipschitz: BoolArray, whole: BandSummary) -> BoolArray:
+    """Return which samples of a band can be taken as exact distances, (V,) bool.
+
+    A truncated sample has the largest value of its sign in the whole band, and no neighbour towards
+    which the field is as steep as a distance.
+    """
+    sample = patches[:, CENTRE]
+    exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE) & (not whole.is_noisy)
+    limits = np.float32(whole.low), np.float32(whole.high)
+    at_limit = np.flatnonzero(exact & (sample == np.where(sample > 0, limits[1], limits[0])))
+    for rows in chunks_of(len(at_limit), 27):
+        some = at_limit[rows]
+        slope = np.abs(patches[some] - sample[some, None]) / np.maximum(MAX_DIFFERENCE, 1)
+        exact[some] = slope.max(1) >= MIN_SLOPE
+    return exact
+
+
+# Neighbouring samples of noisy distances differ by up to twice the spacing (4 half voxels); a
+# distance and a fill value differ by more, a jump. A small share of jumps is tolerated as outliers.
+MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
+# How far distances must reach beyond the offset, in half voxels, where they are truncated; and
+# where fill values begin, which would be taken for noise.
+CUT_OFF_MARGIN, FILL_MARGIN = HALF_BAND, 5.0
+# Tolerances in half voxels, so that the offset that the message suggests works: for rounding, and
+# because no sample lies exactly where fill values begin.
+ROUNDING, UNSAMPLED = 1e-3, 0.1
+
+
+class Jumps(NamedTuple):
+    """Counts of the samples near an offset, and of those with a jump to a neighbour."""
+
+    edges: int
+    near: int
+    end: float  # the farthest with a jump, in half voxels from the offset; -inf if there is none
+
+
+def check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> None:
+    """Raise GridError if the distances are truncated within 1.5 voxels of an offset.
+
+    ``patches`` (V, 27) are the samples round voxels of the band there. A distance never equals all
+    its neighbours.
+    """
+    centre = patches[:, CENTRE]
+    cut_off = (patches == centre[:, None]).all(1) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
+    if cut_off.any():
+        end = offset + float(centre[cut_off][0]) * voxel_size / 2
+        raise _too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
+
+
+def find_jumps(rescaled: FloatArray, own: tuple[slice, ...]) -> tuple[Jumps, Jumps]:
+    """Return the jumps upwards and downwards in planes (n, ny, nz), in half voxels.
+
+    Samples are counted in ``own``; those beside them only show whether there is a jump.
+    """
+
+    def jumps_up(rescaled: FloatArray) -> Jumps:
+        jumps = np.zeros(rescaled.shape, bool)
+        for axis in range(3):
+            values, found = np.moveaxis(rescaled, axis, 0), np.moveaxis(jumps, axis, 0)
+            step = values[1:] - values[:-1]
+            found[:-1] |= step > MIN_JUMP
+            found[1:] |= step < -MIN_JUMP
+        near = np.abs(rescaled[own]) < PATCH_LIMIT
+        found = jumps[own] & near
+        end = float(rescaled[own][found].max(initial=-np.inf))
+        return Jumps(int(found.sum()), int(near.sum()), end)
+
+    return jumps_up(rescaled), jumps_up(-rescaled)
+
+
+def check_not_filled(found: list[tuple[Jumps, Jumps]], offset: float, voxel_size: float) -> None:
+    """Raise GridError if fill values begin within 2.5 voxels of an offset, by all planes' jumps."""
+    for side, parts in zip((1, -1), zip(*found)):
+        count, near = sum(part.edges for part in parts), sum(part.near for part in parts)
+        reach = max(part.end for part in parts)
+        if count > MAX_JUMP_SHARE * near and reach < FILL_MARGIN - UNSAMPLED:
+            end = offset + side * reach * voxel_size / 2
+            raise _too_near(offset, voxel_size, end, FILL_MARGIN, outwards=side > 0)
+
+
+def _too_near(
+    offset: float, voxel_size: float, end: float, needed: float, *, outwards: bool
+) -> GridError:
+    """Return the error for distances that end (world units) within ``needed`` half voxels."""
+    room = needed / 2 * voxel_size
+    limit, which = (end - room, "largest") if outwards else (end + room, "smallest")
+    works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"
+    return GridError(
+        f"offset {offset:g} needs distances {needed / 2:g} spacings ({room:.6g}) to either side "
+        f"of it, but they end at {end:.6g}: {works}"
+    )

@@ -1,0 +1,356 @@
+"""The fine field near the surface: blocks of nodes, never a dense array.
+
+``FineLattice`` is the whole fine lattice, whose planes are made when needed. Away from the blocks
+its values are the coarse samples interpolated trilinearly (extrapolated in the half voxel beyond
+the outermost ones), with the sign of the sample whose voxel the node lies in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import FloatArray, IntArray
+from ..errors import OptionError
+from ..grid.field import NONE_EXACT, Field
+from ..grid.planes import SamplePlanes
+from ..grid.sdf_grid import SdfGrid
+from ..threads import chunks_of
+from ..options import EXACT, NOISY
+from .band import rescale
+from .nodes import (BARELY_INSIDE, BARELY_OUTSIDE, SharedParts, VoxelIndex, block_ijk, number_parts, part_of_node, part_sizes)
+
+CHUNK = 1 << 20  # values of the lattice at a time, but at least a plane
+
+
+@dataclass(frozen=True, eq=False)
+class SampleSpheres:
+    """The spheres of exact samples: the surface touches each and pierces none."""
+
+    shape: tuple[int, int, int]  # samples of the grid along each axis
+    voxel_ijk: IntArray  # (m, 3), the samples, in C order
+    distance: FloatArray  # (m,), signed, in half voxels
+
+    @cached_property
+    def index(self) -> VoxelIndex:
+        """Finds which sample lies in a voxel."""
+        return VoxelIndex(self.voxel_ijk, self.shape)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FineField:
+    """Values at the nodes of the decoded voxels' blocks, in a whole grid or in a slab of it.
+
+    ``positions`` and ``distances`` are the nodes in world units, each once; ``block_positions`` and
+    ``block_distances`` are those of voxels, block by block. The arrays below are in index space.
+
+    Attributes
+    ----------
+    shape : three ints
+        Samples of the coarse grid along each axis.
+    factor : int
+        K; the fine lattice has ``K * n + 1`` nodes along an axis of n samples.
+    voxel_ijk : (D, 3) int32
+        The decoded voxels, in C order.
+    blocks : (Q, D) float32
+        Signed distances at the nodes of each voxel's block, in half voxels, negative inside. The
+        Q = (K+1)^3 nodes are in C order; blocks that share a node have equal values there.
+    parts : SharedParts
+        Which voxels share which nodes.
+    planes : two ints
+        The slab's planes of voxels, from the first to before the second. Values are final in these
+        and in as many planes on either side as the mesher needs; those of other voxels are
+        intermediate.
+    band_voxels : int
+        Voxels in the band of the whole grid.
+    noisy_voxels : int
+        Those of them round which samples differ by more than distances can.
+    pinned : int
+        Nodes in ``planes`` whose sign had to be changed to that of a voxel that holds no surface.
+        If there are any, the input is not a distance field there, or the network failed.
+    dropped, lone : int
+        Small pieces that begin in ``planes``: dropped since nothing supports them (``debris``), and
+        kept since a sample lies in them.
+    spheres : SampleSpheres, optional
+        The exact samples in and beside the slab, for a mesher that leans on them.
+    decoded_voxels : int
+        Voxels with a block in the whole grid.
+    grid : SdfGrid, optional
+        The coarse grid, for positions and units. That of a field from a file has no samples.
+    offset : float
+        The distance from the solid, in world units, of the surface at which the values are 0.
+    leaves : bool
+        Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
+        that crosses the border all the same is closed there.
+    border_inside : (n, 3) int32, optional
+        The voxels on the grid's border that are inside and have no block: what a cap needs of the
+        samples. None if they are to be found in ``grid``.
+    octants : (D,) uint8, optional
+        A bit for each octant of each voxel: whether all eight samples round it are known. Where
+        one is not, the surface ends. None if all are known.
+    """
+
+    shape: tuple[int, int, int]
+    factor: int
+    voxel_ijk: IntArray
+    blocks: FloatArray
+    parts: SharedParts
+    planes: tuple[int, int]
+    band_voxels: int = 0
+    noisy_voxels: int = 0
+    pinned: int = 0
+    dropped: int = 0
+    lone: int = 0
+    spheres: SampleSpheres | None = None
+    decoded_voxels: int = 0
+    grid: SdfGrid | None = None
+    offset: float = 0.0
+    leaves: bool = True
+    border_inside: IntArray | None = None
+    octants: NDArray[np.uint8] | None = None
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.shape))
+        first, last = self.planes
+        return (
+            f"FineField(factor {self.factor}, {self.parts.count_nodes(self.factor):,} nodes of "
+            f"{len(self.voxel_ijk):,} voxels in planes {first} to {last - 1} of {shape})"
+        )
+
+    @cached_property
+    def numbers(self) -> IntArray:
+        """The nodes of each voxel's block as indices of ``values``, (D, Q); computed when read.
+
+        Raises
+        ------
+        OptionError
+            If there are more nodes than 32-bit numbers.
+        """
+        starts, _ = number_parts(self.parts, part_sizes(self.factor))
+        part, place = part_of_node(self.factor)
+        return starts.T[:, part] + place
+
+    @cached_property
+    def values(self) -> FloatArray:
+        """The values of all nodes, each once, (n,) float32 in half voxels; computed when read."""
+        values = np.empty(self.parts.count_nodes(self.factor), np.float32)
+        values[self.numbers] = self.blocks.T
+        return values
+
+    @cached_property
+    def node_ijk(self) -> IntArray:
+        """The indices of all nodes in the fine lattice, in the order of ``values``, (n, 3)."""
+        ijk = np.empty((self.parts.count_nodes(self.factor), 3), np.int32)
+        ijk[self.numbers] = self._block_node_ijk(slice(None))
+        return ijk
+
+    def positions(self) -> NDArray[np.float64]:
+        """Return the world positions of all nodes, each once, (n, 3).
+
+        Raises
+        ------
+        OptionError
+            If the field was made without its ``grid``.
+        """
+        return self.placed.to_world(self.node_ijk / self.factor - 0.5)
+
+    def distances(self) -> NDArray[np.float64]:
+        """Return the signed distances at ``positions``, (n,), in world units, negative inside."""
+        return self.in_world_units(self.values)
+
+    def block_positions(self, rows: slice = slice(None)) -> NDArray[np.float64]:
+        """Return the world positions of the nodes of voxels' blocks, (m, Q, 3).
+
+        Parameters
+        ----------
+        rows : slice
+            The voxels, rows of ``voxel_ijk``; all by default.
+        """
+        return self.placed.to_world(self._block_node_ijk(rows) / self.factor - 0.5)
+
+    def block_distances(self, rows: slice = slice(None)) -> NDArray[np.float64]:
+        """Return the signed distances at ``block_positions``, (m, Q), in world units."""
+        return self.in_world_units(self.blocks[:, rows].T)
+
+    def in_world_units(self, values: FloatArray) -> NDArray[np.float64]:
+        """Return values in half voxels as distances in world units, float64: without rounding."""
+        return np.multiply(values, self.placed.voxel_size / 2, dtype=np.float64)
+
+    @property
+    def placed(self) -> SdfGrid:
+        """The coarse grid; OptionError if the field was made without it."""
+        if self.grid is None:
+            raise OptionError("the field has no grid: make it with upsample(grid, network)")
+        return self.grid
+
+    def _block_node_ijk(self, rows: slice) -> IntArray:
+        """Return the indices of the nodes of voxels' blocks in the fine lattice, (m, Q, 3)."""
+        return self.factor * self.voxel_ijk[rows][:, None] + block_ijk(self.factor)
+
+    def rows(self, first: int, last: int) -> slice:
+        """Return the rows of the voxels in planes ``first`` to before ``last``."""
+        ends = np.array([first, last], self._plane.dtype)  # another type would copy the array
+        start, stop = np.searchsorted(self._plane, ends)
+        return slice(int(start), int(stop))
+
+    @cached_property
+    def _plane(self) -> IntArray:
+        """The plane of each voxel, (D,), in one piece."""
+        return np.ascontiguousarray(self.voxel_ijk[:, 0])
+
+    @property
+    def own_rows(self) -> slice:
+        """The rows of the voxels in ``planes``."""
+        return self.rows(*self.planes)
+
+    def plane_before(self, rows: slice) -> slice:
+        """Return the rows of the voxels in the plane before that of the first of ``rows``."""
+        plane = int(self.voxel_ijk[rows.start, 0])
+        return self.rows(plane - 1, plane)
+
+    def signs(self) -> set[bool]:
+        """Return which signs occur in ``planes``: True if a node is outside, False if inside."""
+        values = self.blocks[:, self.own_rows]
+        if not values.size:
+            return set()
+        return {bool(values.min() > 0), bool(values.max() > 0)}
+
+
+def border_is_crossed(field: FineField, beside: int = 0) -> bool:
+    """Return whether the surface crosses the border of the grid, in the field's planes.
+
+    The border is that of the fine lattice, half a voxel beyond the outermost samples. So it may be
+    crossed though all samples on it are outside. ``beside`` further planes are looked at, too.
+    """
+    rows = field.rows(field.planes[0] - beside, field.planes[1] + beside)
+    side = block_ijk(field.factor)
+    for axis, samples in enumerate(field.shape):
+        for voxel, node in ((0, 0), (samples - 1, field.factor)):
+            at_face = np.flatnonzero(field.voxel_ijk[rows, axis] == voxel) + rows.start
+            outer = np.flatnonzero(side[:, axis] == node)
+            for chunk in chunks_of(len(at_face), len(outer)):
+                inside = field.blocks[outer[:, None], at_face[chunk]] <= 0
+                if (inside.any(0) & ~inside.all(0)).any():
+                    return True
+    return False
+
+
+class FineLattice(SamplePlanes):
+    """The values at all nodes of the fine lattice, in world units, negative inside.
+
+    Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``. The field has the coarse grid
+    that it was made from. Of a slab, the planes of nodes in its own planes of voxels are right.
+    """
+
+    dtype = np.dtype(np.float32)
+
+    def __init__(self, field: FineField) -> None:
+        self.field = field
+        self.shape = lattice_shape(field.shape, field.factor)
+        self.name = "the refined field"
+
+    def read(self, first: int, last: int) -> FloatArray:
+        """Return planes ``first`` to before ``last`` of nodes, (last - first, ny, nz) float32."""
+        planes = np.empty((max(last - first, 0), *self.shape[1:]), np.float32)
+        if len(planes):
+            self._interpolate(planes, first)
+            self._set_blocks(planes, first)
+        for plane in planes:  # one by one, to save memory
+            plane[...] = self.field.in_world_units(plane)
+        return planes
+
+    def _interpolate(self, planes: FloatArray, first: int) -> None:
+        """Fill planes of nodes from ``first`` on with interpolated samples, in half voxels."""
+        factor, grid = self.field.factor, self.field.placed
+        across = [_places_of_nodes(0, n, factor, m) for n, m in zip(self.shape, grid.shape)][1:]
+        low, share, nearest = _places_of_nodes(first, first + len(planes), factor, grid.shape[0])
+        start = int(low[0])
+        samples = rescale(grid, self.field.offset, start, int(low[-1]) + 2)
+        for plane, before, beyond, voxel in zip(planes, low - start, share, nearest - start):
+            values = samples[before] * (1 - beyond) + samples[before + 1] * beyond
+            outside = samples[voxel] > 0
+            for axis, (lower, upper, inner) in enumerate(across):
+                part = upper[:, None] if axis == 0 else upper
+                refined = values.take(lower, axis) * (1 - part)
+                refined += values.take(lower + 1, axis) * part
+                values, outside = refined, outside.take(inner, axis)
+            plane[...] = values
+            np.maximum(plane, BARELY_OUTSIDE, out=plane, where=outside)
+            np.minimum(plane, BARELY_INSIDE, out=plane, where=~outside)
+
+    def _set_blocks(self, planes: FloatArray, first: int) -> None:
+        """Write the refined values over the planes of nodes from ``first`` on."""
+        field, factor = self.field, self.field.factor
+        side = factor + 1
+        rows = field.rows((first - 1) // factor, (first + len(planes) - 1) // factor + 1)
+        at = factor * field.voxel_ijk[rows].astype(np.int64)
+        blocks = field.blocks[:, rows].reshape(side, side * side, -1)
+        _, ny, nz = self.shape
+        face = (np.arange(side)[:, None] * nz + np.arange(side)).ravel()
+        flat = planes.reshape(-1)
+        for layer, values in enumerate(blocks):
+            plane = at[:, 0] + layer - first
+            here = np.flatnonzero((plane >= 0) & (plane < len(planes)))
+            corner = (plane[here] * ny + at[here, 1]) * nz + at[here, 2]
+            flat[corner + face[:, None]] = values[:, here]
+
+
+def own_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
+    """Yield planes of a slab and their number; one between two slabs belongs to the second."""
+    lattice, factor = FineLattice(field), field.factor
+    first, last = (factor * plane for plane in field.planes)
+    last += field.planes[1] == field.shape[0]
+    step = max(CHUNK // (lattice.shape[1] * lattice.shape[2]), 1)
+    for start in range(first, last, step):
+        yield start, lattice.read(start, min(start + step, last))
+
+
+def _places_of_nodes(
+    first: int, last: int, factor: int, samples: int
+) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
+    """Return for nodes of an axis the sample before each, how far beyond it, and its voxel.
+
+    That is 0 to 1 spacing, or -1/2 to 3/2 in the half voxels beyond the outermost samples. A node
+    on a face lies in the second voxel.
+    """
+    place = np.arange(first, last) / factor - 0.5
+    low = np.clip(np.floor(place), 0, samples - 2).astype(np.int64)
+    voxel = np.minimum(np.arange(first, last) // factor, samples - 1)
+    return low, (place - low).astype(np.float32), voxel
+
+
+def lattice_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, int]:
+    """Return the number of nodes of the fine lattice along each axis, ``K n + 1``."""
+    nx, ny, nz = (factor * samples + 1 for samples in shape)
+    return nx, ny, nz
+
+
+def fine_grid(field: FineField) -> SdfGrid:
+    """Return the fine lattice of a whole grid's field, from ``upsample``, as a grid of spacing h/K.
+
+    It can be refined again. Its samples are not stored: planes of them are made from the field, and
+    from the coarse grid away from the surface, when they are needed. They are relative to the
+    surface at the field's offset.
+    """
+    grid, lattice = field.placed, FineLattice(field)
+    spacing = tuple(along / field.factor for along in grid.spacing)
+    blocks = field.blocks
+    ends = np.array([blocks.min(initial=np.inf), blocks.max(initial=-np.inf)], np.float32)
+    lowest, highest = field.in_world_units(ends).tolist()
+    extremes = min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)
+    origin = grid.to_world([-0.5, -0.5, -0.5])
+    kind = Field() if grid.field.kind == EXACT else Field(NOISY, True, NONE_EXACT)
+    kind = replace(kind, on_lattice=grid.field.on_lattice)
+    return SdfGrid.trusted(
+        lattice,
+        spacing,
+        origin,
+        grid.notes,
+        direction=grid.direction,
+        extremes=extremes,
+        field=kind,
+    )

@@ -1,0 +1,294 @@
+"""The fine lattice: the nodes of each voxel's block, and the averaging of nodes that blocks share.
+
+Nodes have spacing h/K. A voxel's block is its Q = (K+1)^3 nodes, faces included (Eq. 3), in C
+order. Coarse sample i has the fine index ``K*i + K/2``.
+
+Values are stored by block in an array (Q, D): a row per node of the block, a column per voxel. An
+operation on a node is one pass over contiguous memory for all voxels. Blocks that share a node
+each hold a copy of its value; ``average_shared`` makes the copies equal, bit for bit, and they stay
+so. One more column, always 0, stands for absent voxels: their index -1 reads it.
+
+A block has 27 parts: 8 corners, 12 edges, 6 faces and the interior, in the order of
+``NEIGHBOURHOOD``. Voxels share whole parts. A part belongs to the first of the voxels that share
+it (its owner), which decides where its nodes are counted and numbered.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray, Signs
+from ..threads import check_count, map_threads, worthwhile_threads
+from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+
+# The value of a node of which only the sign is known, and the least of a mask's sample, in half
+# voxels.
+BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
+LEAST_OF_MASK = np.float32(0.04)
+
+# The neighbours that share each part, the voxel itself included.
+SHARING = [
+    np.flatnonzero(((NEIGHBOURHOOD == 0) | (sides == NEIGHBOURHOOD)).all(1))
+    for sides in NEIGHBOURHOOD
+]
+
+
+def block_ijk(factor: int) -> IntArray:
+    """Return the indices of the block's nodes from the voxel's low corner, (Q, 3) in 0..K."""
+    return np.indices((factor + 1,) * 3).reshape(3, -1).T.astype(np.int32)
+
+
+def block_offsets(factor: int) -> FloatArray:
+    """Return the block's query offsets ``2 (q - p) / h``, (Q, 3) in [-1, 1] (Eqs. 3 and 5)."""
+    return (block_ijk(factor) * (2.0 / factor) - 1.0).astype(np.float32)
+
+
+@lru_cache
+def part_of_node(factor: int) -> tuple[IntArray, IntArray]:
+    """Return the part of each node of a block, (Q,) in 0..26, and its index in the part, (Q,)."""
+    block = block_ijk(factor)
+    part = (np.where(block == 0, 0, np.where(block == factor, 2, 1)) @ STRIDES).astype(np.int32)
+    place = np.empty_like(part)
+    for number in range(27):
+        place[part == number] = np.arange((part == number).sum())
+    return part, place
+
+
+@lru_cache
+def nodes_of_part(factor: int) -> list[NDArray[np.intp]]:
+    """Return the nodes of each of the 27 parts, as indices into the block."""
+    part, _ = part_of_node(factor)
+    return [np.flatnonzero(part == number) for number in range(27)]
+
+
+@lru_cache
+def part_sizes(factor: int) -> NDArray[np.int64]:
+    """Return the number of nodes of each part, (27,)."""
+    return np.array([len(nodes) for nodes in nodes_of_part(factor)])
+
+
+def seen_from(part: int, neighbour: int | np.integer[Any]) -> int:
+    """Return the number that a shared part has in a neighbour: it is on the other side there."""
+    return int((NEIGHBOURHOOD[part] - 2 * NEIGHBOURHOOD[neighbour] + 1) @ STRIDES)
+
+
+class VoxelIndex:
+    """The rows of voxels (n, 3), in C order, by their place in a grid of a shape."""
+
+    def __init__(self, voxel_ijk: IntArray, shape: tuple[int, int, int]) -> None:
+        self.shape = shape
+        self.keys = self._key_of(voxel_ijk)
+
+    def _key_of(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the number of each voxel, (...,), in C order of the whole grid."""
+        _, rows, columns = self.shape
+        i, j, k = (voxel_ijk[..., axis].astype(np.int64) for axis in range(3))
+        return (i * rows + j) * columns + k
+
+    def find(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Return the row of each voxel (..., 3), -1 if it is not in the list, (...,)."""
+        if not len(self.keys):
+            return np.full(voxel_ijk.shape[:-1], -1, np.int64)
+        wanted = self._key_of(voxel_ijk)
+        at = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
+        in_grid = ((voxel_ijk >= 0) & (voxel_ijk < self.shape)).all(-1)
+        return np.where(in_grid & (self.keys[at] == wanted), at, -1)
+
+
+def rows_among(voxels: IntArray, count: int) -> IntArray:
+    """Return the row in ``voxels`` of each of ``count`` voxels, or -1; one more -1 at the end."""
+    row_of = np.full(count + 1, -1, np.int32)
+    row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
+    return row_of
+
+
+@dataclass(frozen=True, eq=False)
+class SharedParts:
+    """Which voxels share the parts of their blocks."""
+
+    table: IntArray  # (27, D), neighbour table of the D voxels, -1 where there is no neighbour
+    owner: NDArray[np.int8]  # (27, D), of each part, as a place: ``CENTRE`` is the voxel itself
+
+    def owned(self, rows: slice = slice(None)) -> BoolArray:
+        """Return which parts the voxels in ``rows`` own, (27, n) bool."""
+        own: BoolArray = self.owner[:, rows] == CENTRE
+        return own
+
+    def count_nodes(self, factor: int, rows: slice = slice(None)) -> int:
+        """Return the number of nodes that the voxels in ``rows`` own."""
+        parts = np.count_nonzero(self.owned(rows), axis=1)
+        return int(parts @ part_sizes(factor))
+
+
+def share_parts(table: IntArray) -> SharedParts:
+    """Return the owners of all parts, given the voxels' neighbour table, (D, 27) int32."""
+    by_place = np.ascontiguousarray(table.T)
+    there = by_place >= 0
+    owner = np.full(by_place.shape, CENTRE, np.int8)
+    for part, sharing in enumerate(SHARING):
+        for place in sharing[sharing < CENTRE][::-1]:  # the first is written last
+            np.copyto(owner[part], place, where=there[place])
+    return SharedParts(by_place, owner)
+
+
+def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray, int]:
+    """Return the number of the first node of each part, (27, D) int32, and the number of nodes.
+
+    They come in the order of the voxels that own them; ``sizes``, (27,), are the nodes per part.
+    OptionError if there are more nodes than 32-bit numbers.
+    """
+    owned = parts.owned()
+    count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
+    starts = np.cumsum(owned * sizes[:, None].astype(np.int32), axis=0, dtype=np.int32)
+    before = np.cumsum(starts[-1], dtype=np.int32) - starts[-1]  # of earlier voxels
+    starts += before - sizes[:, None].astype(np.int32)
+    for part, sharing in enumerate(SHARING):
+        for place in sharing[sharing < CENTRE]:
+            rows = np.flatnonzero(parts.owner[part] == place)
+            neighbour = parts.table[place].take(rows)
+            starts[part][rows] = starts[seen_from(part, place)].take(neighbour)
+    return starts, count
+
+
+def average_shared(
+    blocks: FloatArray,
+    parts: SharedParts,
+    factor: int,
+    threads: int = 1,
+    rows: NDArray[np.intp] | None = None,
+) -> None:
+    """Set each copy of a shared node to the mean of the copies (Eq. 7), in ``blocks`` (Q, D + 1).
+
+    Given ``rows``, only those of their blocks are set. Sums are taken in the order of the voxels
+    and in double precision (in single for two numbers, whose sum does not depend on the order), so
+    that all copies get the same bits and the result does not depend on how the work was divided.
+    """
+    groups = [axes for axes in product((False, True), repeat=3) if any(axes)]
+    threads = worthwhile_threads(blocks.size, threads)
+    some = slice(0, blocks.shape[1] - 1) if rows is None else rows
+    map_threads(lambda axes: _average_group(blocks, parts, factor, axes, some), groups, threads)
+
+
+def copies_agree(blocks: FloatArray, parts: SharedParts, factor: int) -> bool:
+    """Return whether all copies of each shared node, (Q, D) values by block, are equal."""
+    nodes = nodes_of_part(factor)
+    for part, owners in enumerate(parts.owner):
+        for place in np.unique(owners[owners != CENTRE]):
+            rows = np.flatnonzero(owners == place)
+            there = parts.table[place].take(rows)
+            for own, other in zip(nodes[part], nodes[seen_from(part, place)]):
+                if (blocks[own].take(rows) != blocks[other].take(there)).any():
+                    return False
+    return True
+
+
+def _average_group(
+    blocks: FloatArray,
+    parts: SharedParts,
+    factor: int,
+    axes: tuple[bool, ...],
+    rows: slice | NDArray[np.intp],
+) -> None:
+    """Average the nodes at the block's ends along ``axes`` and inside along the other axes."""
+    places, nodes_at = _nodes_of_group(factor, axes)
+    kind = np.float32 if len(places) == 2 else np.float64
+    means = []
+    for own in places:
+        total: NDArray[Any] = np.zeros((len(nodes_at[0]), len(parts.table[0, rows])), kind)
+        times: NDArray[Any] = np.zeros(total.shape[1], kind)
+        for other, nodes in zip(places, nodes_at):
+            voxel = parts.table[CENTRE + int((own - other) @ STRIDES), rows].astype(np.intp)
+            times += voxel >= 0
+            for row, node in enumerate(nodes):
+                total[row] += blocks[node, rows] if other is own else blocks[node].take(voxel)
+        means.append((total / times).astype(np.float32))
+    for nodes, mean in zip(nodes_at, means):
+        for node, values in zip(nodes, mean):
+            blocks[node, rows] = values
+
+
+@lru_cache
+def _nodes_of_group(
+    factor: int, axes: tuple[bool, ...]
+) -> tuple[list[IntArray], list[NDArray[np.intp]]]:
+    """Return the places that a shared node can have in a block, and the block's nodes there.
+
+    A place is (3,) int32: 1 at the block's high end of an axis, 0 at its low end and along axes
+    that are not shared. Places come in the order of the voxels that see the node there.
+    """
+    block = block_ijk(factor)
+    ends = [(1, 0) if shared else (0,) for shared in axes]
+    places = [np.array(place, np.int32) for place in product(*ends)]
+    inner = (block > 0) & (block < factor)
+    nodes_at = [
+        np.flatnonzero(np.where(axes, block == factor * place, inner).all(1)) for place in places
+    ]
+    return places, nodes_at
+
+
+def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: IntArray) -> int:
+    """Give every sample of a mask its side, whatever the network says; return how many it raised.
+
+    A block's value at its sample is raised by adding a pyramid that is 0 on the faces of the block,
+    so that neighbouring blocks still agree. The lines between samples are the network's: it joins
+    slices of a thin vessel or plate across the line between two samples outside, and to hold that
+    line would drill a hole into the joint. The decoded rows of ``patches`` (V, 27) are ``voxels``.
+    """
+    sign = np.where(patches[voxels, CENTRE] > 0, np.float32(1), np.float32(-1))
+    missing = np.maximum(LEAST_OF_MASK - sign * blocks[len(blocks) // 2, :-1], 0)
+    wrong = np.flatnonzero(missing)
+    pyramid = (1 - np.abs(block_offsets(factor))).prod(1).astype(np.float32)
+    blocks[:, wrong] += pyramid[:, None] * (sign * missing)[wrong]
+    return len(wrong)
+
+
+def signs_of_skipped(
+    parts: SharedParts,
+    voxel_ijk: IntArray,
+    patches: FloatArray,
+    voxels: IntArray,
+    shape: tuple[int, int, int],
+) -> Signs:
+    """Return the signs of the neighbours (27, D) of decoded voxels that were not decoded.
+
+    It is 1 outside, -1 inside, 0 for the others. The decoded voxels (D, 3) are the rows ``voxels``
+    of the band, with the samples ``patches`` (V, 27).
+    """
+    signs = np.zeros(parts.table.shape, np.int8)
+    inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
+    for place, step in enumerate(NEIGHBOURHOOD):
+        skipped = parts.table[place] < 0
+        for axis in np.flatnonzero(step):
+            skipped &= inner[axis][int(step[axis] > 0)]
+        rows = np.flatnonzero(skipped)
+        signs[place][rows] = np.where(patches[voxels.take(rows), place] > 0, 1, -1)
+    return signs
+
+
+def pin_to_skipped(
+    blocks: FloatArray, parts: SharedParts, factor: int, skipped: Signs
+) -> NDArray[np.int64]:
+    """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
+
+    A skipped voxel holds no surface, so all its nodes have its sign. Once they do, no sign change
+    reaches the boundary of the decoded voxels, and the isosurface has no hole there. Returned is
+    how many nodes that each voxel owns were changed, (D,).
+    """
+    changed = np.zeros(skipped.shape[1], np.int64)
+    for part, nodes in enumerate(nodes_of_part(factor)):
+        sign = np.zeros(skipped.shape[1], np.int8)
+        for place in SHARING[part]:
+            np.copyto(sign, skipped[place], where=skipped[place] != 0)
+        known, outside = sign != 0, sign > 0
+        for node in nodes:
+            wrong = known & ((blocks[node] > 0) != outside)
+            if wrong.any():
+                blocks[node, wrong] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
+                changed += wrong & (parts.owner[part] == CENTRE)
+    return changed

@@ -1,0 +1,398 @@
+"""Move the surface so that it touches the sphere of every sample.
+
+An exact sample x with distance d is the centre of a sphere of radius |d| that touches the surface
+at its foot point x - d n, where n is the surface normal there. Samples of the band have one, and
+so have those a voxel beyond it: many of these touch the same edges and tips, of which the samples
+nearby say little. The refined field should be 0 at the foot points. It is not quite, since the
+network sees a sample as one number among many. In steps:
+
+1. ``find_foot_points`` follows the field's gradient from each exact sample to its foot point, and
+   reads the field there: the error, with a weight for how far to trust it.
+2. ``find_correction`` averages the errors at the corners of voxels, which also corrects walls that
+   lie between samples; then, twice, what is left of them on a lattice twice as fine.
+3. ``fit_to_spheres`` subtracts the averages from the field, by trilinear interpolation.
+
+Reference: Sellán, Batty and Stein, "Reach For the Spheres: Tangency-Aware Surface Reconstruction
+of SDFs", 2023, for the constraint; it is solved differently here.
+
+Lengths are in half voxels, as in ``band``. Sums are written out, so that the bits of a result do
+not depend on how many are worked on together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from ..threads import map_chunks
+from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from .band import MAX_DISTANCE, MIN_SLOPE
+from .nodes import SharedParts, VoxelIndex, nodes_of_part, number_parts
+
+BEYOND = 2.0  # samples this much farther than MAX_DISTANCE have spheres, too
+APART = np.maximum(2 * np.linalg.norm(NEIGHBOURHOOD, axis=1), 1).astype(np.float32)  # of samples
+LOOKS = 9  # at a sphere, for the place where it touches
+FIRST_TURN = 0.5  # share of the way to the normal, for the second look ...
+NEARER, FARTHER = 1.6, 0.4  # ... and what it is multiplied by after a look that gained, or not
+SETTLED = 0.9999  # cosine between a direction and the normal at which nothing is gained any more
+TYPICAL_ERROR = 0.2  # scale of the Cauchy weight of an error at a foot point ...
+CLEAR_ERROR = 0.05  # ... and where a sphere from beyond the band is clear of the surface
+MAX_ERROR = 0.6  # larger errors are clipped
+SQUARINGS = 3  # of the cosine between the search direction and the normal: its 8th power
+FAR_PENALTY = 0.5  # how the weight falls with a sample's distance beyond MAX_DISTANCE
+MIN_WEIGHT = 1e-3  # foot points of a smaller weight are dropped
+TEMPORARIES = 64  # numbers per sample in the search for its foot point
+
+PRIOR_WEIGHT = 0.2  # of the assumption that the error is 0, in foot points
+VARIANCE_PENALTY = 0.5  # how strongly disagreement of the errors reduces their mean
+CORNER_PARTS = np.flatnonzero(np.abs(NEIGHBOURHOOD).all(1))
+# By cells along a block: how often errors are averaged on the lattice of such cells.
+MEANS = {1: 1, 2: 2}
+
+# The fitted values of a block depend on this many planes of voxels to either side: one each time
+# that errors are averaged, for the foot points in the blocks beside; then the foot points' samples,
+# and the blocks in which these were searched for; and one for the averaging of shared nodes.
+SAMPLE_TO_FOOT = 2  # voxels: (MAX_DISTANCE + BEYOND) / 2, rounded
+REACH_IN_VOXELS = sum(MEANS.values()) + 2 * SAMPLE_TO_FOOT + 1
+
+CELL = np.indices((2, 2, 2)).reshape(3, 8).T
+"""The corners of a cell, (8, 3)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spheres:
+    """The spheres of exact samples."""
+
+    centre: IntArray  # (n, 3), the samples
+    distance: FloatArray  # (n,), signed
+    direction: FloatArray  # (3, n), about the gradient of the field there, of length 1
+
+    def __len__(self) -> int:
+        return len(self.distance)
+
+    def some(self, rows: slice | NDArray[np.signedinteger] | BoolArray) -> Spheres:
+        """Return some of the spheres."""
+        return Spheres(self.centre[rows], self.distance[rows], self.direction[:, rows])
+
+
+def _joined(parts: Sequence[Spheres]) -> Spheres:
+    return Spheres(
+        np.concatenate([part.centre for part in parts]),
+        np.concatenate([part.distance for part in parts]),
+        np.concatenate([part.direction for part in parts], 1),
+    )
+
+
+def fit_to_spheres(
+    blocks: FloatArray,
+    parts: SharedParts,
+    factor: int,
+    spheres: Spheres,
+    index: VoxelIndex,
+    threads: int = 1,
+) -> None:
+    """Move the surface so that it touches the samples' spheres.
+
+    Nodes at exact samples keep the sample's value. Without exact samples nothing is changed.
+    ``blocks`` (Q, D + 1), in half voxels, are changed in place; the last column is 0. ``parts`` and
+    ``index`` are of the D voxels.
+    """
+    if not len(spheres):  # in a noisy field, for example
+        return
+    feet = find_foot_points(blocks, factor, spheres, index, threads)
+    correction = find_correction(feet, parts)
+
+    def subtract(rows: slice) -> None:
+        blocks[:, rows] -= prolong(correction[:, rows], 2, factor)
+
+    map_chunks(subtract, correction.shape[1], len(blocks), threads)
+    own = spheres.some(np.abs(spheres.distance) < MAX_DISTANCE)
+    rows = index.find(own.centre)
+    inside = nodes_of_part(factor)[CENTRE]
+    blocks[inside[len(inside) // 2], rows[rows >= 0]] = own.distance[rows >= 0]
+
+
+def spheres_of_band(
+    voxel_ijk: IntArray,
+    patches: FloatArray,
+    exact: NDArray[np.signedinteger],
+    shape: tuple[int, int, int],
+    limits: tuple[float, float],
+    threads: int = 1,
+) -> Spheres:
+    """Return the spheres of the exact samples of a band, then of those a voxel beyond.
+
+    The band has voxels (V, 3), in C order, and their patches (V, 27); in the rows ``exact`` the own
+    sample is exact. Samples beyond have no sphere unless they lie between ``limits``.
+    """
+
+    def gather(rows: slice) -> tuple[Spheres, Spheres, FloatArray]:
+        patch = patches[exact[rows]]
+        gradient = _unit((patch[:, CENTRE + STRIDES] - patch[:, CENTRE - STRIDES]).T)
+        own = Spheres(voxel_ijk[exact[rows]], patch[:, CENTRE].copy(), gradient)
+        return own, *_spheres_beyond(own, patch, shape, limits)
+
+    parts = map_chunks(gather, len(exact), 4 * TEMPORARIES, threads)
+    if not parts:
+        return Spheres(voxel_ijk[:0], patches[:0, 0], patches[:0, :3].T)
+    own, others, slope = zip(*parts)
+    beyond = _joined(others)
+    keys = VoxelIndex(beyond.centre, shape).keys
+    order = np.lexsort((-np.concatenate(slope), keys))  # of equal samples the steepest
+    return _joined([*own, beyond.some(order[np.diff(keys[order], prepend=-1) > 0])])
+
+
+def _spheres_beyond(
+    own: Spheres, patch: FloatArray, shape: tuple[int, int, int], limits: tuple[float, float]
+) -> tuple[Spheres, FloatArray]:
+    """Return those of the samples around, ``patch`` (n, 27), that are farther than exact ones.
+
+    Also returned is how steeply each rises from the exact sample, about 1 along the gradient. One
+    that was cut off does not rise as distances do, or is at a limit.
+    """
+    sign = np.copysign(np.float32(1), own.distance)
+    slope = (sign[:, None] * patch - np.abs(own.distance)[:, None]) / APART
+    size = np.abs(patch)
+    found = np.asarray((size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND))
+    found &= (slope >= MIN_SLOPE) & (patch > limits[0]) & (patch < limits[1])
+    row, step = np.nonzero(found)
+    centre = own.centre[row] + NEIGHBOURHOOD[step]
+    in_grid = np.flatnonzero(((centre >= 0) & (centre < shape)).all(1))
+    row, step = row[in_grid], step[in_grid]
+    return Spheres(centre[in_grid], patch[row, step], own.direction[:, row]), slope[row, step]
+
+
+@dataclass(frozen=True, eq=False)
+class FootPoints:
+    """Foot points of samples, and the field's value there."""
+
+    rows: IntArray  # (n,), the block that each lies in
+    place: FloatArray  # (3, n), the position in the block, 0 to 1 along each axis
+    values: FloatArray  # (n,), the field there: the error, since it should be 0
+    weights: FloatArray  # (n,), how far to trust it, 0 to 1
+
+
+def find_foot_points(
+    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, threads: int = 1
+) -> FootPoints:
+    """Return the foot points of samples, leaving out those outside all blocks (Q, D + 1)."""
+
+    def search(rows: slice) -> FootPoints:
+        some = spheres.some(rows)
+        return _weigh(_touch(blocks, factor, some, index), some.distance)
+
+    parts = map_chunks(search, len(spheres), TEMPORARIES, threads)
+    return FootPoints(
+        *(np.concatenate(each, -1) for each in zip(*(vars(part).values() for part in parts)))
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """The field at a place on each of n spheres."""
+
+    direction: FloatArray  # (3, n), from the place to the sample, or back for a sample inside
+    rows: IntArray  # (n,), the block that the place lies in, -1 if it was not decoded
+    place: FloatArray  # (3, n), the position in it, 0 to 1 along each axis
+    value: FloatArray  # (n,), the field
+    normal: FloatArray  # (3, n), its gradient, of length 1
+    clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
+
+    @property
+    def cosine(self) -> FloatArray:
+        """The cosine between the direction and the normal, (n,)."""
+        return _dot(self.direction, self.normal)
+
+
+def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Look:
+    """Return the places where spheres touch the surface.
+
+    A sphere that touches the surface lies on the sample's side of it everywhere else. So the place
+    is where the field is lowest on the sphere of a sample outside, highest for one inside, and its
+    direction is the normal there. Each look turns the direction some way to the normal; a turn
+    that gains nothing is taken back, and the next one is smaller.
+    """
+    found = _look_along(blocks, factor, spheres, index, spheres.direction)
+    turn = np.full(len(spheres), FIRST_TURN, np.float32)
+    for _ in range(LOOKS - 1):
+        rest = np.flatnonzero((found.rows >= 0) & (found.cosine < SETTLED))
+        if not len(rest):
+            break
+        direction, share = found.direction[:, rest], turn[rest]
+        direction = _unit(direction + share * (found.normal[:, rest] - direction))
+        new = _look_along(blocks, factor, spheres.some(rest), index, direction)
+        better = new.clearance < found.clearance[rest]
+        turn[rest] = np.where(
+            better, np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
+        )
+        for mine, its in zip(vars(found).values(), vars(new).values()):
+            mine[..., rest[better]] = its[..., better]
+    return found
+
+
+def _look_along(
+    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, direction: FloatArray
+) -> Look:
+    """Return what the field is where directions (3, n) meet spheres."""
+    half = spheres.distance * direction * np.float32(-0.5)
+    aside = np.rint(half)
+    rows = index.find(spheres.centre + aside.T.astype(np.int32)).astype(np.int32)
+    place = np.clip(half - aside + np.float32(0.5), 0, 1)
+    value, gradient = sample_trilinear(blocks, rows, place, factor)
+    side = np.copysign(np.float32(1), spheres.distance)
+    clearance = np.where(rows >= 0, side * value, np.float32(np.inf))
+    return Look(direction.copy(), rows, place, value, _unit(gradient), clearance)
+
+
+def _weigh(found: Look, distance: FloatArray) -> FootPoints:
+    """Return foot points with their weights, leaving out those of almost no weight.
+
+    The weight falls with the angle between direction and normal, with the error (a Cauchy weight: a
+    large error is probably a place on the wrong part of the surface), and with the sample's
+    ``distance`` (n,), since an error of the direction matters more. Spheres from beyond the band
+    mostly touch edges, which linear cells cut off: that they are clear of them is no error.
+    """
+    clear = (np.abs(distance) >= MAX_DISTANCE) & (found.clearance > 0)
+    unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
+    aligned = np.clip(found.cosine, 0, 1)
+    for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
+        aligned *= aligned
+    farther: FloatArray = np.maximum(np.abs(distance) - np.float32(MAX_DISTANCE), 0)
+    penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
+    weights = aligned / penalty
+    kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
+    values = np.clip(found.value[kept], -MAX_ERROR, MAX_ERROR)
+    place = np.ascontiguousarray(found.place[:, kept])
+    return FootPoints(found.rows[kept], place, values, weights[kept])
+
+
+def _unit(vectors: FloatArray) -> FloatArray:
+    """Return the vectors (3, n) scaled to length 1; 0 stays 0."""
+    length = np.maximum(np.sqrt(_dot(vectors, vectors)), np.float32(1e-6))
+    return (vectors / length).astype(np.float32, copy=False)
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the dot products of vectors (3, n), (n,)."""
+    product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product
+
+
+def sample_trilinear(
+    blocks: FloatArray, rows: IntArray, place: FloatArray, factor: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the trilinear value (n,) and its gradient per cell (3, n) at places in blocks.
+
+    A place is given by its block, a column of ``blocks`` (Q, D + 1), where -1 reads the last, and
+    the position in it, (3, n), 0 to 1 along each axis.
+    """
+    low, (x, y, z) = _find_cell(place, factor)
+    side, width = factor + 1, blocks.shape[1]
+    steps = (CELL @ np.array([side * side, side, 1])) * width
+    first = ((low[0] * side + low[1]) * side + low[2]) * np.int64(width) + rows % width
+    corner = blocks.ravel().take(first + steps[:, None])  # (8, n)
+    along_z = corner[1::2] - corner[::2]
+    at_z = corner[::2] + along_z * z
+    along_y = at_z[1::2] - at_z[::2]
+    at_yz = at_z[::2] + along_y * y
+    along_x = at_yz[1] - at_yz[0]
+    slope_z = along_z[::2] + (along_z[1::2] - along_z[::2]) * y
+    gradient_y = along_y[0] + (along_y[1] - along_y[0]) * x
+    gradient_z = slope_z[0] + (slope_z[1] - slope_z[0]) * x
+    return at_yz[0] + along_x * x, np.stack([along_x, gradient_y, gradient_z])
+
+
+def _find_cell(place: FloatArray, cells: int) -> tuple[IntArray, FloatArray]:
+    """Return the cells of places (3, n), (3, n) int32, and the positions in them, 0 to 1."""
+    scaled = place * np.float32(cells)
+    low = np.minimum(scaled.astype(np.int32), cells - 1)
+    return low, scaled - low.astype(np.float32)
+
+
+def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
+    """Return the correction on the lattice of 2 cells per block, (27, D), in half voxels.
+
+    It is the mean error at the corners of voxels, interpolated to the finer lattice, plus the means
+    there of the errors that are left each time.
+    """
+    numbers, count = number_parts(parts, np.ones(27, np.int64))
+    left, correction = feet.values, np.zeros(numbers.shape, np.float32)
+    for cells, turns in MEANS.items():
+        at, shares = _nodes_round(feet, numbers, cells)
+        own = numbers[CORNER_PARTS] if cells == 1 else numbers
+        for _ in range(turns):
+            mean = _mean_at_nodes(left, at, shares * feet.weights, count)
+            correction += prolong(mean.take(own), cells, 2)
+            left = left - (mean.take(at) * shares).sum(0)
+        del at, shares
+    return correction
+
+
+def _nodes_round(
+    feet: FootPoints, numbers: IntArray, cells: int
+) -> tuple[NDArray[np.intp], FloatArray]:
+    """Return the 8 nodes round each foot point, (8, n), and its trilinear weights there, (8, n).
+
+    The nodes have ``numbers`` (27, D) by the part of each block; with 1 cell along a block they are
+    the corners of blocks, with 2 all parts.
+    """
+    low, within = _find_cell(feet.place, cells)
+    step = STRIDES * (2 // cells)
+    at = step @ low + (CELL @ step)[:, None]
+    upper = np.stack([1 - within, within])  # (2, 3, n)
+    shares: FloatArray = upper[CELL[:, 0], 0] * upper[CELL[:, 1], 1] * upper[CELL[:, 2], 2]
+    at *= numbers.shape[1]  # in place: these arrays are the largest of the fit
+    at += feet.rows
+    at[:] = numbers.ravel().take(at)
+    return at, shares
+
+
+def _mean_at_nodes(
+    values: FloatArray, at: NDArray[np.intp], weights: FloatArray, count: int
+) -> FloatArray:
+    """Return the mean at each of ``count`` nodes, (count,), of values (n,).
+
+    The ``weights`` (8, n) are of each value for the 8 nodes ``at``, (8, n).
+    """
+    weight = weights.astype(np.float64)
+    sums: list[NDArray[np.float64]] = []
+    for _ in range(3):  # of weights, values and squares
+        total: NDArray[Any] = np.bincount(at.ravel(), weight.ravel(), count)
+        sums.append(total)
+        weight *= values
+    means = map_chunks(lambda some: _shrunk_mean(*(s[some] for s in sums)), count, 8)
+    return np.concatenate(means)
+
+
+def _shrunk_mean(
+    weight: NDArray[np.float64], total: NDArray[np.float64], squares: NDArray[np.float64]
+) -> FloatArray:
+    """Return the means, (n,), by sums of weights, values and squares, shrunk if these disagree."""
+    mean = total / np.maximum(weight, 1e-9)
+    variance = np.maximum(squares / np.maximum(weight, 1e-9) - mean**2, 0)
+    agreement = mean**2 / np.maximum(mean**2 + VARIANCE_PENALTY * variance, 1e-12)
+    return (agreement * total / (weight + PRIOR_WEIGHT)).astype(np.float32)
+
+
+def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
+    """Interpolate values trilinearly to the nodes of a finer lattice of the same n blocks.
+
+    ``cells`` and ``finer`` are the cells along a block before and after, and values
+    ((cells + 1)^3, n) become ((finer + 1)^3, n). If the copies of shared nodes were equal before,
+    they are equal, bit for bit.
+    """
+    block = values.reshape(*(cells + 1,) * 3, -1)
+    for axis in range(3):
+        source = np.moveaxis(block, axis, 0)
+        block = np.empty((*block.shape[:axis], finer + 1, *block.shape[axis + 1 :]), np.float32)
+        for number, plane in enumerate(np.moveaxis(block, axis, 0)):
+            low, rest = divmod(number * cells, finer)
+            plane[:] = source[low]
+            if rest:
+                plane += (source[low + 1] - source[low]) * np.float32(rest / finer)
+    return block.reshape(len(block) ** 3, -1)

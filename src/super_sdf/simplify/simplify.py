@@ -1,0 +1,151 @@
+"""Simplifying a mesh within a measured distance, or to a number of triangles.
+
+>>> from super_sdf import simplify_mesh
+>>> simplify_mesh(mesh, error=0.02 * grid.voxel_size).mesh               # doctest: +SKIP
+
+The modules that do it are imported when they are needed: they need the extra ``simplify``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from ..errors import OutOfMemoryError
+from ..machine.extras import check_modules
+from ..machine.memory import give_back, held_memory, in_words, memory_bound
+from ..surface.mesh import Mesh, check_mesh
+from ..options import check_goal, check_max_memory
+from ..progress import ShareCallback
+
+# Peak of memory beside the mesh, measured on meshes of 120,000 to 760,000 triangles: 680 to 1,230,
+# with the libraries that it loads.
+BYTES_PER_TRIANGLE = 1300
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Distances between a mesh and a simplified one, in world units or in voxels.
+
+    Attributes
+    ----------
+    largest, mean : float
+        From the vertices of the mesh, and middles of its triangles, to the simplified one, or a
+        bound of that; the mean is over the area.
+    largest_back, mean_back : float
+        From the vertices of the simplified mesh, and points on it, to the mesh.
+    """
+
+    largest: float
+    mean: float
+    largest_back: float
+    mean_back: float
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """A simplified mesh and its distance from the unsimplified one.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        Closed, oriented and manifold if the unsimplified mesh was; its open edges are the same.
+    triangles_before : int
+        Triangles of the unsimplified mesh.
+    deviation : Deviation
+        In world units.
+    warnings : tuple of str
+        What was asked for and not reached.
+    """
+
+    mesh: Mesh
+    triangles_before: int
+    deviation: Deviation
+    warnings: tuple[str, ...] = ()
+
+    def report(self, voxel_size: float) -> dict[str, Any]:
+        """Return the figures as they stand in JSON; distances are in voxels.
+
+        ``voxel_size`` is their length in world units.
+        """
+        return {
+            "voxel_size": voxel_size,
+            "triangles_before": self.triangles_before,
+            "triangles": len(self.mesh.faces),
+            "deviation": {name: x / voxel_size for name, x in vars(self.deviation).items()},
+            "warnings": list(self.warnings),
+        }
+
+
+def simplify_mesh(
+    mesh: Mesh,
+    *,
+    error: float | None = None,
+    triangles: int | None = None,
+    max_memory: int | None = None,
+    progress: ShareCallback | None = None,
+) -> Simplified:
+    """Simplify a mesh within a distance, or to a number of triangles.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Vertices at the same position must be one vertex.
+    error : float, optional
+        Largest distance, in world units, between the two surfaces, measured both ways at the
+        vertices and at points less than an edge of ``mesh`` apart.
+    triangles : int, optional
+        Largest number of triangles. If it cannot be reached, a warning says how many are left.
+    max_memory : int, optional
+        Bytes that the process may hold in all; by default a share of the free memory.
+    progress : callable, optional
+        Called with the estimated share of the work that is done; an exception in it ends the work.
+
+    Returns
+    -------
+    Simplified
+        With vertices of the same type. Open edges stay exactly where they are.
+
+    Raises
+    ------
+    OptionError
+        If not exactly one of ``error`` and ``triangles`` is given, or it is not positive.
+    FileError
+        If the extra ``simplify`` is not installed.
+    OutOfMemoryError
+        If it would not fit in memory.
+    """
+    check_mesh(mesh)
+    error, triangles = check_goal(error, triangles)
+    check_modules("simplifying", "simplify")
+    check_room(len(mesh.faces), check_max_memory(max_memory))
+    from .collapsing import Rounds, within
+    from .counting import down_to
+    from .measuring import Original
+
+    if not len(mesh.faces):
+        return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
+    original, rounds = Original(mesh), Rounds(progress)
+    if error is not None:
+        result, warnings = within(mesh, original, error, rounds)
+    else:
+        result, warnings = down_to(mesh, original, triangles or 0, rounds)
+    deviation = Deviation(*original.deviation(result))
+    if progress:
+        progress(1.0)
+    return Simplified(result, len(mesh.faces), deviation, warnings)
+
+
+def check_room(triangles: int, max_memory: int | None, *, estimated: bool = False) -> None:
+    """Raise OutOfMemoryError if simplifying a mesh would exceed the memory bound.
+
+    With ``estimated``, the number of its triangles is a low estimate.
+    """
+    give_back()  # otherwise freed memory counts as held
+    bound, need = memory_bound(max_memory), triangles * BYTES_PER_TRIANGLE + (held_memory() or 0)
+    if bound is not None and need > bound:
+        raise OutOfMemoryError(
+            f"simplifying {'at least ' * estimated}{triangles:,} triangles needs {in_words(need)} "
+            f"of memory, since the whole mesh must be held; {in_words(bound)} may be used; use a "
+            "smaller factor, allow more (--max-memory), or do not simplify"
+        )

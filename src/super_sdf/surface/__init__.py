@@ -1,0 +1,1 @@
+"""From a fine field to a mesh."""

@@ -1,0 +1,351 @@
+"""Marching cubes on the blocks of a sparse field.
+
+Every cell of the fine lattice lies in exactly one voxel, and a node has the same value in all
+blocks that share it. Vertices lie on lattice edges and are identified by them, so nothing is welded
+by distance. Cells that share a face see the same edges on it, so the mesh is a closed, oriented
+2-manifold, except where the blocks end. In steps:
+
+1. ``find_crossings`` lists the lattice edges and cells of each block that the surface crosses.
+2. ``place_vertices`` makes a vertex on each crossed edge, in the voxel that owns the edge.
+3. ``connect`` looks up the vertices on the edges of each crossed cell, and makes its triangles.
+
+Vertices and triangles are in the order of the voxels, so a surface made slab by slab is the same as
+one made at once.
+
+The edge from node q of a block along axis a has the number ``a Q + q`` in the block, Q = (K+1)^3.
+Its number in another block that shares it, or relative to a cell, therefore differs by a constant.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, IntArray
+from ..grid.sdf_grid import SdfGrid
+from ..threads import check_count, map_chunks, map_threads, rows_in_chunk
+from .mesh import CLEARANCE, Mesh, vertex_type
+from ..network.neighbourhood import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES
+from .cap import octant_of_cells
+from .cell_cases import EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
+from ..refine.field import FineField
+from ..refine.nodes import block_ijk, part_of_node
+
+# Bytes per node of a block in the vertex lookup table: three edges, four bytes each.
+LOOKUP_BYTES = 12
+# Nodes beyond the grid's border (of a cap, see cap.close_at_border) are placed this far outside it,
+# in fine spacings: enough for distinct vertices.
+CAP_HEIGHT = 0.02
+NO_FACES = np.empty((0, 3), np.int32)
+
+
+def extract_pieces(
+    field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
+) -> list[Mesh]:
+    """Return the zero level of a field, in one or more pieces: see ``meshers.extract_mesh``."""
+    core = field.own_rows
+    before = field.plane_before(core).start if core.start < core.stop else core.start
+    rows = slice(before, core.stop)
+    crossings = find_crossings(field, rows, threads)
+    first = first_vertex - crossings.own(core).start
+    check_count(first + len(crossings.own_row), "vertices")
+    groups = groups_of_planes(field)
+    widest = max((rows.stop - field.plane_before(rows).start for rows in groups), default=0)
+    at_once = lookups_at_once(len(field.voxel_ijk), widest, threads)
+
+    def mesh_of(group: slice) -> Mesh:
+        own = crossings.own(group)
+        edges = crossings.own_row[own], crossings.own_edge[own]
+        vertices = to_world(lattice_positions(field, *edges), field, grid)
+        return Mesh(vertices, connect(field, crossings, group, first))
+
+    meshes = map_threads(mesh_of, groups, at_once)
+    return meshes or [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Edges and cells that the surface crosses in the blocks of some voxels, in their order."""
+
+    own_row: IntArray  # (n,), voxels ...
+    own_edge: NDArray[np.int16]  # (n,), ... and crossed edges that they own: each has a vertex
+    other_row: IntArray  # (m,), voxels ...
+    other_edge: NDArray[np.int16]  # (m,), ... and crossed edges of theirs that another voxel owns
+    cell_row: IntArray  # (c,), voxels ...
+    cell: NDArray[np.int16]  # (c,), ... crossed cells of their blocks ...
+    case: NDArray[np.int16]  # (c,), ... and the cases of these cells (``cell_cases``)
+
+    def own(self, rows: slice) -> slice:
+        """Return which of the own edges belong to some voxels."""
+        return _between(self.own_row, rows)
+
+
+def _between(sorted_rows: IntArray, rows: slice) -> slice:
+    """Return the places of some rows; bounds of another type would copy the array."""
+    ends = np.array([rows.start, rows.stop], sorted_rows.dtype)
+    start, stop = np.searchsorted(sorted_rows, ends)
+    return slice(int(start), int(stop))
+
+
+def find_crossings(field: FineField, rows: slice, threads: int = 1) -> Crossings:
+    """Return the edges and cells that the surface crosses in the blocks of some voxels."""
+    chunks = map_chunks(
+        lambda some: _crossings_of_chunk(field, rows.start + some.start, rows.start + some.stop),
+        rows.stop - rows.start,
+        4 * len(field.blocks),
+        threads,
+    )
+    empty = _crossings_of_chunk(field, rows.start, rows.start)
+    return Crossings(*(np.concatenate(arrays) for arrays in zip(empty, *chunks)))
+
+
+def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArray[Any], ...]:
+    """Return the arrays of ``Crossings`` for the voxels from ``start`` to before ``stop``."""
+    inside = field.blocks[:, start:stop] <= 0
+    crossed = np.flatnonzero(inside.any(0) & ~inside.all(0))
+    rows = (start + crossed).astype(np.int32)
+    inside = inside.take(crossed, 1).reshape(*(field.factor + 1,) * 3, -1)
+    slot, edge = _split(_crossed_edges(inside), rows, 3 * len(field.blocks))
+    owner = field.parts.owner[part_of_edge(field.factor)[edge], slot]
+    own = owner == CENTRE
+    corners = _corners_inside(inside)
+    active = np.flatnonzero(corners - np.uint8(1) < 254)  # 0 and 255 are not crossed
+    cell_row, cell = _split(active, rows, field.factor**3)
+    if field.octants is not None:
+        seen = (field.octants[cell_row] >> octant_of_cells(field.factor)[cell] & 1).astype(bool)
+        cell_row, cell, active = cell_row[seen], cell[seen], active[seen]
+        kept = _are_edges_of(cell_row, cell, slot, edge, field.factor)
+        slot, edge, own = slot[kept], edge[kept], own[kept]
+    case = choose_cases(field, corners[active], cell_row, cell)
+    return slot[own], edge[own], slot[~own], edge[~own], cell_row, cell, case
+
+
+def _are_edges_of(
+    cell_row: IntArray, cell: NDArray[np.int16], row: IntArray, edge: NDArray[np.int16], factor: int
+) -> BoolArray:
+    """Return which edges of voxels' blocks belong to some cells of these blocks.
+
+    On the faces of a block this is so in all blocks that share the edge: the cells on either side
+    of a face lie between the same samples.
+    """
+    edges = 3 * (factor + 1) ** 3
+    low = cell_row * np.int64(edges) + cells_low_nodes(factor)[cell]
+    return np.isin(row * np.int64(edges) + edge, low[:, None] + edge_steps(factor))
+
+
+def _split(
+    places: NDArray[np.intp], rows: IntArray, width: int
+) -> tuple[IntArray, NDArray[np.int16]]:
+    """Return the row and the column of flat indices into a table; ``rows`` names its rows."""
+    line = places // width
+    return rows[line], (places - line * width).astype(np.int16)
+
+
+def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
+    """Return the crossed edges of blocks (K+1, K+1, K+1, n), flat in a table (n, 3 Q)."""
+    crossed = np.zeros((3, *inside.shape), bool)
+    np.not_equal(inside[1:], inside[:-1], out=crossed[0, :-1])
+    np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[1, :, :-1])
+    np.not_equal(inside[:, :, 1:], inside[:, :, :-1], out=crossed[2, :, :, :-1])
+    return np.flatnonzero(np.moveaxis(crossed, -1, 0))
+
+
+def _corners_inside(inside: BoolArray) -> NDArray[np.uint8]:
+    """Return a bit for each corner of all cells of such blocks, (n K^3,), voxel by voxel."""
+    bits: NDArray[Any] = inside.view(np.uint8)
+    bits = bits[:, :, :-1] | bits[:, :, 1:] << 1
+    bits = bits[:, :-1] | bits[:, 1:] << 2
+    bits = bits[:-1] | bits[1:] << 4
+    return np.moveaxis(bits, -1, 0).ravel()
+
+
+def choose_cases(
+    field: FineField, corners: NDArray[np.uint8], row: IntArray, cell: NDArray[np.int16]
+) -> NDArray[np.int16]:
+    """Return the cases of cells, (c,), given a bit for each corner that is inside.
+
+    The inside corners of an ambiguous face are joined where bilinear interpolation on it is
+    negative at its saddle (Nielson and Hamann 1991).
+    """
+    table = choices()
+    case: NDArray[np.int16] = corners.astype(np.int16)
+    unsure = np.flatnonzero(table.ambiguous[corners])
+    low, row = cells_low_nodes(field.factor)[cell[unsure]], row[unsure]
+    steps = CORNERS @ strides(field.factor)
+    values = [field.blocks[low + step, row].astype(np.float64) for step in steps]
+    joined = np.zeros(len(unsure), np.uint8)
+    for n, (a, b, c, d) in enumerate(FACES):
+        excess = values[a] * values[c] - values[b] * values[d]
+        joined |= (np.where(values[a] <= 0, excess, -excess) > 0).astype(np.uint8) << n
+    some = corners[unsure]
+    case[unsure] = table.number[some, joined & table.ambiguous[some]]
+    return case
+
+
+@lru_cache
+def part_of_edge(factor: int) -> IntArray:
+    """Return the part of the block in which each edge lies, (3 Q,); the part's owner owns it."""
+    side = np.tile(NEIGHBOURHOOD[part_of_node(factor)[0]], (3, 1, 1))
+    side[np.arange(3), :, np.arange(3)] = 0  # not at either end of its axis
+    part: IntArray = ((side.reshape(-1, 3) + 1) @ STRIDES).astype(np.int32)
+    return part
+
+
+def groups_of_planes(field: FineField) -> list[slice]:
+    """Return the rows of the field's own planes, cut into runs of planes of about a chunk each."""
+    core = field.own_rows
+    plane = field.voxel_ijk[core, 0]
+    starts = core.start + np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1))
+    step = rows_in_chunk(len(field.blocks))
+    found = np.searchsorted(starts, np.arange(core.start, core.stop, step))
+    chosen = found[np.diff(found, prepend=-1) > 0]  # np.unique would load masked arrays
+    bounds = [*starts[chosen[chosen < len(starts)]].tolist(), core.stop]
+    return [slice(a, b) for a, b in pairwise(bounds)]
+
+
+def lookups_at_once(voxels: int, widest: int, threads: int) -> int:
+    """Return how many threads may hold a vertex lookup table at the same time.
+
+    A table may be large, since one plane may hold the whole surface. All tables, of ``widest``
+    voxels each, take at most twice the memory of the values of all ``voxels``, or there is one.
+    """
+    return max(min(8 * voxels // max(LOOKUP_BYTES * widest, 1), threads), 1)
+
+
+def lattice_positions(
+    field: FineField, row: IntArray, edge: NDArray[np.int16]
+) -> NDArray[np.float64]:
+    """Return where the surface crosses edges of blocks, (3, n), in fine spacings from node 0."""
+    axis, node = np.divmod(edge, np.int16(len(field.blocks)))
+    low = field.blocks[node, row].astype(np.float64)
+    high = field.blocks[edge_ends(field.factor)[edge], row].astype(np.float64)
+    share = np.clip(low / (low - high), CLEARANCE, 1 - CLEARANCE)
+    positions = np.empty((3, len(row)))
+    for along, samples in enumerate(field.shape):
+        voxel, runs = field.voxel_ijk[row, along], axis == along
+        start = field.factor * voxel + block_ijk(field.factor)[node, along]
+        positions[along] = start + np.where(runs, share, 0.0)
+        if ((voxel < 0) | (voxel >= samples)).any():  # voxels of a cap: moved onto the border
+            ends = -CAP_HEIGHT, samples * field.factor + CAP_HEIGHT
+            begin, end = (np.clip(x.astype(np.float64), *ends) for x in (start, start + runs))
+            positions[along] = begin + share * (end - begin)
+    return positions
+
+
+def to_world(positions: NDArray[np.float64], field: FineField, grid: SdfGrid) -> NDArray[Any]:
+    """Return positions (3, n) in fine spacings as vertices (n, 3) in world units."""
+    vertices: NDArray[Any] = np.empty(positions.shape[::-1], vertex_type(grid, field.factor))
+    if not grid.is_straight:
+        vertices[:] = grid.to_world(positions.T / field.factor - 0.5)
+        return vertices
+    for axis, position in enumerate(positions):
+        sample = position / field.factor - 0.5  # the fine index K i + K/2 is sample i
+        vertices[:, axis] = sample * grid.spacing[axis] + grid.origin[axis]
+    return vertices
+
+
+@lru_cache
+def edge_ends(factor: int) -> NDArray[np.intp]:
+    """Return the node at the far end of each edge, (3 Q,); that of edges that leave is not used."""
+    return (np.arange((factor + 1) ** 3) + strides(factor)[:, None]).ravel()
+
+
+def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> IntArray:
+    """Return the triangles (m, 3) in some whole planes, in the order of voxels and cells.
+
+    ``first`` is the vertex number of the first of ``crossings``' own edges. The lookup table of
+    vertices begins at the plane before; of that it has only the edges that each voxel owns.
+    """
+    before = np.int64(field.plane_before(rows).start)
+    own = crossings.own(slice(int(before), rows.stop))
+    vertex_at = edge_table(
+        field,
+        crossings,
+        lambda row: row - before,
+        rows.stop - int(before),
+        own,
+        _between(crossings.other_row, rows),
+        np.arange(first + own.start, first + own.stop),
+    )
+    some = _between(crossings.cell_row, rows)
+    case = crossings.case[some]
+    counts, starts, table = _flat_triangles(field.factor)
+    low = (crossings.cell_row[some] - before) * (3 * len(field.blocks))
+    low += cells_low_nodes(field.factor)[crossings.cell[some]]
+    times = counts[case]
+    nth = np.arange(times.sum()) + np.repeat(starts[case] - (np.cumsum(times) - times), times)
+    faces: IntArray = vertex_at.take(table[nth] + np.repeat(low, times)[:, None])
+    return faces
+
+
+def edge_table(
+    field: FineField,
+    crossings: Crossings,
+    slot: Callable[[NDArray[Any]], NDArray[np.int64]],
+    count: int,
+    own: slice | NDArray[np.intp],
+    others: slice | NDArray[np.intp],
+    numbers: NDArray[Any],
+) -> IntArray:
+    """Return a number for each crossed edge of some blocks, (count 3 Q,); other entries are unset.
+
+    ``numbers`` are those of the ``own`` edges; the ``others`` look them up in the blocks of their
+    owners. ``slot`` returns the places of voxels in the table.
+    """
+    edges = 3 * len(field.blocks)
+    number_at = np.empty(count * edges, np.int32)
+    number_at[slot(crossings.own_row[own]) * edges + crossings.own_edge[own]] = numbers
+    row, edge = crossings.other_row[others], crossings.other_edge[others].astype(np.int64)
+    place, owner = owners_of(field, crossings, others)
+    same_edge = slot(owner) * edges + edge - edge_shifts(field.factor)[place]
+    number_at[slot(row) * edges + edge] = number_at.take(same_edge)
+    return number_at
+
+
+def owners_of(
+    field: FineField, crossings: Crossings, others: slice | NDArray[np.intp]
+) -> tuple[NDArray[np.int8], IntArray]:
+    """Return the places and the rows of the voxels that own other edges."""
+    row = crossings.other_row[others]
+    place = field.parts.owner[part_of_edge(field.factor)[crossings.other_edge[others]], row]
+    return place, field.parts.table[place, row]
+
+
+@lru_cache
+def edge_shifts(factor: int) -> NDArray[np.int64]:
+    """Return an edge's number in a block minus its number in each neighbouring block, (27,)."""
+    shifts: NDArray[np.int64] = factor * NEIGHBOURHOOD.astype(np.int64) @ strides(factor)
+    return shifts
+
+
+def strides(factor: int) -> NDArray[np.int64]:
+    """Return the steps from a node of a block to the next one along each axis, (3,)."""
+    return np.array([(factor + 1) ** 2, factor + 1, 1])
+
+
+@lru_cache
+def cells_low_nodes(factor: int) -> NDArray[np.intp]:
+    """Return the node at the low corner of each cell of a block, (K^3,)."""
+    return np.flatnonzero((block_ijk(factor) < factor).all(1))
+
+
+def edge_steps(factor: int) -> NDArray[np.int64]:
+    """Return the number of each edge of a cell, counted from that of its low node, (12,)."""
+    start = (CORNERS @ strides(factor))[np.array(EDGE_START)]
+    steps: NDArray[np.int64] = start + np.array(EDGE_AXIS) * (factor + 1) ** 3
+    return steps
+
+
+@lru_cache
+def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
+    """Return the triangles of all cases: how many, the first, edges from the cell's low node."""
+    counts, table = triangle_table()
+    edge = edge_steps(factor)
+    used = np.arange(table.shape[1]) < counts[:, None]
+    return counts, (np.cumsum(counts) - counts).astype(np.int32), edge[table[used]]
