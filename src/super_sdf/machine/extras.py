@@ -10,6 +10,7 @@ from ..errors import FileError
 EXTRAS = {
     "nifti": ("nibabel",),
     "nrrd": ("nrrd",),
+    "metaimage": ("SimpleITK",),
     "vti": ("vtkmodules",),
     "tiff": ("tifffile",),
     "hdf5": ("h5py",),
