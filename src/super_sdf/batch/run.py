@@ -13,6 +13,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 
+from ..errors import OptionError
 from ..machine.memory import free_memory
 from .pool import Death, Pool, Work
 from ..threads import allot_each, count_cores
@@ -75,10 +76,7 @@ class Run:
         workers = self._count_workers()
         memory = self.batch.waiting[0].options.max_memory
         if settings.cluster is not None:
-            from .on_cluster import convert_on_cluster
-
-            jobs = list(self.batch.waiting)
-            yield from convert_on_cluster(Queue(self), jobs, settings, workers, warn)
+            raise OptionError("--cluster is not there yet: leave it out")
         elif workers > 1:  # decided once, before the workers fill the memory
             share = allot_each(workers, settings.threads, memory)
             prepare = partial(prepare_worker, settings, share.threads)

@@ -25,7 +25,7 @@ from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words, memory_bound
-from ..threads import allot, useful_threads
+from ..threads import useful_threads
 from ..surface.mesh import Mesh
 from ..options import LENGTHS, MASK, ConvertOptions, check_distance, check_max_memory
 from ..refine.survey import Band, no_surface, survey
@@ -270,8 +270,7 @@ def band_of(kept: Kept, options: ConvertOptions) -> Band:
     offset = check_distance(options.offset)
     if kept.band:
         return kept.band
-    resources = allot(0, check_max_memory(options.max_memory))
-    band = survey(cubic_grid(kept.grid, offset), offset, resources)
+    band = survey(cubic_grid(kept.grid, offset), offset, threads=useful_threads(0))
     if not len(band.voxel_ijk):
         raise no_surface(kept.grid, offset)
     return band

@@ -99,7 +99,7 @@ class SparseWriter:
             array = np.asarray(value)
             with self._open(name, array.shape, array.dtype) as member:
                 member.write(little_endian(array))
-        self.values = self._open("values", (field.decoded_voxels, side, side, side), exact)
+        self.values = self._open("values", (len(field.voxel_ijk), side, side, side), exact)
 
     def _add_samples(self, field: FineField) -> None:
         spheres = field.spheres
@@ -207,9 +207,7 @@ class _Reader:
             voxels,
             blocks,
             parts,
-            (0, shape[0]),
             spheres=SampleSpheres(shape, samples, _in_half_voxels(distance, grid)),  # type: ignore[arg-type]
-            decoded_voxels=len(voxels),
             grid=grid,
             offset=float(self._array("offset", "f", ())),
             leaves=bool(self._array("leaves", "b", ())),
