@@ -107,8 +107,7 @@ class Upsampling:
 
         then = (SHARE_BEFORE, "simplifying") if self.chosen.goals() else None
         with raising_interrupts(), progress_bar("upsampling", options["quiet"], then) as progress:
-            convert = self._convert_here if options["cluster"] is None else self._convert_there
-            self.result = convert(progress)
+            self.result = self._convert_here(progress)
         self.seconds |= self.result.seconds
         with raising_interrupts():
             if options["check"]:
@@ -138,9 +137,7 @@ class Upsampling:
             check_page("--report", options["report"], files, force=force)
         if options["cluster"] is not None:
             check_cluster(options)
-            from ..cluster.bricks import check_can_brick
-
-            check_can_brick(self.source, self.chosen, options["save_field"])
+            raise OptionError("--cluster is not there yet: leave it out")
         elif options["jobs"]:
             raise OptionError(
                 f"--jobs {options['jobs']} is for --cluster local: give that, too, or leave it out"
@@ -160,28 +157,6 @@ class Upsampling:
             save_field=self.options["save_field"],
             keep=bool(self.options["check"] or self.options["report"]),
         )
-
-    def _convert_there(self, progress: Progress | None) -> Conversion:
-        from ..cluster.bricks import convert_on_cluster
-        from ..cluster.checking import Needs
-        from ..cluster.connecting import connect
-
-        options, model = self.options, self.model
-        if model not in QUALITIES:
-            model = str(Path(model).absolute())
-        needs = Needs(model, options["precision"], options["device"])
-        limits = {"threads": options["threads"], "max_memory": options["max_memory"]}
-        with connect(options["cluster"], workers=options["jobs"], **limits) as cluster:
-            return convert_on_cluster(
-                self.source,
-                self.target,
-                cluster,
-                needs,
-                self.chosen,
-                force=options["force"],
-                progress=progress,
-                announce=self._announce,
-            )
 
     def _announce(self, line: str) -> None:
         """Print, before the work, what may make the user stop it; the bar is redrawn below."""
