@@ -33,10 +33,9 @@ from .refine.field import FineField, SampleSpheres, border_is_crossed
 from .refine.spheres import fit_to_spheres, spheres_of_band
 from .refine.spline import interpolate
 from .refine.survey import Band, BandSummary, no_surface, survey
-from .surface.cap import check_can_close, close, seen_octants
-from .surface.mesh import Mesh, join_meshes, vertex_type
-from .surface.meshers import extract_pieces, find_mesher
-from .surface.topology import OpenEdges
+from .surface.cap import check_can_close, seen_octants
+from .surface.extract import choose_mesher, extract
+from .surface.mesh import Mesh, vertex_type
 from .threads import useful_threads
 
 
@@ -56,6 +55,8 @@ def refine(
     """
     steps = steps or StepCounter()
     band = survey(grid, offset, threads=threads, whole=whole)  # Eqs. 2 and 4
+    if whole is None and not band.decoded.any():
+        raise no_surface(grid, offset)
     steps.finish("band")
     field = refine_band(band, network, factor, threads, steps)
     return replace(field, grid=grid, offset=offset)
@@ -273,7 +274,7 @@ def mesh_grid(
     check_can_close(grid, cap=chosen.cap)
     steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
-    mesher = find_mesher(chosen.mesher, exact=lattice.field.has_exact)
+    mesher = choose_mesher(chosen.mesher, exact=lattice.field.has_exact)
     vertex_type(lattice, factor)
     threads = useful_threads(decoder.threads)
     field = refine(lattice, decoder, factor, offset, threads=threads, steps=steps)
@@ -283,13 +284,9 @@ def mesh_grid(
         save_field(field)
         steps.watch.lap("save field")
     is_cut = field.octants is not None or (field.leaves and border_is_crossed(field))
-    whole = close(field, cap=chosen.cap, beside=mesher.planes_beside(factor))
-    counts, leaves = field.counts, field.leaves
-    del field
-    mesh = join_meshes(extract_pieces(whole, lattice, 0, threads, mesher))
-    steps.finish("isosurface")
-    edges = OpenEdges()
-    edges.add(mesh.faces)
-    if (chosen.cap or not is_cut) and (count := len(edges)):
+    mesh, _ = extract(field, lattice, mesher=mesher, cap=chosen.cap, threads=threads)
+    count = mesh.open_edges()
+    if count and (chosen.cap or not is_cut):
         raise MeshError(f"the mesh is torn, with {count:,} open edges: report it")
-    return Result(mesh, len(edges), counts, leaves, is_cut, steps.take_seconds())
+    steps.finish("isosurface")
+    return Result(mesh, count, field.counts, field.leaves, is_cut, steps.take_seconds())

@@ -104,21 +104,6 @@ class FineField:
     border_inside: IntArray | None = None
     octants: NDArray[np.uint8] | None = None
     counts: dict[str, int] = field(default_factory=dict)
-    planes: tuple[int, int] | None = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "planes", self.planes or (0, self.shape[0]))
-
-    @property
-    def own_rows(self) -> slice:
-        """The rows of the voxels in ``planes``."""
-        assert self.planes is not None
-        return self.rows(*self.planes)
-
-    def plane_before(self, rows: slice) -> slice:
-        """Return the rows of the voxels in the plane before that of the first of ``rows``."""
-        plane = int(self.voxel_ijk[rows.start, 0])
-        return self.rows(plane - 1, plane)
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -212,7 +197,7 @@ class FineField:
         return np.ascontiguousarray(self.voxel_ijk[:, 0])
 
 
-def border_is_crossed(field: FineField, beside: int = 0) -> bool:
+def border_is_crossed(field: FineField) -> bool:
     """Return whether the surface crosses the border of the grid.
 
     The border is that of the fine lattice, half a voxel beyond the outermost samples. So it may be
