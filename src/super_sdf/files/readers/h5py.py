@@ -42,10 +42,11 @@ def read_hdf5(request: Request) -> Volume:
             "direction": image["Directions"][:].T[:, ::-1],
             "space": LPS,
         }
-        return _volume_of(_dataset(request, image, "VoxelData"), place)
-    values = _dataset(request, file, request.choose(names, "3D dataset"))
+        return _volume_of(request, image["VoxelData"], place)
+    values = file[request.choose(names, "3D dataset")]
     axes = _axes(values)
-    return _volume_of(values, placed(axes, dict(values.attrs), values.shape, request.axes))
+    place = placed(axes, dict(values.attrs), values.shape, request.axes)
+    return _volume_of(request, values, place)
 
 
 def read_mat_73(request: Request, numbers: tuple[str, ...], place: Any) -> Volume:
@@ -61,9 +62,9 @@ def read_mat_73(request: Request, numbers: tuple[str, ...], place: Any) -> Volum
         and len(entry.shape or ()) == 3
         and entry.attrs.get("MATLAB_class", b"") in kinds
     ]
-    values = _dataset(request, file, request.choose(names, "array of three axes"))
+    values = file[request.choose(names, "array of three axes")]
     stated = {key: np.transpose(file[key][()]) for key in PLACE if key in file}
-    return _volume_of(values, place(stated, values.shape))
+    return _volume_of(request, values, place(stated, values.shape))
 
 
 def may_be_grid(shape: tuple[int, ...] | None) -> bool:
@@ -94,29 +95,27 @@ def _axes(values: Any) -> list[Axis]:
     return axes
 
 
-def _dataset(request: Request, file: Any, name: str) -> Any:
+def _volume_of(request: Request, values: Any, place: dict[str, Any]) -> Volume:
     """Return a dataset whose raw data may be in files beside its own; FileError if elsewhere."""
     import h5py
 
-    # HDF5 takes names of files from the current folder, unless it is told otherwise
-    access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
-    access.set_efile_prefix(os.fsencode(request.path.absolute().parent))
-    values = h5py.Dataset(h5py.h5d.open(file.id, name.encode(), access))
     if values.is_virtual:
         raise FileError(
             f"{request.path}:{values.name} is a virtual dataset, put together of others: save its "
             "values as a dataset of their own"
         )
-    for raw, _, _ in values.external or ():
-        check_beside(request.path, raw)
-    return values
-
-
-def _volume_of(values: Any, place: dict[str, Any]) -> Volume:
     absent = total = 0
     if values.chunks:
         total = prod(-(-size // chunk) for size, chunk in zip(values.shape, values.chunks))
         absent = total - values.id.get_num_chunks()
     about = dict(values.attrs)
     said = values_of(values.dtype, about, absent=absent, total=total, fill=values.fillvalue)
+    for raw, _, _ in values.external or ():
+        check_beside(request.path, raw)
+    if values.external:  # HDF5 takes their names from the current folder, unless told otherwise
+        access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
+        access.set_efile_prefix(os.fsencode(request.path.absolute().parent))
+        file, name = values.file.id, values.name.encode()
+        values.id.close()
+        values = h5py.Dataset(h5py.h5d.open(file, name, access))
     return Volume(values, **place, **said)
