@@ -21,15 +21,17 @@ BESIDE = {"lab", "export"}  # packages of a clone that are not in the wheel
 # The library of each file format is imported by its reader or writer alone, when it is used.
 READERS = {
     "fields.writing": {"vtkmodules"},
-    "files.readers.medical": {"nibabel", "pydicom"},
-    "files.readers.hdf5": {"h5py", "scipy"},
-    "files.readers.raw_files": {"mrcfile"},
-    "files.readers.nrrd_file": {"nrrd"},
-    "files.readers.tiff": {"tifffile"},
+    "files.readers.nibabel": {"nibabel"},
+    "files.readers.pydicom": {"pydicom"},
+    "files.readers.simpleitk": {"SimpleITK"},
+    "files.readers.h5py": {"h5py"},
+    "files.readers.scipy": {"h5py", "scipy"},
+    "files.readers.mrcfile": {"mrcfile"},
+    "files.readers.nrrd": {"nrrd"},
+    "files.readers.tifffile": {"tifffile"},
     "files.readers.vdb": {"numcodecs"},
-    "files.readers.vti": {"vtkmodules"},
     "files.readers.vtk": {"vtkmodules"},
-    "files.readers.zarr_files": {"zarr"},
+    "files.readers.zarr": {"zarr"},
     "pyvista": {"pyvista"},
 }
 # Rooms that need more than the few packages that are always installed.

@@ -20,7 +20,7 @@ from super_sdf.files.vdb_writer import (ACTIVE_MASK, INSIDE, MIXED, OUTSIDE, Lev
 
 PAD = 8  # voxels that are looked at beyond the lattice
 
-pytestmark = pytest.mark.usefixtures("folder", "in_process")
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 def turned() -> SdfGrid:
