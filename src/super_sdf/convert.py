@@ -29,7 +29,6 @@ from .pipeline import mesh_grid
 from .progress import Progress, Stopwatch, part_of, share_of
 from .surface.cap import check_can_close
 from .refine.field import lattice_shape
-from .refine.survey import Band
 
 if TYPE_CHECKING:
     from .files.fields import FieldFile
@@ -46,19 +45,11 @@ COUNTS = (
 )
 
 @dataclass(frozen=True, eq=False)
-class Kept:
-    """What a check of a mesh needs: the grid as it was read, the mesh, and the band if known."""
-
-    grid: SdfGrid
-    mesh: Mesh
-    band: Band | None = None
-
-
-@dataclass(frozen=True)
 class Conversion:
     """The result of a conversion."""
 
     grid: SdfGrid  # as it was read
+    mesh: Mesh  # as it was written
     counts: dict[str, int]  # those of ``COUNTS``, ``expected_triangles`` and ``expected_bytes``
     bounds: tuple[Triple, Triple]  # lowest and highest coordinates, in world units
     closed: bool  # no edge is open; else the surface leaves the grid and is not capped
@@ -69,7 +60,6 @@ class Conversion:
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
     saved_field: dict[str, Any] | None = None  # its path; shape, spacing, origin of the lattice
     engine: dict[str, Any] = field(default_factory=dict)  # who did the work, if not this process
-    kept: Kept | None = None  # for a check, if it was asked for and is small enough
 
     def remarks(self) -> list[str]:
         """Return sentences on what the mesh has that the samples do not show, or lacks."""
@@ -103,7 +93,6 @@ def convert(
     before_rename: Callable[[Path], None] | None = None,
     announce: Callable[[str], None] | None = None,
     save_field: str | Path | None = None,
-    keep: bool = False,
 ) -> Conversion:
     """Convert a grid file to a mesh file, in formats of ``read_grid`` and ``write_mesh``.
 
@@ -112,8 +101,7 @@ def convert(
     called with the path of the finished temporary file, before it is renamed to ``target``;
     ``announce`` before the work with a sentence on the size of the mesh file, if it will be large.
     ``save_field`` is a file for the refined field, in a format of ``write_field``: it and the mesh
-    file are both complete at the end, or neither is written. ``keep`` keeps grid, band and mesh for
-    a check, so that it need not read them again.
+    file are both complete at the end, or neither is written.
 
     SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
     Nothing is written then.
@@ -172,6 +160,7 @@ def convert(
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     return Conversion(
         grid,
+        mesh,
         counts,
         bounds=(as_triple(low, "low"), as_triple(high, "high")),
         closed=simplified.mesh.is_closed() if simplified else not is_open,
@@ -184,7 +173,6 @@ def convert(
         ),
         seconds=watch.seconds,
         saved_field=file.report() if file else None,
-        kept=Kept(grid, mesh) if keep else None,
     )
 
 
