@@ -207,7 +207,7 @@ def test_bad_input_is_one_line_and_no_file(here, command, words):
 def test_a_zip_bomb_is_refused_unread(here, command, monkeypatch):
     np.savez_compressed("bomb.npz", values=np.zeros((200, 200, 200), np.float32))
     packed = zipfile.ZipFile("bomb.npz").getinfo("values.npy").compress_size
-    monkeypatch.setattr("super_sdf.machine.memory.free_memory", lambda: 10**7)
+    monkeypatch.setattr("super_sdf.threads.free_memory", lambda: 10**7)
     monkeypatch.setattr("super_sdf.files.unpacking._scratch_file", None)
     want = (
         "bomb.npz[values], 200 x 200 x 200 float32, 32,000,000 bytes, is compressed to "
@@ -218,7 +218,7 @@ def test_a_zip_bomb_is_refused_unread(here, command, monkeypatch):
 
 
 def test_a_factor_beyond_memory_is_refused_before_the_work(here, command, monkeypatch):
-    monkeypatch.setattr("super_sdf.machine.memory.free_memory", lambda: 10**7)
+    monkeypatch.setattr("super_sdf.threads.free_memory", lambda: 10**7)
     monkeypatch.setattr("super_sdf.slabs.cutting.give_back", lambda: None)
     code, _, err = command("upsample", "in.npy", "out.ply", "--factor", 16)
     assert code == 1 and err.startswith("Error: factor 16 on ")

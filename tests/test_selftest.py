@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from super_sdf.cli import selftest
-from super_sdf.machine import extras
-from super_sdf.machine.extras import EXTRAS
+from super_sdf import errors as extras
+from super_sdf.errors import EXTRAS
 from super_sdf.network import network
 from super_sdf.cli.selftest import Finding, run_checks
 

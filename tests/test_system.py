@@ -10,9 +10,9 @@ import pytest
 
 from super_sdf import load_network
 from super_sdf.cli.entry import main
-from super_sdf.machine import memory, system
+from super_sdf import threads as memory, system
 from super_sdf import threads as resources
-from super_sdf.machine.system import bound_of_cores, left_memory
+from super_sdf.threads import bound_of_cores, left_memory
 from super_sdf.network.network import Network, find_model, fingerprint_of, small_ball
 
 CORE_2 = "fpu sse sse2 pni ssse3 cx16"

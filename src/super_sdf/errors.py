@@ -4,6 +4,8 @@ A message is one line: what is wrong, the value seen, the way out. Each class is
 Python's own, so that code which knows only these catches it.
 """
 
+from importlib.util import find_spec
+
 
 class SuperSdfError(Exception):
     """Base class of all errors of this package."""
@@ -57,3 +59,45 @@ def seen(value: object) -> str:
     """Return the repr of a value for error messages: on one line, at most 60 characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+EXTRAS = {
+    "nifti": ("nibabel",),
+    "nrrd": ("nrrd",),
+    "vti": ("vtkmodules",),
+    "tiff": ("tifffile",),
+    "hdf5": ("h5py",),
+    "zarr": ("zarr",),
+    "vdb": ("numcodecs",),
+    "mrc": ("mrcfile",),
+    "mat": ("h5py", "scipy"),
+    "netcdf": ("h5py", "scipy"),
+    "dicom": ("pydicom",),
+    "3mf": ("lxml", "networkx"),
+    "pyvista": ("pyvista",),
+    "simplify": ("igl", "pyfqmr"),
+    "eval": ("igl", "scipy"),
+    "report": ("igl", "pyfqmr"),
+    "cluster": ("distributed",),
+}
+"""Modules that each extra installs."""
+
+
+def missing_modules(modules: tuple[str, ...]) -> list[str]:
+    """Return the modules that are not installed."""
+    return [name for name in modules if find_spec(name) is None]
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra, from a clone of the sources."""
+    return f"pip install -e '.[{extra}]' in a clone of super-sdf"
+
+
+def check_modules(what: str, extra: str, modules: tuple[str, ...] | None = None) -> None:
+    """Raise FileError if modules that ``what`` needs are missing, naming the extra to install.
+
+    ``modules`` are the modules needed; by default all of the extra.
+    """
+    missing = missing_modules(EXTRAS[extra] if modules is None else modules)
+    if missing:
+        raise FileError(f"{what} needs {', '.join(missing)}: {how_to_install(extra)}")

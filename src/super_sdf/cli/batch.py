@@ -11,7 +11,7 @@ import click
 
 from ..errors import SuperSdfError, WriteError
 from ..files.formats import NAMED, list_formats
-from ..machine.extras import check_modules
+from ..errors import check_modules
 from ..options import MESH_FORMATS
 from .batch_report import (made_again_lines, print_plan, print_summary, progress_line, sentence, summary)
 from .common import (CONTEXT, GroupedCommand, InterruptedCommand, check_can_check, check_cluster, check_names, check_option, check_page, chosen_model, cluster_option, conversion_options, labels_option, make_options, names_option, one_line_errors, print_stderr, report_option)

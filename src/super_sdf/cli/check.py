@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from ..machine.extras import check_modules
+from ..errors import check_modules
 from ..options import GRID, LENGTHS, ConvertOptions, parse_size
 from .common import (CHECK_MODULES, CONTEXT, Parsed, one_line_errors, print_stderr, print_stdout, table_options)
 from .interrupts import raising_interrupts

@@ -15,7 +15,7 @@ import click
 from click.core import ParameterSource
 
 from ..errors import OptionError, SuperSdfError, seen
-from ..machine.extras import check_modules
+from ..errors import check_modules
 from ..options import MARCHING, OPTIONS, UPSAMPLE, ConvertOptions, Option
 from .interrupts import describe_interrupt, exit_code
 

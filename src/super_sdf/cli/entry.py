@@ -11,7 +11,6 @@ import os
 import sys
 from contextlib import suppress
 
-from ..machine.system import check_processor
 from .interrupts import ending_at_once
 
 # Writing to a descriptor that is open for reading fails, as writing to a closed one does.
@@ -27,7 +26,6 @@ def main() -> None:
     gc.set_threshold(RARELY)
     with ending_at_once():
         open_missing_streams()
-        check_processor()
         from .main import run
 
         try:

@@ -10,7 +10,7 @@ import click
 from click.core import ParameterSource
 
 from ..errors import OptionError
-from ..machine.extras import check_modules
+from ..errors import check_modules
 from .common import CONTEXT, one_line_errors, print_stderr, progress_bar
 from .interrupts import raising_interrupts
 

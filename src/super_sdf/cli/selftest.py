@@ -19,8 +19,8 @@ from .. import __version__
 from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, SuperSdfError
 from ..grid.sdf_grid import make_grid
-from ..machine.extras import EXTRAS, how_to_install, missing_modules
-from ..machine.memory import free_memory
+from ..errors import EXTRAS, how_to_install, missing_modules
+from ..threads import free_memory
 from ..network.device import available_devices, check_cuda, describe_gpu, onnxruntime_version
 from ..network.network import MASK_MODEL, NO_NETWORKS, float32_name, load_network, shipped_models
 from ..options import AUTO, FLOAT32, MASK, Device, FieldKind

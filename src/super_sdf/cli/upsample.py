@@ -12,7 +12,7 @@ import click
 from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
-from ..machine.extras import check_modules
+from ..errors import check_modules
 from ..options import MESH_FORMATS, ConvertOptions
 from ..progress import Progress, Stopwatch
 from .common import (CONTEXT, GroupedCommand, check_can_check, check_cluster, check_names, check_option, check_page, chosen_model, cluster_option, conversion_options, labels_option, load_chosen, make_options, names_option, one_line_errors, print_stderr, print_stdout, progress_bar, report_option)

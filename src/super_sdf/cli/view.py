@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ..machine.extras import check_modules
+from ..errors import check_modules
 from .common import (CONTEXT, check_page, conversion_options, load_chosen, make_options, one_line_errors, print_stderr)
 from .interrupts import raising_interrupts
 

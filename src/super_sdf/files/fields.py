@@ -14,8 +14,8 @@ from numpy.lib import format as npy
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
 from .output import check_free, free_space, little_endian, naming, replacing
 from ..grid.sdf_grid import SdfGrid
-from ..machine.extras import check_modules
-from ..machine.memory import held_memory, in_words, memory_bound
+from ..errors import check_modules
+from ..threads import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..surface.cap import check_all_seen
 from ..refine.field import FineField, fine_grid, lattice_shape, lattice_planes

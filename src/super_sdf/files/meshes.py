@@ -27,7 +27,7 @@ from ..errors import FileError, OptionError, WriteError
 from ..grid.placement import as_triple
 from ..grid.planes import in_blocks, over_planes
 from ..grid.sdf_grid import SdfGrid, negated
-from ..machine.memory import in_words
+from ..threads import in_words
 from ..surface.mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
 from ..options import Space, Unit, check_path, check_space, check_unit
 from .mesh_writers import (NO_COLOURS, Colour, write_3mf, write_glb, write_obj, write_off, write_ply, write_stl)

@@ -24,7 +24,7 @@ from .regular import check_regular_file
 from ..grid.field import Field
 from ..grid.planes import InputFile, SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import check_fits
+from ..threads import check_fits
 from ..options import check_factor, check_path
 from ..refine.band import neighbour_table
 from ..surface.cap import find_border_inside
