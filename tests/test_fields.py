@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from conftest import ball, refusal, trilinear
 from numpy.typing import ArrayLike
-from test_slabs import in_pieces
 
 from super_sdf import (SdfGrid, extract_mesh, fine_grid, load_network, make_grid, read_field, read_grid, reconstruct, upsample, write_field, write_mesh)
 from super_sdf.errors import (FileError, OptionError, OptionTypeError, OutOfMemoryError, WriteError)
@@ -199,24 +198,6 @@ def test_a_field_from_a_file_has_no_far_values():
             "own file"
         )
     assert sorted(os.listdir()) == ["again.npz", "field.npz"]
-
-
-@pytest.mark.parametrize(
-    "name, suffix",
-    [
-        *(("whole", ".npz"), ("leaving", ".npz"), ("leaving", ".vti"), ("tip", ".npy")),
-        *(("whole", ".vdb"), ("leaving", ".vdb"), ("tip", ".vdb")),
-    ],
-)
-def test_a_field_saved_in_slabs_is_the_same_file(name, suffix, bare_plan, monkeypatch):
-    grid, network = GRIDS[name](), load_network("fast", threads=1)
-    path, shape = Path("slabs" + suffix), tuple(4 * n + 1 for n in grid.shape)
-    write_field(upsample(grid, network, 4), "whole" + suffix)
-    with writing.saving_field(path, shape) as file:
-        pieces = in_pieces(grid, network, monkeypatch, 4, save=file.add)
-        file.finish()
-    assert len(pieces) > 2 and pieces[0].whole["slabs"] == len(pieces)
-    assert path.read_bytes() == Path("whole" + suffix).read_bytes()
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,11 @@
 """Everything that this package raises on purpose, below ``SuperSdfError``.
 
 A message is one line: what is wrong, the value seen, the way out. Each class is also one of
-Python's own, so that code which knows only these catches it.
+Python's own, so that code which knows only these catches it. ``check_modules`` raises one where an
+optional library is missing.
 """
+
+from __future__ import annotations
 
 from importlib.util import find_spec
 
@@ -20,7 +23,7 @@ class NoSurfaceError(GridError):
 
 
 class MeshError(SuperSdfError, ValueError):
-    """A reference mesh does not bound a solid, or slabs or bricks of a mesh do not meet."""
+    """A reference mesh does not bound a solid, or a mesh or the tiles of one are torn."""
 
 
 class OptionError(SuperSdfError, ValueError):
@@ -80,7 +83,7 @@ EXTRAS = {
     "report": ("igl", "pyfqmr"),
     "cluster": ("distributed",),
 }
-"""Modules that each extra installs."""
+"""The modules that each extra installs."""
 
 
 def missing_modules(modules: tuple[str, ...]) -> list[str]:
@@ -94,10 +97,6 @@ def how_to_install(extra: str) -> str:
 
 
 def check_modules(what: str, extra: str, modules: tuple[str, ...] | None = None) -> None:
-    """Raise FileError if modules that ``what`` needs are missing, naming the extra to install.
-
-    ``modules`` are the modules needed; by default all of the extra.
-    """
-    missing = missing_modules(EXTRAS[extra] if modules is None else modules)
-    if missing:
+    """Raise FileError if modules that ``what`` needs, all of an extra or some, are missing."""
+    if missing := missing_modules(EXTRAS[extra] if modules is None else modules):
         raise FileError(f"{what} needs {', '.join(missing)}: {how_to_install(extra)}")
