@@ -331,15 +331,6 @@ def test_a_size_that_is_none_is_named(here, command, size):
     assert {text: parse_size(text) for text in sizes} == sizes
 
 
-def test_a_large_file_is_announced_unless_quiet(here, command, monkeypatch):
-    monkeypatch.setattr("super_sdf.files.meshes.LARGE", 1000)
-    _, _, err = command("upsample", "in.npy", "out.ply", "--quality", "fast")
-    assert err.startswith("out.ply will have about 22,000 triangles, 423,168 bytes\nNote: ")
-    options = "--quality", "fast", "--quiet", "--json"
-    code, out, err = command("upsample", "in.npy", "new.ply", *options)
-    assert (code, err) == (0, "") and json.loads(out)["expected_bytes"] > 400_000
-
-
 def test_wrong_values_are_named_in_lists_by_their_names(here, command):
     Path("list.jsonl").write_text('{"in": "in.npy", "simplify": -1}')
     _, _, err = command("batch", "list.jsonl", "--out", "out", "--simplify", "0.5")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .arrays import Triple
 from .errors import MeshError
 from .files.grids import read_grid
-from .files.meshes import (CERTAIN_SHARE, Expectation, World, check_format_holds, check_target, expect, local_origin_note, write_pieces)
+from .files.meshes import check_format_holds, check_target, local_origin_note, write_mesh
 from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.cubic import cubic_grid
@@ -27,16 +27,16 @@ from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
 from .machine.extras import check_modules
 from .machine.memory import memory_bound
-from .surface.mesh import Mesh, join_meshes
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP
 from .options import ConvertOptions as ConvertOptions
-from .pipeline import reconstruct_slabs
+from .pipeline import reconstruct_slabs, upsample
 from .progress import Progress, Stopwatch, part_of, share_of
+from .refine.field import FineField, lattice_shape
+from .refine.survey import Band
 from .slabs.preparing import Piece
 from .surface.cap import check_can_close
-from .refine.field import lattice_shape
-from .refine.survey import Band
+from .surface.mesh import Mesh, join_meshes
 from .surface.topology import OpenEdges
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ COUNTS = (
     *("pinned_nodes", "dropped_pieces", "lone_samples", "slabs", "planned_bytes"),
 )
 
-MakePieces = Callable[[Expectation, Progress | None], Iterator[Piece]]
+MakePieces = Callable[[Progress | None], Iterator[Piece]]
 """Yields the mesh of a grid in pieces, in order, made while they are taken."""
 
 
@@ -74,7 +74,7 @@ class Conversion:
     """The result of a conversion."""
 
     grid: SdfGrid  # as it was read
-    counts: dict[str, int]  # those of ``COUNTS``, ``expected_triangles`` and ``expected_bytes``
+    counts: dict[str, int]  # those of ``COUNTS``
     bounds: tuple[Triple, Triple]  # lowest and highest coordinates, in world units
     closed: bool  # no edge is open; else the surface leaves the grid and is not capped
     capped: bool  # the solid runs out of the grid, and was closed along the border
@@ -118,7 +118,6 @@ def convert(
     force: bool = False,
     progress: Progress | None = None,
     before_rename: Callable[[Path], None] | None = None,
-    announce: Callable[[str], None] | None = None,
     save_field: str | Path | None = None,
     keep: bool = False,
 ) -> Conversion:
@@ -126,8 +125,7 @@ def convert(
 
     ``force`` replaces the target, and the field's file, if they exist. ``progress`` is called with
     (done, total), see ``progress.Progress``; an exception in it ends the work. ``before_rename`` is
-    called with the path of the finished temporary file, before it is renamed to ``target``;
-    ``announce`` before the work with a sentence on the size of the mesh file, if it will be large.
+    called with the path of the finished temporary file, before it is renamed to ``target``.
     ``save_field`` is a file for the refined field, in a format of ``write_field``: it and the mesh
     file are both complete at the end, or neither is written. ``keep`` keeps grid, band and mesh for
     a check, so that it need not read them again.
@@ -143,7 +141,9 @@ def convert(
     if save_field is not None:
         check_apart(save_field, files_of(source))
 
-    def make(expected: Expectation, shown: Progress | None) -> Iterator[Piece]:
+    fields: list[FineField] = []
+
+    def make(shown: Progress | None) -> Iterator[Piece]:
         return reconstruct_slabs(
             grid,
             network,
@@ -153,13 +153,16 @@ def convert(
             mesher=options.mesher,
             max_memory=options.max_memory,
             progress=shown,
-            save=file.add if file else None,
+            save=fields.append if file else None,
             look=keeper.take_band if keeper else None,
         )
 
     def complete(part: Path) -> None:
         if file:
-            file.finish()
+            whole = fields[0]
+            if len(fields) > 1:
+                whole = upsample(grid, network, options.factor, offset=options.offset)
+            file.write(whole)
             check_free(file.path, force=force)  # both files appear, or none
         if before_rename:
             before_rename(part)
@@ -174,11 +177,10 @@ def convert(
             force=force,
             progress=progress,
             before_rename=complete,
-            announce=announce,
             watch=watch,
             keeper=keeper,
         )
-    return replace(done, saved_field=file.report()) if file else done
+    return replace(done, saved_field=file.report) if file else done
 
 
 def describe_place(grid: SdfGrid) -> dict[str, Any]:
@@ -204,7 +206,7 @@ def _field_file(
     check_can_close(grid, cap=options.cap)
     path, shape = check_field_target(path, force=force), lattice_shape(grid.shape, options.factor)
     check_field_fits(path, shape, options.max_memory)
-    return saving_field(path, shape, force=force)
+    return saving_field(path, force=force)
 
 
 def convert_grid(
@@ -217,7 +219,6 @@ def convert_grid(
     force: bool = False,
     progress: Progress | None = None,
     before_rename: Callable[[Path], None] | None = None,
-    announce: Callable[[str], None] | None = None,
     watch: Stopwatch | None = None,
     keeper: Keeper | None = None,
 ) -> Conversion:
@@ -234,35 +235,27 @@ def convert_grid(
 
         check_has_volume(grid, options.offset, cap=options.cap)
     lattice = cubic_grid(grid, options.offset)
-    about = check_format_holds(target, lattice, options.factor)
-    expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
-    if options.goals():  # imported here, as few conversions need it
-        from .simplify.simplify import check_room
-
-        least = int(expected.triangles * CERTAIN_SHARE)
-        check_room(least, options.max_memory, estimated=True)
-    elif announce and (sentence := expected.warning(target)):
-        announce(sentence)
+    check_format_holds(target, lattice, options.factor)
     watch.lap("read")
     tally, simplified, off = Tally(options.cap), None, list[str]()
     shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
-    meshes = tally.count(make(expected, shown), watch)
+    mesh = join_meshes(list(tally.count(make(shown), watch)))
     if options.keep_volume or options.goals():
-        whole, simplified, off = _reworked(join_meshes(list(meshes)), grid, options, progress)
-        meshes = tally.instead(whole)
+        mesh, simplified, off = _reworked(mesh, grid, options, progress)
+        tally.instead(mesh)
         watch.lap("simplify" if simplified else "isosurface")
-    meshes = keeper.copies(meshes) if keeper else meshes
-    write_pieces(
-        meshes,
+    if keeper:
+        keeper.take_mesh(mesh)
+    write_mesh(
+        mesh,
         target,
         force=force,
-        world=World(options.unit, grid.space),
-        about=about,
+        unit=options.unit,
+        space=grid.space,
         before_rename=before_rename,
     )
     watch.lap("write")
     counts = {name: tally.counts[name] for name in COUNTS}
-    counts |= {"expected_triangles": expected.triangles, "expected_bytes": expected.size}
     warnings = find_warnings(grid, options.offset, counts, is_open=tally.is_open)
     return Conversion(
         grid,
@@ -273,7 +266,7 @@ def convert_grid(
         warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
         notes=(
-            *(*lattice.notes, *edges_note(lattice, options), *local_origin_note(target, about)),
+            *(*lattice.notes, *edges_note(lattice, options), *local_origin_note(target, [mesh])),
             *off,
         ),
         seconds=watch.seconds,
@@ -314,25 +307,20 @@ class Keeper:
         bound = memory_bound(max_memory)
         self.room = np.inf if bound is None else KEPT_SHARE * bound
         self.band: Band | None = None
-        self.meshes: list[Mesh] = []
+        self.mesh: Mesh | None = None
 
     def take_band(self, band: Band) -> None:
         """Keep the band."""
         self.band = band
 
-    def copies(self, meshes: Iterable[Mesh]) -> Iterator[Mesh]:
-        """Yield the meshes, and keep them."""
-        for mesh in meshes:
-            self.room -= mesh.vertices.nbytes + mesh.faces.nbytes
-            if self.room > 0:
-                self.meshes.append(mesh)
-            else:
-                self.meshes.clear()
-            yield mesh
+    def take_mesh(self, mesh: Mesh) -> None:
+        """Keep the mesh, if it is small enough."""
+        if mesh.vertices.nbytes + mesh.faces.nbytes < self.room:
+            self.mesh = mesh
 
     def kept(self, grid: SdfGrid) -> Kept | None:
         """Return what is kept; None if nothing, or not all of it."""
-        return Kept(grid, join_meshes(self.meshes), self.band) if self.meshes else None
+        return Kept(grid, self.mesh, self.band) if self.mesh else None
 
 
 class Tally:
@@ -372,12 +360,11 @@ class Tally:
         if self.last and self.is_open and (self.cap or not self.is_cut):
             raise torn(len(self.edges), "in", self.last)
 
-    def instead(self, mesh: Mesh) -> Iterator[Mesh]:
-        """Count another mesh instead of those so far, and return it; the open edges stay."""
+    def instead(self, mesh: Mesh) -> None:
+        """Count another mesh instead of those so far; the open edges stay."""
         self.counts["vertices"], self.counts["triangles"] = len(mesh.vertices), len(mesh.faces)
         self.low, self.high = np.full(3, np.inf), np.full(3, -np.inf)
         self._extend_box(mesh.vertices)
-        return iter([mesh])
 
     def _count_edges(self, piece: Piece) -> None:
         """Count the edges of a piece; MeshError if edges before it stay open."""

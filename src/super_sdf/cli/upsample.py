@@ -156,7 +156,6 @@ class Upsampling:
             self.chosen,
             force=self.options["force"],
             progress=progress,
-            announce=self._announce,
             save_field=self.options["save_field"],
             keep=bool(self.options["check"] or self.options["report"]),
         )
@@ -180,13 +179,7 @@ class Upsampling:
                 self.chosen,
                 force=options["force"],
                 progress=progress,
-                announce=self._announce,
-            )
-
-    def _announce(self, line: str) -> None:
-        """Print, before the work, what may make the user stop it; the bar is redrawn below."""
-        if not self.options["quiet"]:
-            print_stderr(f"\r{line}\x1b[K" if sys.stderr.isatty() else line)
+                )
 
     def _check(self) -> None:
         """Check the finished mesh against its samples."""

@@ -23,7 +23,6 @@ import numpy as np
 from ..convert import Conversion, convert_grid
 from ..errors import ClusterError, OptionError, SuperSdfError
 from ..files.formats import split_member
-from ..files.meshes import Expectation
 from ..files.volume import PLACE
 from ..grid.cubic import check_has_offsets
 from ..grid.planes import Ranges, Result, SamplePlanes
@@ -199,7 +198,6 @@ def convert_on_cluster(
     *,
     force: bool = False,
     progress: Progress | None = None,
-    announce: Callable[[str], None] | None = None,
 ) -> Conversion:
     """Convert a grid file to a mesh file on the workers of a cluster; see ``convert``.
 
@@ -231,7 +229,6 @@ def convert_on_cluster(
                 options,
                 force=force,
                 progress=progress,
-                announce=announce,
                 watch=watch,
             )
         finally:
@@ -268,11 +265,11 @@ class _Bricks:
         self.count = 0
         self.workers: dict[str, dict[str, int | None]] = {}
 
-    def pieces(self, expected: Expectation, progress: Progress | None) -> Iterator[Piece]:
+    def pieces(self, progress: Progress | None) -> Iterator[Piece]:
         """Yield the mesh brick by brick, in order; see ``reconstruct_slabs``."""
         watch, show = Stopwatch(), progress or (lambda done, total: None)
         seen = look_at_band(self.grid, self.options.offset)
-        tasks = self._tasks(expected, seen)
+        tasks = self._tasks(seen)
         self.count = len(tasks)
         watch.lap("band")
         show(round(LOOKED * TOTAL), TOTAL)
@@ -289,7 +286,7 @@ class _Bricks:
         if len(signs) < 2:
             raise no_surface(self.grid, self.options.offset)
 
-    def _tasks(self, expected: Expectation, seen: Glance) -> list[MeshTask]:
+    def _tasks(self, seen: Glance) -> list[MeshTask]:
         """Cut the grid into bricks with about the same number of decoded voxels.
 
         GridError without a surface, or if not even float64 resolves the vertices; OptionError if
@@ -303,7 +300,8 @@ class _Bricks:
         members = self.crew.members.values()
         bounds = [limits.memory or memory_bound() for limits in members]
         room = min((bound for bound in bounds if bound), default=1 << 32)
-        mesh = expected.triangles * BYTES_PER_TRIANGLE / (MESH_SHARE * room)
+        triangles = 2 * options.factor**2 * seen.crossings
+        mesh = triangles * BYTES_PER_TRIANGLE / (MESH_SHARE * room)
         band = seen.summary.voxels * BYTES_PER_VOXEL / (BAND_SHARE * room)
         count = max(MESH_BRICKS * len(members), int(mesh) + 1, int(band) + 1)
         before = np.append(0, np.cumsum(seen.decoded))
