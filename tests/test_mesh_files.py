@@ -14,7 +14,8 @@ from super_sdf import Mesh, reconstruct, write_mesh
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import FileError, GridError, OptionError
 from super_sdf.files import mesh_writers
-from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
+from super_sdf.files.mesh_writers import World
+from super_sdf.files.meshes import MESH_SUFFIXES, write_meshes
 
 OPTIONS = ConvertOptions(4, inside="negative")
 

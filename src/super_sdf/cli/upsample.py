@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,7 @@ from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
-from ..options import MESH_FORMATS, QUALITIES, ConvertOptions
+from ..options import MESH_FORMATS, ConvertOptions
 from ..progress import Progress, Stopwatch
 from .common import (CONTEXT, GroupedCommand, check_can_check, check_cluster, check_names, check_option, check_page, chosen_model, cluster_option, conversion_options, labels_option, load_chosen, make_options, names_option, one_line_errors, print_stderr, print_stdout, progress_bar, report_option)
 from .interrupts import raising_interrupts
@@ -107,8 +106,7 @@ class Upsampling:
 
         then = (SHARE_BEFORE, "simplifying") if self.chosen.goals() else None
         with raising_interrupts(), progress_bar("upsampling", options["quiet"], then) as progress:
-            convert = self._convert_here if options["cluster"] is None else self._convert_there
-            self.result = convert(progress)
+            self.result = self._convert_here(progress)
         self.seconds |= self.result.seconds
         with raising_interrupts():
             if options["check"]:
@@ -138,9 +136,7 @@ class Upsampling:
             check_page("--report", options["report"], files, force=force)
         if options["cluster"] is not None:
             check_cluster(options)
-            from ..cluster.bricks import check_can_brick
-
-            check_can_brick(self.source, self.chosen, options["save_field"])
+            raise OptionError("--cluster is not there yet: leave it out")
         elif options["jobs"]:
             raise OptionError(
                 f"--jobs {options['jobs']} is for --cluster local: give that, too, or leave it out"
@@ -157,38 +153,16 @@ class Upsampling:
             force=self.options["force"],
             progress=progress,
             save_field=self.options["save_field"],
-            keep=bool(self.options["check"] or self.options["report"]),
         )
-
-    def _convert_there(self, progress: Progress | None) -> Conversion:
-        from ..cluster.bricks import convert_on_cluster
-        from ..cluster.checking import Needs
-        from ..cluster.connecting import connect
-
-        options, model = self.options, self.model
-        if model not in QUALITIES:
-            model = str(Path(model).absolute())
-        needs = Needs(model, options["precision"], options["device"])
-        limits = {"threads": options["threads"], "max_memory": options["max_memory"]}
-        with connect(options["cluster"], workers=options["jobs"], **limits) as cluster:
-            return convert_on_cluster(
-                self.source,
-                self.target,
-                cluster,
-                needs,
-                self.chosen,
-                force=options["force"],
-                progress=progress,
-                )
 
     def _check(self) -> None:
         """Check the finished mesh against its samples."""
         from ..check.check import check_files
 
-        watch, threads = Stopwatch(), self.options["threads"]
+        watch = Stopwatch()
         files = self.target, self.source, self.chosen
         try:
-            self.certificate = check_files(*files, kept=self.result.kept, processes=threads)
+            self.certificate = check_files(*files, made=self.result)
         except SuperSdfError as error:
             raise type(error)(f"{error}; {self.target} is written, but not checked") from error
         watch.lap("check")
@@ -198,10 +172,10 @@ class Upsampling:
         """Write the page; what cannot be shown in it is said there."""
         from ..pages.html import page_of_conversion, write_page
 
-        watch, threads = Stopwatch(), self.options["threads"]
+        watch = Stopwatch()
         report = {**self._report(), "notes": [*self.result.remarks(), *self.network.notes]}
-        given = self.chosen, self.result.kept, self.certificate
-        text = page_of_conversion(report, *given, processes=threads)
+        given = self.chosen, self.result, self.certificate
+        text = page_of_conversion(report, *given)
         write_page(text, self.options["report"], force=self.options["force"])
         watch.lap("page")
         self.seconds |= watch.seconds

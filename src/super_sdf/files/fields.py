@@ -12,26 +12,15 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from ..arrays import FloatArray
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
 from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
-from ..refine.field import FineField, FineLattice, fine_grid, lattice_shape
+from ..refine.field import FineField, fine_grid, lattice_planes, lattice_shape
 from ..surface.cap import check_all_seen
 from .output import check_free, free_space, naming, replacing
 from .sparse import write_sparse
 from .vdb_writer import write_level_set
-
-CHUNK = 1 << 20  # values of the lattice at a time, but at least a plane
-
-
-def planes_of(field: FineField) -> Iterator[tuple[int, FloatArray]]:
-    """Yield all planes of the fine lattice, some at a time, and the number of the first."""
-    lattice = FineLattice(field)
-    step = max(CHUNK // prod(lattice.shape[1:]), 1)
-    for first in range(0, len(lattice), step):
-        yield first, lattice[first : first + step]
 
 
 def write_npy(field: FineField, path: Path) -> None:
@@ -39,7 +28,7 @@ def write_npy(field: FineField, path: Path) -> None:
     shape = lattice_shape(field.shape, field.factor)
     with path.open("wb") as file:
         npy.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
-        for _, planes in planes_of(field):
+        for _, planes in lattice_planes(field):
             file.write(planes.astype("<f4", copy=False).tobytes())
 
 
@@ -53,7 +42,7 @@ def write_vti(field: FineField, path: Path) -> None:
 
     grid = fine_grid(field)
     values = np.empty(grid.shape[::-1], np.float32)  # x is the fastest
-    for first, planes in planes_of(field):
+    for first, planes in lattice_planes(field):
         values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
     image = vtkImageData()
     image.SetDimensions(*grid.shape)

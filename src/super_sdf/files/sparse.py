@@ -62,7 +62,7 @@ def write_sparse(field: FineField, path: Path) -> None:
         distances = field.in_world_units(field.spheres.distance)
     border = np.empty((0, 3), np.int32)
     if field.leaves:
-        border = find_border_inside(field, 0, field.shape[0])
+        border = find_border_inside(field)
     arrays: dict[str, Any] = {
         "version": VERSION,
         "shape": field.shape,
@@ -183,9 +183,7 @@ def read_field(path: str | Path) -> FineField:
         voxels,
         blocks,
         parts,
-        (0, shape[0]),
         spheres=SampleSpheres(shape, samples, _in_half_voxels(distances, grid)),  # type: ignore[arg-type]
-        decoded_voxels=len(voxels),
         grid=grid,
         offset=float(arrays["offset"]),
         leaves=bool(arrays["leaves"]),

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..convert import describe_place
 from ..errors import MeshError, OptionError, seen
-from ..files.mesh_writers import Colour
-from ..files.meshes import (World, check_format_holds, check_mesh_suffix, check_target, format_of, local_origin_note, write_meshes)
+from ..files.mesh_writers import Colour, World
+from ..files.meshes import check_format_holds, check_mesh_suffix, check_target, format_of, local_origin_note, write_meshes
 from ..files.output import check_apart, naming
 from ..files.regular import files_of
 from ..files.volume import PLACE
