@@ -19,8 +19,8 @@ import numpy as np
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
 from ..grid.placement import STRAIGHT, check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
-from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
 from ..options import AxisOrder, ReadOptions, Space, Values, check_path
+from ..threads import held_memory, memory_bound
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .output import check_free, replacing
 from .regular import check_grid_file
@@ -35,6 +35,8 @@ from .volume import (
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+ROOM_SHARE = 0.25  # of the memory that is left: larger arrays in chunks stay in their file
 
 
 
