@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from math import prod
@@ -15,9 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
 from ..grid.placement import STRAIGHT, check_kind
+from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import AxisOrder, ReadOptions, Space, Values, check_path
 from ..threads import held_memory, memory_bound
@@ -27,7 +29,7 @@ from .regular import check_grid_file
 from .volume import (
     PLACE,
     Request,
-    StoredPlanes,
+    Placement,
     Volume,
     find_placement,
     place_in_world,
@@ -36,6 +38,7 @@ from .volume import (
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+LAYER_BYTES = 1 << 23  # of planes that are read together, if chunks are smaller
 ROOM_SHARE = 0.25  # of the memory that is left: larger arrays in chunks stay in their file
 
 
@@ -144,6 +147,43 @@ def memory_left(max_memory: int | None = None) -> int | None:
     return None if bound is None else max(bound - (held_memory() or 0), 0)
 
 
+class StoredPlanes(SamplePlanes):
+    """The samples of a volume, (nx, ny, nz), that stay in their file until planes are needed.
+
+    Planes of x that share chunks are read together, and the last ones that were read are held.
+    """
+
+    def __init__(self, volume: Volume, placement: Placement, request: Request) -> None:
+        self.volume, self.placement, self.path = volume, placement, request.path
+        self.files = request.files.pop_all()  # closed with this
+        self.shape, self.dtype, self.name = placement.of_world(volume.shape), volume.dtype, str(request.path)
+        chunk = placement.of_world(volume.chunks)[0] if volume.chunks else 1
+        self.layer = chunk * max(LAYER_BYTES // (chunk * prod(self.shape[1:])), 1)
+        self.held: tuple[int, NDArray[Any]] = (-1, np.empty(0))
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        planes = np.empty((max(last - first, 0), *self.shape[1:]), self.dtype)
+        for start in range(first - first % self.layer, last, self.layer):
+            held = self.held
+            if held[0] != start:
+                stop = min(start + self.layer, self.shape[0])
+                self.held = held = start, self.crop((start, 0, 0), (stop, *self.shape[1:]))
+            low, high = max(first, start), min(last, start + len(held[1]))
+            planes[low - first : high - first] = held[1][low - start : high - start]
+        return planes
+
+    def crop(self, low: Sequence[int], high: Sequence[int]) -> NDArray[Any]:
+        """Return the samples in a box, which alone is read."""
+        box = [slice(None)] * 3
+        for world, (start, stop, count) in enumerate(zip(low, high, self.shape)):
+            axis = self.placement.world_axes.index(world)
+            is_back = self.placement.backwards[axis]
+            box[axis] = slice(count - stop, count - start) if is_back else slice(start, stop)
+        with one_line_errors(self.path, find_format(self.path)):
+            return np.asarray(self.placement.ordered(self.volume.read(*box)), self.dtype)
+
+
 @contextmanager
 def one_line_errors(path: Path, format_: GridFormat) -> Iterator[None]:
     """Turn whatever a library raises into a FileError of one line, and silence it meanwhile."""
@@ -179,7 +219,7 @@ def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str,
     if isinstance(volume.values, np.memmap) and (placement.is_straight or is_large):
         values = placement.ordered(volume.read())
     elif is_large and volume.chunks:
-        values = StoredPlanes(volume, placement, name, request.files.pop_all())
+        values = StoredPlanes(volume, placement, request)
     else:
         request.check_fits(volume.shape, volume.dtype)
         dtype = volume.dtype.newbyteorder("=")

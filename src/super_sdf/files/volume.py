@@ -21,13 +21,11 @@ from numpy.typing import NDArray
 from ..arrays import Triple
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError
 from ..grid.placement import Direction, as_direction, check_direction
-from ..grid.planes import SamplePlanes
 from ..threads import in_words
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
 MOST_NAMED = 10  # arrays that an error lists
 COPIES = 2  # of an array that is loaded, while its axes are put in order
-LAYER_BYTES = 1 << 23  # of planes that are read together, if chunks are smaller
 PLACE = ("spacing", "origin", "direction")
 XYZ = np.eye(3)
 
@@ -176,40 +174,6 @@ class Placement(NamedTuple):
         flips = tuple(axis for axis in range(3) if self.backwards[axis])
         turned = np.flip(samples, flips) if flips else samples
         return turned.transpose(self.of_world((0, 1, 2)))
-
-
-class StoredPlanes(SamplePlanes):
-    """The samples of a volume, (nx, ny, nz), that stay in their file until planes are needed.
-
-    Planes of x that share chunks are read together, and the last ones that were read are held.
-    """
-
-    def __init__(self, volume: Volume, placement: Placement, name: str, files: ExitStack) -> None:
-        self.volume, self.placement, self.name, self.files = volume, placement, name, files
-        self.shape, self.dtype = placement.of_world(volume.shape), volume.dtype
-        self._axis = placement.world_axes.index(0)
-        chunk = volume.chunks[self._axis] if volume.chunks else 1
-        self._layer = chunk * max(LAYER_BYTES // (chunk * self.plane_bytes), 1)
-        self._held: tuple[int, NDArray[Any]] = (-1, np.empty(0))
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
-        nx, planes = self.shape[0], np.empty((max(last - first, 0), *self.shape[1:]), self.dtype)
-        is_back = self.placement.backwards[self._axis]
-        # in the file's own order, so that layers begin where chunks do
-        low, high = (nx - last, nx - first) if is_back else (first, last)
-        for number in range(low // self._layer, -(-high // self._layer)):
-            held = self._held
-            start = number * self._layer
-            if held[0] != number:
-                parts = [slice(None)] * 3
-                parts[self._axis] = slice(start, min(start + self._layer, nx))
-                held = number, self.placement.ordered(self.volume.read(*parts))
-                self._held = held
-            a = nx - start - len(held[1]) if is_back else start
-            begin, end = max(first, a), min(last, a + len(held[1]))
-            planes[begin - first : end - first] = held[1][begin - a : end - a]
-        return planes
 
 
 def triple(numbers: Any) -> Triple:
