@@ -150,7 +150,7 @@ def _certify(
 
     try:
         if settings.items is None:
-            return check_files(mesh, job.source, job.options, kept=done.kept).report()
+            return check_files(mesh, job.source, job.options, made=done.kept).report()
         from ..pages.items import item_of_files, keep_item
 
         item = item_of_files(mesh, job.source, job.options, done.kept)

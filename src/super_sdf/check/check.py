@@ -202,20 +202,24 @@ def check_files(
     grid: str | Path,
     options: ConvertOptions = AS_GIVEN,
     *,
+    made: Any = None,
     intersections: bool = True,
 ) -> Certificate:
     """Check a mesh file against the grid file that it was made from; see ``check_mesh``.
 
     ``options`` are those that the mesh was made with: how the grid is read, the offset, the memory
-    bound.
+    bound. What was ``made`` has the ``mesh`` and the ``grid``, so that they are not read again.
     """
-    return check_mesh(*read_for_check(mesh, grid, options), options, intersections=intersections)
+    both = read_for_check(mesh, grid, options, made)
+    return check_mesh(*both, options, intersections=intersections)
 
 
 def read_for_check(
-    mesh: str | Path, grid: str | Path, options: ConvertOptions
+    mesh: str | Path, grid: str | Path, options: ConvertOptions, made: Any = None
 ) -> tuple[Mesh, SdfGrid]:
-    """Return the mesh and the grid in two files; OutOfMemoryError before they are read."""
+    """Return a mesh and its grid: those that were ``made``, else read from their files."""
+    if made is not None:
+        return merged(made.mesh), made.grid
     check_room(stated_triangles(check_regular_file(mesh)), 0, options.max_memory)
     samples, read = read_grid(grid, **options.reading()), read_mesh(mesh, options.max_memory)
     if options.unit and Path(mesh).suffix.lower() == ".glb":  # it is in metres

@@ -167,10 +167,10 @@ class Upsampling:
         """Check the finished mesh against its samples."""
         from ..check.check import check_files
 
-        watch, threads = Stopwatch(), self.options["threads"]
+        watch = Stopwatch()
         files = self.target, self.source, self.chosen
         try:
-            self.certificate = check_files(*files, kept=self.result.kept, processes=threads)
+            self.certificate = check_files(*files, made=self.result.kept)
         except SuperSdfError as error:
             raise type(error)(f"{error}; {self.target} is written, but not checked") from error
         watch.lap("check")
@@ -180,10 +180,10 @@ class Upsampling:
         """Write the page; what cannot be shown in it is said there."""
         from ..pages.html import page_of_conversion, write_page
 
-        watch, threads = Stopwatch(), self.options["threads"]
+        watch = Stopwatch()
         report = {**self._report(), "notes": [*self.result.remarks(), *self.network.notes]}
         given = self.chosen, self.result.kept, self.certificate
-        text = page_of_conversion(report, *given, processes=threads)
+        text = page_of_conversion(report, *given)
         write_page(text, self.options["report"], force=self.options["force"])
         watch.lap("page")
         self.seconds |= watch.seconds
