@@ -24,9 +24,8 @@ import dask
 from distributed import Client, KilledWorker, LocalCluster, get_worker, wait
 
 from .. import __version__
-from ..errors import ClusterError, SuperSdfError
+from ..errors import EXTRAS, ClusterError, SuperSdfError, missing_modules
 from ..files.formats import find_format, split_member
-from ..machine.extras import EXTRAS, missing_modules
 from ..network.network import find_model, shipped_models
 from ..threads import count_cores
 from .job import Job, Settings, convert_job

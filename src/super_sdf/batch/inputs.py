@@ -24,7 +24,7 @@ from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix
 from ..files.regular import is_store, reason_of
 from ..labels.files import with_numbers
 from ..labels.names import Names
-from ..options import BATCH_LISTS, GOALS, OPTIONS, ConvertOptions
+from ..options import BATCH_LISTS, GOALS, OPTIONS, Options
 from .job import Job
 from .record import OWN_NAMES
 
@@ -37,7 +37,7 @@ Unread = list[tuple[str, str]]
 
 
 def find_jobs(
-    arguments: Sequence[str], suffix: str, options: ConvertOptions, names: Names | None = None
+    arguments: Sequence[str], suffix: str, options: Options, names: Names | None = None
 ) -> tuple[list[Job], Unread]:
     """Return the jobs that the arguments name, each once: files, folders, patterns, lists.
 
@@ -67,7 +67,7 @@ def find_jobs(
 
 
 def _expand(
-    argument: str, suffix: str, options: ConvertOptions, names: Names | None, unread: Unread
+    argument: str, suffix: str, options: Options, names: Names | None, unread: Unread
 ) -> list[Job]:
     """Return the jobs that one argument stands for, and note the folders that cannot be read."""
     path, kinds = Path(argument), ", ".join(GRID_SUFFIXES)
@@ -114,7 +114,7 @@ def _files_below(folder: Path, unread: Unread) -> Iterator[Path]:
 
 
 def _read_list(
-    path: Path, suffix: str, options: ConvertOptions, names: Names | None
+    path: Path, suffix: str, options: Options, names: Names | None
 ) -> Iterator[Job]:
     """Yield a job for each line of a list; OptionError with the number of one that is not valid.
 
@@ -144,7 +144,7 @@ def _read_list(
 
 
 def _job(
-    entry: dict[str, Any], home: Path, suffix: str, options: ConvertOptions, names: Names | None
+    entry: dict[str, Any], home: Path, suffix: str, options: Options, names: Names | None
 ) -> Job:
     """Return the job that a line describes."""
     source, target = entry.pop("in", None), entry.pop("out", None)

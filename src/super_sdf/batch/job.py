@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
-from ..convert import ConvertOptions, convert
+from ..convert import convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.meshes import format_of
 from ..files.output import naming
@@ -18,7 +18,7 @@ from ..files.regular import check_grid_file
 from ..labels.files import convert_labels
 from ..labels.names import Names
 from ..network.network import Network, load_network
-from ..options import AUTO, AUTO_PRECISION, Device, Precision
+from ..options import AUTO, AUTO_PRECISION, Device, Options, Precision
 from .record import Row, fingerprint
 
 load_once = lru_cache(maxsize=1)(load_network)
@@ -49,7 +49,7 @@ class Job:
 
     source: Path
     mesh: str
-    options: ConvertOptions
+    options: Options
 
     @property
     def has_label_files(self) -> bool:
@@ -116,7 +116,7 @@ def _make_mesh(job: Job, settings: Settings, stage: Path, network: Network) -> R
     """Convert a file; return what its row says of the mesh."""
     target = stage / job.mesh
     keep = settings.check or settings.items is not None
-    done = convert(job.source, target, network, job.options, force=True, keep=keep)
+    done = convert(job.source, target, network, job.options, force=True)
     stages = {stage: round(seconds, 4) for stage, seconds in done.seconds.items()}
     row = {"output": fingerprint(target), **done.report(), "stages": stages}
     if not keep:
@@ -125,11 +125,11 @@ def _make_mesh(job: Job, settings: Settings, stage: Path, network: Network) -> R
 
     try:
         if settings.items is None:
-            found = check_files(target, job.source, job.options, made=done.kept)
+            found = check_files(target, job.source, job.options, made=done)
             return {**row, "check": found.report()}
         from ..pages.items import item_of_files, keep_item
 
-        item = item_of_files(target, job.source, job.options, done.kept)
+        item = item_of_files(target, job.source, job.options, done)
         keep_item(item, settings.items, job.target, row["output"]["sha256"])
         return {**row, "check": item.certificate or {}}
     except Exception as error:  # the mesh is good all the same
