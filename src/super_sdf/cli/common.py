@@ -320,14 +320,11 @@ def load_chosen(options: dict[str, Any], meanwhile: Callable[[], None] = lambda:
     with ThreadPoolExecutor(1) as pool:
         loading = pool.submit(load_network, chosen_model(options), **chosen)
         from .. import convert  # noqa: F401  # onnxruntime needs no interpreter while it loads
-        from ..surface.cell_cases import loop_table, triangle_table
 
         meanwhile()
-        triangle_table()  # it is kept
         if options.get("mesher") != MARCHING:
             from ..surface.sharp import features  # noqa: F401
 
-            loop_table()
         return loading.result()
 
 

@@ -23,7 +23,7 @@ from ..grid.sdf_grid import SdfGrid
 from ..surface.mesh import Mesh
 from ..network.neighbourhood import CORNERS
 from ..options import MASK
-from ..surface.sharp.patches import Numbers, Vectors, dot, length, sums_at
+from ..arrays import Numbers, Vectors, dot, length, sums_at
 from ..functions.zero import face_normals
 
 CELL = 0.5  # spacings of the samples between nodes
