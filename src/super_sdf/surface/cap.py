@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import CORNERS, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError
 from ..grid.sdf_grid import SdfGrid
-from ..network.neighbourhood import CORNERS, NEIGHBOURHOOD
 from ..refine.band import neighbour_table, rescale
 from ..refine.field import FineField
 from ..refine.nodes import (

@@ -26,8 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, IntArray
-from ..network.neighbourhood import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES
+from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, IntArray
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, part_of_node
 from ..threads import map_chunks, map_threads, rows_in_chunk, worthwhile_threads

@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import BoolArray, Index, Vectors, cross, dot, length, sums_at, unit
-from ...network.neighbourhood import NEIGHBOURHOOD
+from ...arrays import NEIGHBOURHOOD, BoolArray, Index, Vectors, cross, dot, length, sums_at, unit
 from .patches import Patches, Placed, nth_of_run, triangles_of
 
 # Vertices of triangles that intersect are in cells at most 3 apart: none is more than half a cell

@@ -23,8 +23,19 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import BoolArray, FloatArray, Index, IntArray, Numbers, Vectors, cross, dot, unit
-from ...network.neighbourhood import CENTRE, STRIDES
+from ...arrays import (
+    CENTRE,
+    STRIDES,
+    BoolArray,
+    FloatArray,
+    Index,
+    IntArray,
+    Numbers,
+    Vectors,
+    cross,
+    dot,
+    unit,
+)
 from ...refine.field import FineField
 from ...refine.nodes import block_ijk
 from ...threads import map_chunks

@@ -19,8 +19,7 @@ from functools import cached_property, lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Index, IntArray, Numbers, Vectors, dot, length, unit
-from ...network.neighbourhood import CENTRE, STRIDES
+from ...arrays import CENTRE, STRIDES, Index, IntArray, Numbers, Vectors, dot, length, unit
 from ...refine.field import FineField
 from ...refine.nodes import block_ijk
 from ...threads import chunks_of, map_chunks, map_threads, worthwhile_threads
