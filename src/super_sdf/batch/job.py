@@ -185,9 +185,8 @@ def _convert_labels(
         progress=progress,
         before_rename=prints.take,
     )
-    labels = [{**row, "output": prints.name(row["output"])} for row in made["labels"]]
-    closed = all(row["closed"] for row in labels)
-    return {**made, "labels": labels, "closed": closed, "warnings": []}
+    labels = [{**row, "output": prints.name(row["output"])} for row in made.labels]
+    return {**made.report(), "labels": labels, "closed": made.closed, "warnings": []}
 
 
 def _certify(job: Job, done: Conversion, mesh: Fingerprint, settings: Settings) -> dict[str, Any]:

@@ -258,7 +258,7 @@ def upsample_labels(
     source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
 ) -> None:
     """Convert the labels of an image to meshes, and print what was made."""
-    from ..labels.files import check_options, convert_labels, missing_note
+    from ..labels.files import check_options, convert_labels
     from ..labels.names import read_names
 
     watch, model = Stopwatch(), chosen_model(options)
@@ -281,22 +281,22 @@ def upsample_labels(
             "version": __version__,
             "asked": chosen.digest(),
             **_describe_network(model, network),
-            **made,
+            **made.report(),
             "seconds": _rounded(watch.seconds),
         }
         print_stdout(json.dumps(report, indent=2), "the meshes are written")
     if options["quiet"]:
         return
-    for note in (*made["inferred"], *missing_note(made["missing"]), *network.notes):
+    for note in (*made.grid.notes, *made.notes, *made.remarks(), *network.notes):
         print_stderr(f"Note: {note}")
-    for row in made["labels"]:
+    for row in made.labels:
         print_stderr(
             f"{row['output']}: {row['name']}, {row['vertices']:,} vertices, "
             f"{row['triangles']:,} triangles, "
             f"{row['components']:,} closed component{'s' * (row['components'] != 1)}, "
             f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
         )
-    print_stderr(f"{len(made['labels'])} labels, {sum(watch.seconds.values()):.1f} s")
+    print_stderr(f"{len(made.labels)} labels, {sum(watch.seconds.values()):.1f} s")
 
 
 def _describe_network(model: str, network: Network) -> dict[str, Any]:
