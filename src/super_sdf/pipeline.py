@@ -34,10 +34,10 @@ from .slabs.preparing import Piece, Run, describe_piece, prepare
 from .refine import nodes
 from .refine.band import BandSummary
 from .refine.bounds import keep_within_bounds
-from .surface.cap import check_can_close, close, seen_octants
+from .surface.cap import check_can_close, seen_octants
 from .refine.debris import count_between, drop_debris
 from .refine.field import FineField, SampleSpheres
-from .surface.meshers import extract_pieces
+from .surface.extract import extract
 from .refine.spheres import fit_to_spheres, spheres_of_band
 from .refine.spline import interpolate
 from .refine.survey import Band, no_surface
@@ -310,7 +310,7 @@ def reconstruct_planes(
 
 def _mesh_slabs(run: Run, cap: bool, save: Callable[[FineField], None] | None) -> Iterator[Piece]:
     """Yield the piece of each slab of a run."""
-    steps, mesher, vertices = run.steps, run.mesher, 0
+    steps, mesher = run.steps, run.mesher
     work = {"slabs": len(run.slabs), "planned_bytes": run.planned}
     for slab in run.slabs:
         if len(run.slabs) > 1:
@@ -320,13 +320,11 @@ def _mesh_slabs(run: Run, cap: bool, save: Callable[[FineField], None] | None) -
         if save:
             save(field)
             steps.watch.lap("save field")
-        whole = close(field, cap=cap, beside=mesher.planes_beside(run.factor))
-        meshes = extract_pieces(whole, run.lattice, vertices, run.threads, mesher)
-        piece = describe_piece(field, meshes, work, run.band.leaves)
-        del field, whole, meshes  # before those of the next slab are made
+        mesh, _ = extract(field, run.lattice, mesher=mesher, cap=cap, threads=run.threads)
+        piece = describe_piece(field, [mesh], work, run.band.leaves)
+        del field, mesh  # before those of the next slab are made
         steps.finish("isosurface")
         piece.seconds.update(steps.take_seconds())
-        vertices += piece.counts["vertices"]
         yield piece
         del piece  # before the next one is made
         steps.watch.start()  # the time since the yield was the caller's

@@ -17,4 +17,4 @@ from .pipeline import upsample as upsample
 from .simplify.simplify import simplify_mesh as simplify_mesh
 from .refine.field import FineField as FineField
 from .refine.field import fine_grid as fine_grid
-from .surface.meshers import extract_mesh as extract_mesh
+from .surface.extract import extract_mesh as extract_mesh

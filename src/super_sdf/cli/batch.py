@@ -19,8 +19,7 @@ from .interrupts import describe_interrupt, exit_code, raising_interrupts
 
 if TYPE_CHECKING:
     from ..batch.job import Job, Settings
-    from ..batch.plan import Batch
-    from ..batch.run import Run
+    from ..batch.run import Batch
 
 HELP = f"""Convert many grids to meshes in the folder DIR, each as upsample would.
 
@@ -102,8 +101,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
     chosen, suffix = make_options(options), f".{options['kind']}"
     from ..batch.inputs import find_jobs
     from ..batch.job import Settings
-    from ..batch.ledger import Ledger
-    from ..batch.plan import Planner
+    from ..batch.run import Batch
     from ..labels.files import check_options
     from ..labels.names import read_names
     from ..network.network import find_model
@@ -132,9 +130,7 @@ def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -
         **{name: options[name] for name in taken},
     )
     if options["dry_run"]:
-        plan = Planner(jobs, settings, Ledger(folder)).plan()
-        plan.unread = unread
-        print_plan(plan, options["as_json"])
+        print_plan(Batch(jobs, settings, unread), options["as_json"])
         return
     done = complete(jobs, settings, options, unread)
     done.seconds = time.perf_counter() - start
@@ -165,42 +161,39 @@ def complete(
     jobs: list[Job], settings: Settings, options: dict[str, Any], unread: list[tuple[str, str]]
 ) -> Batch:
     """Run the batch and write its page; an interrupt reports how many files are done."""
-    from ..batch.ledger import folder_lock
-    from ..batch.run import Run
+    from ..batch.record import folder_lock
+    from ..batch.run import Batch
 
     with raising_interrupts(), folder_lock(settings.folder):
-        run = Run(jobs, settings)
-        run.batch.unread = unread
-        for line in () if options["quiet"] else made_again_lines(run.batch):
+        batch = Batch(jobs, settings, unread)
+        for line in () if options["quiet"] else made_again_lines(batch):
             print_stderr(line)
-        total = len(run.batch.waiting)
-        # in place of a progress line, if one is shown
-        cleared = "\r\x1b[K" if sys.stderr is not None and sys.stderr.isatty() else ""
+        total = len(batch.waiting)
         try:
             with progress_line(total, options["quiet"]) as progress, raising_interrupts():
-                run.complete(progress, lambda text: print_stderr(f"{cleared}Warning: {text}"))
-            write_page(run, jobs, options["report"])
+                batch.run(progress)
+            write_page(batch, options["report"])
         except KeyboardInterrupt as error:
             try:
-                write_page(run, jobs, options["report"], describe_interrupt(exit_code(error)))
+                write_page(batch, options["report"], describe_interrupt(exit_code(error)))
             except SuperSdfError as fault:
                 print_stderr(f"Warning: {fault}")
-            kept = f": {len(run.batch.done)} of {total} are done and kept; run it again to go on"
-            raise InterruptedCommand(kept, error, summary(run.batch)) from None
-    return run.batch
+            kept = f": {len(batch.done)} of {total} are done and kept; run it again to go on"
+            raise InterruptedCommand(kept, error, summary(batch)) from None
+    return batch
 
 
-def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = "") -> None:
+def write_page(batch: Batch, path: Path | None, interrupted: str = "") -> None:
     """Write the page, if one was asked for; after an interrupt, at once and without drawing."""
     if path is None:
         return
     from ..batch.page import BatchPage
     from ..pages.html import is_page
 
-    page = BatchPage(path, run.batch, jobs, run.ledger.rows)
+    page = BatchPage(path, batch)
     alert = ""
     if page.unfinished or interrupted:
         why = f", {interrupted}" if interrupted else ""
         alert = f"Incomplete{why}: {len(page.unfinished)} not finished; run it again to go on"
-    title, force = f"Batch: {run.settings.folder}", run.settings.force or is_page(path)
-    page.write(title, sentence(run.batch), alert, force=force, draw=not interrupted)
+    title, force = f"Batch: {batch.settings.folder}", batch.settings.force or is_page(path)
+    page.write(title, sentence(batch), alert, force=force, draw=not interrupted)

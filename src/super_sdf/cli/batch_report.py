@@ -6,7 +6,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -15,16 +15,15 @@ import click
 from .common import print_stderr, print_stdout
 
 if TYPE_CHECKING:
-    from ..batch.ledger import Row
-    from ..batch.plan import Batch
-    from ..batch.run import OnFile
+    from ..batch.record import Row
+    from ..batch.run import Batch
 
 MOST_FAILURES = 20  # printed; the report has all
 REDRAW_SECONDS = 0.1  # between two drawings of the progress line
 
 
 @contextmanager
-def progress_line(total: int, quiet: bool) -> Iterator[OnFile | None]:
+def progress_line(total: int, quiet: bool) -> Iterator[Callable[[Batch], None] | None]:
     """Keep a progress line on stderr up to date; None if stderr is no terminal."""
     if quiet or not total or sys.stderr is None or not sys.stderr.isatty():
         yield None

@@ -128,7 +128,7 @@ def run_check(mesh: Path, grid: Path, options: dict[str, Any]) -> list[str]:
         **{name: options[name] for name in (*GRID, "offset", "max_memory", "unit")}
     )
     count = not options["skip_intersections"]
-    certificate = check_files(mesh, grid, given, intersections=count, processes=0)
+    certificate = check_files(mesh, grid, given, intersections=count)
     if options["out"]:
         with raising_interrupts():
             write_coloured(certificate, options["out"], force=options["force"])

@@ -325,7 +325,7 @@ def load_chosen(options: dict[str, Any], meanwhile: Callable[[], None] = lambda:
         meanwhile()
         triangle_table()  # it is kept
         if options.get("mesher") != MARCHING:
-            from ..surface.sharp import mesher  # noqa: F401
+            from ..surface.sharp import features  # noqa: F401
 
             loop_table()
         return loading.result()

@@ -107,8 +107,7 @@ class Upsampling:
 
         then = (SHARE_BEFORE, "simplifying") if self.chosen.goals() else None
         with raising_interrupts(), progress_bar("upsampling", options["quiet"], then) as progress:
-            convert = self._convert_here if options["cluster"] is None else self._convert_there
-            self.result = convert(progress)
+            self.result = self._convert_here(progress)
         self.seconds |= self.result.seconds
         with raising_interrupts():
             if options["check"]:
@@ -138,9 +137,7 @@ class Upsampling:
             check_page("--report", options["report"], files, force=force)
         if options["cluster"] is not None:
             check_cluster(options)
-            from ..cluster.bricks import check_can_brick
-
-            check_can_brick(self.source, self.chosen, options["save_field"])
+            raise OptionError("--cluster is not there yet: leave it out")
         elif options["jobs"]:
             raise OptionError(
                 f"--jobs {options['jobs']} is for --cluster local: give that, too, or leave it out"
@@ -161,28 +158,6 @@ class Upsampling:
             keep=bool(self.options["check"] or self.options["report"]),
         )
 
-    def _convert_there(self, progress: Progress | None) -> Conversion:
-        from ..cluster.bricks import convert_on_cluster
-        from ..cluster.checking import Needs
-        from ..cluster.connecting import connect
-
-        options, model = self.options, self.model
-        if model not in QUALITIES:
-            model = str(Path(model).absolute())
-        needs = Needs(model, options["precision"], options["device"])
-        limits = {"threads": options["threads"], "max_memory": options["max_memory"]}
-        with connect(options["cluster"], workers=options["jobs"], **limits) as cluster:
-            return convert_on_cluster(
-                self.source,
-                self.target,
-                cluster,
-                needs,
-                self.chosen,
-                force=options["force"],
-                progress=progress,
-                announce=self._announce,
-            )
-
     def _announce(self, line: str) -> None:
         """Print, before the work, what may make the user stop it; the bar is redrawn below."""
         if not self.options["quiet"]:
@@ -192,10 +167,10 @@ class Upsampling:
         """Check the finished mesh against its samples."""
         from ..check.check import check_files
 
-        watch, threads = Stopwatch(), self.options["threads"]
+        watch = Stopwatch()
         files = self.target, self.source, self.chosen
         try:
-            self.certificate = check_files(*files, kept=self.result.kept, processes=threads)
+            self.certificate = check_files(*files, made=self.result.kept)
         except SuperSdfError as error:
             raise type(error)(f"{error}; {self.target} is written, but not checked") from error
         watch.lap("check")
@@ -205,10 +180,10 @@ class Upsampling:
         """Write the page; what cannot be shown in it is said there."""
         from ..pages.html import page_of_conversion, write_page
 
-        watch, threads = Stopwatch(), self.options["threads"]
+        watch = Stopwatch()
         report = {**self._report(), "notes": [*self.result.remarks(), *self.network.notes]}
         given = self.chosen, self.result.kept, self.certificate
-        text = page_of_conversion(report, *given, processes=threads)
+        text = page_of_conversion(report, *given)
         write_page(text, self.options["report"], force=self.options["force"])
         watch.lap("page")
         self.seconds |= watch.seconds

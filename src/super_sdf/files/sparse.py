@@ -65,7 +65,7 @@ class SparseWriter:
             self.values.write(self._bytes("values", field.block_distances(some)))
         self._add_samples(field)
         if field.leaves:
-            self._extend("border_inside", find_border_inside(field, *field.planes))
+            self._extend("border_inside", find_border_inside(field))
 
     def finish(self) -> None:
         """Complete the archive with the arrays of which the length is known only now."""

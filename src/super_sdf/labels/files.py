@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ..convert import describe_place
 from ..errors import MeshError, OptionError, seen
-from ..files.meshes import (World, check_format_holds, check_mesh_suffix, check_target, format_of, local_origin_note, write_together)
+from ..files.meshes import (
+    World,
+    check_format_holds,
+    check_mesh_suffix,
+    check_target,
+    format_of,
+    local_origin_note,
+    write_together,
+)
 from ..files.output import check_apart
 from ..files.regular import files_of
 from ..files.volume import PLACE
@@ -19,7 +27,6 @@ from ..network.decoder import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, ConvertOptions
 from ..progress import Progress, Stopwatch
 from ..surface.mesh import Mesh
-from ..surface.topology import vertex_components
 from .image import find_image, in_order
 from .names import LabelName, Names, in_file_name, numbers_of
 from .reconstruct import label_meshes
@@ -67,16 +74,14 @@ def convert_labels(
     names: Names | None = None,
     force: bool = False,
     progress: Progress | None = None,
-    before_rename: Callable[[Mapping[Path, Path]], None] | None = None,
 ) -> LabelConversion:
     """Convert a file with a label image to closed meshes of its labels, which share their walls.
 
     A target ``.glb`` or ``.3mf`` gets all labels as its parts; of another, ``part.ply`` say, each
     label has its own file, ``part-1.ply``. ``names`` of ``read_names`` take the place of numbers in
     ``options.labels``, in files and as parts, and parts have their colours. Listed labels that the
-    image lacks are left out. ``before_rename`` is called with all complete files, by the paths that
-    they will have; an exception in it leaves none. The other parameters are those of ``convert``;
-    options besides ``options.LABELS`` must have their defaults.
+    image lacks are left out. The other parameters are those of ``convert``; options besides
+    ``options.LABELS`` must have their defaults.
 
     Raises
     ------
@@ -113,14 +118,13 @@ def convert_labels(
     rows = []
     for path, (label, entry), mesh, volume in zip(paths, called.items(), meshes, volumes):
         files[path][entry.name] = [mesh]
-        pieces = vertex_components(mesh.faces, len(mesh.vertices))
         row = {"label": label, "name": entry.name, "output": str(path)}
         row |= {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-        row |= {"volume": mesh.volume(), "components": len(set(pieces.tolist())), "closed": True}
+        row |= {"volume": mesh.volume(), "components": mesh.components()[0], "closed": True}
         rows.append({**row, "sample_volume": volume})
     colours = {entry.name: entry.colour for entry in called.values() if entry.colour}
     world = World(options.unit, grid.space, colours)
-    write_together(files, force=force, world=world, about=about, before_rename=before_rename)
+    write_together(files, force=force, world=world, about=about)
     watch.lap("write")
     missing = names_of(image.missing(wanted), known)
     return LabelConversion(

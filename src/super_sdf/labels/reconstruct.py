@@ -29,7 +29,16 @@ from ..machine.memory import advised, held_memory, in_words
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.neighbourhood import NEIGHBOURHOOD
 from ..network.network import network_for
-from ..options import (ALL, MASK, OPTIONS, AxisOrder, check_factor, check_max_memory, check_network, check_progress)
+from ..options import (
+    ALL,
+    MASK,
+    OPTIONS,
+    AxisOrder,
+    check_factor,
+    check_max_memory,
+    check_network,
+    check_progress,
+)
 from ..pipeline import refine
 from ..progress import Progress, StepCounter, part_of
 from ..refine.field import FineField

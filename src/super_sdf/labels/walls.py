@@ -33,7 +33,7 @@ from ..arrays import BoolArray, FloatArray, IntArray
 from ..network.neighbourhood import CORNERS
 from ..refine.nodes import VoxelIndex, block_ijk
 from ..surface.cap import outer_voxels
-from ..surface.cell_cases import (EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate)
+from ..surface.cell_cases import EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate
 from ..surface.marching import CAP_HEIGHT, cells_low_nodes, strides
 from ..surface.mesh import CLEARANCE
 
@@ -231,7 +231,7 @@ def _closed(field: Labelled) -> tuple[IntArray, Labels]:
     of_filled = np.broadcast_to(filled[:, 3].astype(np.int16), (size, len(filled)))
     voxel_ijk = voxel_ijk[order]
     holder = np.concatenate([field.holder, of_filled], axis=1)[:, order]
-    outer = outer_voxels(voxel_ijk, field.shape)
+    outer = outer_voxels(voxel_ijk, np.array([(0, 0, 0), field.shape]))
     beside = np.clip(outer, 0, shape - 1)
     row = VoxelIndex(voxel_ijk, field.shape).find(beside)
     of_outer = np.zeros((size, len(outer)), np.int16)

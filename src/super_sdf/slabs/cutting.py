@@ -28,12 +28,11 @@ from ..threads import CHUNK, Resources, rows_in_chunk
 from ..network.decoder import NETWORK_BYTES
 from ..options import MARCHING, SHARP, MesherName
 from ..refine import bounds, debris, spheres
-from ..surface.marching import LOOKUP_BYTES, lookups_at_once
-from ..surface.meshers import BY_NAME, Mesher
+from ..surface.extract import reach_in_voxels
 from ..refine.spline import spline_bytes
 from ..refine.survey import (Band, band_bytes, count_crossings, look_at_band, outline, plan_reading)
 
-DEFAULT = BY_NAME[MARCHING]
+DEFAULT: MesherName = MARCHING
 SURFACE_SHARE, DOUBT = 0.25, "is this a distance field?"  # of which few samples are
 SEEN_AGAIN = 1.15  # voxels that slabs see in all, over those of one slab, if they take no more time
 LARGE = 250_000  # voxels of a slab below which smaller slabs save little memory
@@ -54,10 +53,10 @@ def whole(band: Band) -> Slab:
     return Slab((0, band.shape[0]), band.all_rows, band.all_rows)
 
 
-def planes_needed(receptive_field: int, mesher: Mesher, factor: int) -> int:
+def planes_needed(receptive_field: int, mesher: MesherName, factor: int) -> int:
     """Return how many planes to either side of a slab its mesh depends on."""
     seen = max(receptive_field, bounds.REACH_OF_SAMPLES)
-    return mesher.planes_beside(factor) + REACH_IN_VOXELS + seen
+    return reach_in_voxels(mesher, factor) + REACH_IN_VOXELS + seen
 
 
 def plan_slabs(
@@ -66,13 +65,13 @@ def plan_slabs(
     receptive_field: int | None,
     resources: Resources,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
-    mesher: Mesher = DEFAULT,
+    mesher: MesherName = DEFAULT,
     planes: tuple[int, int] | None = None,
 ) -> list[Slab]:
     """Return the fewest slabs that fit in memory, in order; more where they take no more time."""
     check_vertices(band, factor)
     bound, need = resources.memory, 0
-    beside = mesher.planes_beside(factor)
+    beside = reach_in_voxels(mesher, factor)
     for nth, slabs in enumerate(_ways(band, receptive_field, beside, planes)):
         if nth == 1:
             give_back()  # otherwise freed memory counts as held
@@ -93,7 +92,7 @@ def refuse_band(
     receptive_field: int | None,
     resources: Resources,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
-    mesher: Mesher = DEFAULT,
+    mesher: MesherName = DEFAULT,
 ) -> OutOfMemoryError:
     """Return the error for a grid whose band does not fit in memory: the grid is read once more."""
     give_back()
@@ -152,10 +151,10 @@ def peak_bytes(
     factor: int,
     network_bytes: tuple[float, float] = NETWORK_BYTES,
     threads: int = 1,
-    mesher: Mesher = DEFAULT,
+    mesher: MesherName = DEFAULT,
 ) -> int:
     """Return the peak memory of the process in bytes: what it holds now plus the largest slab."""
-    held, rest = held_memory() or band.patches.nbytes, (factor, network_bytes, threads, mesher.name)
+    held, rest = held_memory() or band.patches.nbytes, (factor, network_bytes, threads, mesher)
     needs = (slab_bytes(band, slab.seen, slab.decoded, slab.planes, *rest) for slab in slabs)
     return max(held + max(needs), band.peak)
 
@@ -166,11 +165,11 @@ def least_bytes(
     receptive_field: int | None,
     resources: Resources,
     network_bytes: tuple[float, float],
-    mesher: Mesher,
+    mesher: MesherName,
     planes: tuple[int, int] | None = None,
 ) -> int:
     """Return the peak memory in the smallest slabs."""
-    *_, slabs = _ways(band, receptive_field, mesher.planes_beside(factor), planes)
+    *_, slabs = _ways(band, receptive_field, reach_in_voxels(mesher, factor), planes)
     return peak_bytes(band, slabs, factor, network_bytes, resources.threads, mesher)
 
 
@@ -288,22 +287,9 @@ def slab_bytes(
 
 def _lookup_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
     """Return the bytes of the vertex lookup tables of whole planes, see ``marching.connect``."""
-    nodes = (factor + 1) ** 3
-    before = band.decoded_before[max(planes[0] - 1, 0) : planes[1] + 1]
-    two_planes = int((before[2:] - before[:-2]).max()) if len(before) > 2 else decoded
-    widest = min(two_planes + rows_in_chunk(nodes), decoded)
-    return LOOKUP_BYTES * nodes * widest * lookups_at_once(decoded, widest, threads)
+    return 12 * (factor + 1) ** 3 * decoded
 
 
 def _sharp_bytes(band: Band, planes: Range, decoded: int, factor: int, threads: int) -> int:
-    """Return the bytes of the sharp mesher: every voxel beside a group may be near an edge."""
-    from ..surface.sharp.mesher import GROUP_BYTES, groups_at_once, voxel_bytes
-
-    beside = BY_NAME[SHARP].planes_beside(factor)
-    before = band.decoded_before[max(planes[0] - beside, 0) : planes[1] + beside + 1]
-    width = min(2 * beside + 1, len(before) - 1)
-    around = int((before[width:] - before[: len(before) - width]).max())
-    most = sum(voxel_bytes(factor))
-    return min(threads, groups_at_once(planes, band.shape)) * min(
-        GROUP_BYTES + most * around, most * decoded
-    )
+    """Return the bytes of the sharp mesher: every voxel may be near an edge."""
+    return 432 * factor**2 * decoded

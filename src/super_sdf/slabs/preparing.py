@@ -17,11 +17,11 @@ from ..options import MARCHING, MesherName
 from ..progress import StepCounter
 from ..refine.band import BandSummary
 from ..refine.field import FineField, border_is_crossed
-from ..surface.meshers import Mesher, find_mesher
+from ..surface.extract import choose_mesher
 from ..refine.survey import Band, BandTooLargeError, no_surface, survey
 from .cutting import Slab, peak_bytes, plan_slabs, planes_needed, refuse_band
 
-Plan: TypeAlias = tuple[int, int | None, Resources, tuple[float, float], Mesher]
+Plan: TypeAlias = tuple[int, int | None, Resources, tuple[float, float], MesherName]
 """The factor, the receptive field, the resources, the network's bytes, the mesher."""
 
 
@@ -33,7 +33,7 @@ class Run:
     offset: float
     network: Adapter
     factor: int
-    mesher: Mesher
+    mesher: MesherName
     band: Band
     slabs: list[Slab]
     planned: int
@@ -60,7 +60,7 @@ def prepare(
     chosen = adapt(network_for(network, grid.field.kind))
     resources = allot(chosen.threads, max_memory)
     lattice, reach = cubic_grid(grid, offset), None if at_once else chosen.receptive_field
-    mesh_with = find_mesher(mesher, exact=lattice.field.has_exact)
+    mesh_with = choose_mesher(mesher, exact=lattice.field.has_exact)
     plan: Plan = factor, reach, resources, chosen.memory_bytes, mesh_with
     if part is None:
         band = _find_surface(lattice, offset, plan)
