@@ -18,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import OptionError
+from ..functions.zero import face_normals
 from ..grid.sdf_grid import SdfGrid
-from ..surface.mesh import Mesh
 from ..network.neighbourhood import CORNERS
 from ..options import MASK
+from ..surface.mesh import Mesh
 from ..surface.sharp.patches import Vectors, dot, length, sums_at
-from ..functions.zero import face_normals
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move

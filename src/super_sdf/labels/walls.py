@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..network.neighbourhood import CORNERS
 from ..refine.nodes import VoxelIndex, block_ijk
 from ..surface.cap import outer_voxels
