@@ -110,7 +110,7 @@ def _make_mesh(job: Job, settings: Settings, stage: Path, network: Network) -> d
     """Convert a file; return what its row says of the mesh."""
     target = stage / job.mesh
     keep = settings.check or settings.items is not None
-    done = convert(job.source, target, network, job.options, force=True, keep=keep)
+    done = convert(job.source, target, network, job.options, force=True)
     output, facts = _fingerprint_of(target), done.report()
     if keep:
         facts["check"] = _certify(job, done, target, output, settings)
@@ -150,10 +150,10 @@ def _certify(
 
     try:
         if settings.items is None:
-            return check_files(mesh, job.source, job.options, made=done.kept).report()
+            return check_files(mesh, job.source, job.options, made=done).report()
         from ..pages.items import item_of_files, keep_item
 
-        item = item_of_files(mesh, job.source, job.options, done.kept)
+        item = item_of_files(mesh, job.source, job.options, done)
         keep_item(item, settings.items, job.target, output["sha256"])
         return item.certificate or {}
     except Exception as error:  # the mesh is good all the same

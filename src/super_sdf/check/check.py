@@ -24,7 +24,7 @@ from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
 from ..machine.memory import give_back, held_memory, in_words, memory_bound
-from ..threads import allot
+from ..threads import useful_threads
 from ..surface.mesh import Mesh
 from ..options import LENGTHS, MASK, ConvertOptions, check_distance, check_max_memory
 from ..refine.survey import Band, no_surface, survey
@@ -255,8 +255,7 @@ def check_mesh(
 def band_of(grid: SdfGrid, options: ConvertOptions = AS_GIVEN) -> Band:
     """Return the band of a grid on its cubic lattice; NoSurfaceError if it has none."""
     offset = check_distance(options.offset)
-    resources = allot(0, check_max_memory(options.max_memory))
-    band = survey(cubic_grid(grid, offset), offset, resources)
+    band = survey(cubic_grid(grid, offset), offset, threads=useful_threads(0))
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)
     return band

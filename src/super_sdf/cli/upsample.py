@@ -13,7 +13,7 @@ from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
 from ..machine.extras import check_modules
-from ..options import MESH_FORMATS, QUALITIES, ConvertOptions
+from ..options import MESH_FORMATS, ConvertOptions
 from ..progress import Progress, Stopwatch
 from .common import (CONTEXT, GroupedCommand, check_can_check, check_cluster, check_names, check_option, check_page, chosen_model, cluster_option, conversion_options, labels_option, load_chosen, make_options, names_option, one_line_errors, print_stderr, print_stdout, progress_bar, report_option)
 from .interrupts import raising_interrupts
@@ -155,7 +155,6 @@ class Upsampling:
             progress=progress,
             announce=self._announce,
             save_field=self.options["save_field"],
-            keep=bool(self.options["check"] or self.options["report"]),
         )
 
     def _announce(self, line: str) -> None:
@@ -170,7 +169,7 @@ class Upsampling:
         watch = Stopwatch()
         files = self.target, self.source, self.chosen
         try:
-            self.certificate = check_files(*files, made=self.result.kept)
+            self.certificate = check_files(*files, made=self.result)
         except SuperSdfError as error:
             raise type(error)(f"{error}; {self.target} is written, but not checked") from error
         watch.lap("check")
@@ -182,7 +181,7 @@ class Upsampling:
 
         watch = Stopwatch()
         report = {**self._report(), "notes": [*self.result.remarks(), *self.network.notes]}
-        given = self.chosen, self.result.kept, self.certificate
+        given = self.chosen, self.result, self.certificate
         text = page_of_conversion(report, *given)
         write_page(text, self.options["report"], force=self.options["force"])
         watch.lap("page")

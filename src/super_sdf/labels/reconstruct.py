@@ -20,14 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import OutOfMemoryError
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
 from ..grid.interpret import labelled
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import advised, held_memory, in_words
+from ..machine.memory import advised, held_memory, in_words, memory_bound
 from ..network.decoder import Adapter, Decoder, adapt
-from ..network.neighbourhood import NEIGHBOURHOOD
 from ..network.network import network_for
 from ..options import (
     ALL,
@@ -39,14 +38,14 @@ from ..options import (
     check_network,
     check_progress,
 )
-from ..pipeline import refine
+from ..pipeline import refine_band
 from ..progress import Progress, StepCounter, part_of
+from ..refine import bounds, spheres
 from ..refine.field import FineField
 from ..refine.nodes import SHARING, VoxelIndex, part_of_node
 from ..refine.survey import survey
-from ..slabs.cutting import REACH_IN_VOXELS, whole
 from ..surface.mesh import Mesh, vertex_type
-from ..threads import Resources, allot, check_count
+from ..threads import check_count, useful_threads
 from .image import LabelImage, find_image, in_order
 from .volumes import keep_volumes, mean_spacing
 from .walls import Labelled, Walls, extract_walls, join_walls
@@ -142,12 +141,12 @@ def label_meshes(
     factor, grid = check_factor(factor), image.grid
     chosen = adapt(network_for(network, MASK))
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
-    resources = allot(chosen.threads, check_max_memory(max_memory))
-    ranges = plan_ranges(image, factor, chosen.receptive_field, resources.memory)
+    bound = memory_bound(check_max_memory(max_memory))
+    ranges = plan_ranges(image, factor, chosen.receptive_field, bound)
     walls: list[Walls] = []
     for nth, planes in enumerate(ranges):
         share = part_of(progress, nth / len(ranges), (nth + 1) / len(ranges))
-        walls.append(extract_walls(label_fields(image, planes, chosen, factor, resources, share)))
+        walls.append(extract_walls(label_fields(image, planes, chosen, factor, share)))
     places, faces, sides = join_walls(walls)
     del walls
     world: NDArray[Any] = grid.to_world(places / factor - 0.5).astype(kind)
@@ -196,7 +195,7 @@ def plan_ranges(
 
 def reach_of(receptive_field: int) -> int:
     """Return how many planes to either side of a range its walls depend on."""
-    return receptive_field + REACH_IN_VOXELS + MARGIN + 1
+    return receptive_field + spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + MARGIN + 1
 
 
 def label_fields(
@@ -204,7 +203,6 @@ def label_fields(
     planes: tuple[int, int],
     network: Adapter,
     factor: int,
-    resources: Resources,
     progress: Progress | None = None,
 ) -> Labelled:
     """Return the fields of labels in some planes: label by label, the one beside all others last.
@@ -237,7 +235,7 @@ def label_fields(
             part_of(progress, turn / (len(image.labels) + 1), (turn + 1) / (len(image.labels) + 1)),
             ["network", "nodes"],
         )
-        field = _refined(mask, grid, several, network, factor, resources, steps)
+        field = _refined(mask, grid, several, network, factor, steps)
         if field is not None:
             at = VoxelIndex(own_ijk, field.shape).find(field.voxel_ijk)
             blocks[:, at[at >= 0]] = field.blocks[:, at >= 0]
@@ -279,20 +277,20 @@ def _refined(
     only: IntArray | None,
     network: Adapter,
     factor: int,
-    resources: Resources,
     steps: StepCounter,
 ) -> FineField | None:
     """Return the field of a mask, with blocks of voxels ``only`` if some are given."""
     distances = SdfGrid.trusted(
         mask_distances(mask), 1.0, extremes=extremes_of_masks(1.0), field=grid.field
     )
-    band = survey(distances, 0.0, resources)
+    threads = useful_threads(network.threads)
+    band = survey(distances, 0.0, threads=threads)
     if only is not None:
         chosen = VoxelIndex(only, distances.shape).find(band.voxel_ijk) >= 0
         band = replace(band, decoded=band.decoded & chosen)
     if not band.decoded.any():
         return None
-    return refine(band, network, factor, whole(band), resources.threads, steps)
+    return refine_band(band, network, factor, threads, steps)
 
 
 def at_walls(values: NDArray[Any]) -> BoolArray:

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import CORNERS
 from ..errors import OptionError
 from ..functions.zero import face_normals
 from ..grid.sdf_grid import SdfGrid
-from ..network.neighbourhood import CORNERS
 from ..options import MASK
 from ..surface.mesh import Mesh
 from ..surface.sharp.patches import Vectors, dot, length, sums_at

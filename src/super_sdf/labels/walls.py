@@ -29,8 +29,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, IntArray
-from ..network.neighbourhood import CORNERS
+from ..arrays import CORNERS, FloatArray, IntArray
 from ..refine.nodes import VoxelIndex, block_ijk
 from ..surface.cap import outer_voxels
 from ..surface.cell_cases import EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate

@@ -153,8 +153,8 @@ def _viewed_grid(source: str, network: Decoder, options: ConvertOptions) -> tupl
     """Refine a grid; return what the page says and shows of it."""
     with TemporaryDirectory(prefix="super-sdf-") as folder:
         target = Path(folder, "mesh.ply")
-        done = convert(source, target, network, options, keep=True)
-        item = item_of_files(target, source, options, done.kept)
+        done = convert(source, target, network, options)
+        item = item_of_files(target, source, options, done)
     report = {**done.report(), "input": source, "asked": options.digest(), "seconds": done.seconds}
     return entry_of_report(Path(source).name, report, item), item
 

@@ -29,7 +29,7 @@ COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
 LISTS = ("facts", "certificate", "stages", "faults", "notes", "warnings", "remarks")
 NUMBERS = ("seconds", "residual", "thumbnail", "meshes")
-COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "slabs")
+COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "tiles")
 NOT_DRAWN = "not drawn: run the command again for its picture and its meshes"
 
 Entry = dict[str, Any]
