@@ -24,7 +24,7 @@ from ..files.regular import files_of
 from ..files.volume import PLACE
 from ..grid.sdf_grid import SdfGrid
 from ..network.decoder import Decoder
-from ..options import ALL, LABELS, MARCHING, OPTIONS, ConvertOptions
+from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..progress import Progress, Stopwatch
 from ..surface.mesh import Mesh
 from .image import find_image, in_order
@@ -69,7 +69,7 @@ def convert_labels(
     source: str | Path,
     target: str | Path,
     network: Decoder,
-    options: ConvertOptions | None = None,
+    options: Options | None = None,
     *,
     names: Names | None = None,
     force: bool = False,
@@ -89,7 +89,7 @@ def convert_labels(
         As in ``reconstruct_labels`` and ``write_mesh``; OptionError if an option does not go with
         labels. Nothing is written then.
     """
-    watch, options, known = Stopwatch(), options or ConvertOptions(), names or {}
+    watch, options, known = Stopwatch(), options or Options(), names or {}
     check_options(options)
     check_mesh_suffix(Path(target), options.unit)
     given, bound = options.reading(), options.max_memory
@@ -136,7 +136,7 @@ def convert_labels(
     )
 
 
-def with_numbers(options: ConvertOptions, names: Names | None) -> ConvertOptions:
+def with_numbers(options: Options, names: Names | None) -> Options:
     """Return options with numbers in place of names of labels; OptionError if some do not go."""
     if options.labels is None:
         return options
@@ -181,7 +181,7 @@ def label_paths(target: str | Path, labels: Sequence[Any]) -> list[Path]:
     return [path.with_name(f"{path.stem}-{label}{path.suffix}") for label in labels]
 
 
-def check_options(options: ConvertOptions, more: Sequence[str] = ()) -> None:
+def check_options(options: Options, more: Sequence[str] = ()) -> None:
     """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
     others = [name for name in vars(options) if name not in LABELS]
     given = [
