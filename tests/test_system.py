@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from super_sdf import load_network
-from super_sdf.cli.entry import main
 from super_sdf.machine import memory, system
 from super_sdf import threads as resources
 from super_sdf.machine.system import bound_of_cores, left_memory
@@ -55,20 +54,6 @@ def test_auto_is_float32_where_int8_is_slower(describe, text, want):
     assert find_model("base")[0].stem == want
     assert find_model("base", "int8")[0].stem == "base-int8"
     assert find_model("base", "float32")[0].stem == "base"
-
-
-def test_a_processor_that_numpy_cannot_run_on_ends_in_a_line(describe, monkeypatch):
-    for text in (x86(NEHALEM), ARM, ""):
-        describe(text)
-        system.check_processor()
-    monkeypatch.setattr(os, "_exit", lambda code: pytest.fail("the command was run"))
-    describe(x86(CORE_2))
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == (
-        "Error: this processor has no SSE4.1, SSE4.2, POPCNT, and NumPy and onnxruntime need "
-        "x86-64-v2: use another machine; a virtual one needs the host's processor (-cpu host)"
-    )
 
 
 def test_the_name_of_the_processor(describe, monkeypatch):
