@@ -9,7 +9,6 @@ import trimesh
 from conftest import trilinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_slabs import in_pieces
 
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.check.check import check_mesh
@@ -147,21 +146,6 @@ def test_offsets_grow_the_solid(offset, network):
     assert np.abs(pear(mesh.vertices.astype(float)) - offset).mean() < 0.02
     other = reconstruct(make_grid(-values, **place), network, offset=offset)
     assert np.array_equal(mesh.vertices, other.vertices)
-
-
-@pytest.mark.parametrize("axis, mesher", [(0, "marching"), (1, "sharp"), (2, "marching")])
-def test_slabs_and_threads_make_the_same_mesh(axis, mesher, network, monkeypatch):
-    spacing = tuple(np.where(np.arange(3) == axis, 1.0, 0.5))
-    grid = make_grid(sampled(spacing), spacing=spacing)
-    whole = reconstruct(grid, network, mesher=mesher)
-    threaded = reconstruct(grid, load_network("fast", threads=2), mesher=mesher)
-    monkeypatch.setattr("super_sdf.steps.band.BLOCK_SAMPLES", 1)
-    pieces = in_pieces(grid, network, monkeypatch, 5, mesher=mesher)
-    assert len(pieces) > 2
-    joined = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
-    for other in (threaded, joined):
-        assert np.array_equal(whole.vertices, other.vertices)
-        assert np.array_equal(whole.faces, other.faces)
 
 
 def test_a_field_is_meshed_with_the_grid_that_it_was_made_from():

@@ -19,7 +19,7 @@ from super_sdf.check import check, surface
 from super_sdf.check import samples as slabs
 from super_sdf.check.check import LIMITS, check_mesh, exceeded, stated_triangles
 from super_sdf.files import mesh_writers
-from super_sdf.machine import extras
+from super_sdf import errors as extras
 
 H = 1 / 24  # of the grids
 RADIUS = 0.4

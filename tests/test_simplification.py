@@ -19,8 +19,8 @@ from super_sdf.check.surface import count_components
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
 from super_sdf.files.meshes import write_mesh
-from super_sdf.machine import extras
-from super_sdf.machine.memory import held_memory
+from super_sdf import errors as extras
+from super_sdf.threads import held_memory
 from super_sdf.network.network import load_network
 from super_sdf.simplify import collapsing, simplify
 from super_sdf.simplify.collapsing import collapse_within

@@ -20,7 +20,7 @@ from .files.regular import files_of
 from .grid.cubic import cubic_grid
 from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
-from .machine.extras import check_modules
+from .errors import check_modules
 from .surface.mesh import Mesh
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP

@@ -15,10 +15,10 @@ from numpy.lib import format as npy
 from numpy.typing import ArrayLike
 
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
-from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..refine.field import FineField, fine_grid, lattice_planes, lattice_shape
 from ..surface.cap import check_all_seen
+from ..threads import held_memory, in_words, memory_bound
 from .output import check_free, free_space, naming, replacing
 from .sparse import write_sparse
 from .vdb_writer import write_level_set

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, MeshError, OutOfMemoryError, SuperSdfError
 from ..files.regular import check_regular_file
-from ..machine.memory import held_memory, in_words, memory_bound
 from ..surface.mesh import Mesh
+from ..threads import held_memory, in_words, memory_bound
 
 # Products and squares of larger coordinates overflow.
 LARGEST_COORDINATE = 1e30

@@ -18,8 +18,8 @@ from scipy import ndimage
 from ..arrays import FloatArray
 from ..errors import MeshError, OptionError, seen
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import check_fits
 from ..surface.mesh import Mesh
+from ..threads import check_fits
 from .solid import Points, Solid
 
 EDGE = 8  # samples along a cube
