@@ -24,8 +24,8 @@ from super_sdf.errors import SuperSdfError
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import Network, load_network
 from super_sdf.pipeline import upsample
-from super_sdf.surface.cap import close_at_border
 from super_sdf.refine.field import FineField
+from super_sdf.surface.cap import close_at_border
 from super_sdf.surface.marching import find_crossings, to_world
 from super_sdf.surface.sharp.features import Rule, find_candidates, placed_by
 from super_sdf.surface.sharp.patches import Placed, Triangles, find_patches, triangles_of
