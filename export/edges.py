@@ -24,9 +24,10 @@ from super_sdf.errors import SuperSdfError
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import Network, load_network
 from super_sdf.pipeline import upsample
-from super_sdf.surface.cap import close_at_border
+from super_sdf.surface.cap import close
 from super_sdf.refine.field import FineField
-from super_sdf.surface.marching import find_crossings, to_world
+from super_sdf.surface.extract import to_world
+from super_sdf.surface.marching import find_crossings
 from super_sdf.surface.sharp.features import Rule, find_candidates, placed_by
 from super_sdf.surface.sharp.patches import Placed, Triangles, find_patches, triangles_of
 from super_sdf.surface.sharp.planes import planes_at_crossings
@@ -65,11 +66,12 @@ def draw_case(rng: np.random.Generator, paths: list[Path], procedural: float, nu
 
 def rows_of(case: Case, network: Network) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence (f, e) and the losses (f, s) of all candidates of a case."""
-    field = close_at_border(upsample(case.grid, network, FACTOR))
+    field = close(upsample(case.grid, network, FACTOR), cap=True)
     every = np.ones(len(field.voxel_ijk), bool)
-    crossings = find_crossings(field, slice(0, len(every)))
+    crossings = find_crossings(field)
+    border = np.array([(0, 0, 0), field.shape])
     patches, used = find_patches(field, crossings, every)
-    own = planes_at_crossings(field, crossings, used)
+    own = planes_at_crossings(field, crossings, used, border)
     candidates = find_candidates(patches, own, every, field)
     losses = []
     for way in SHARES:
@@ -93,7 +95,7 @@ def errors_of(
     area = np.linalg.norm(normal, axis=1)
     normal /= np.maximum(area, 1e-12)[:, None]
     points = np.einsum("pk,tkd->ptd", AT, corners).reshape(-1, 3)
-    world = to_world(points.T, field, grid).astype(np.float64)
+    world = to_world(points.T, field.factor, grid)
     distance = solid.distance(world).reshape(len(AT), -1).mean(0) / grid.spacing[0]
     true = face_vectors(solid.mesh)[solid.nearest_face(world)]
     true /= np.maximum(np.linalg.norm(true, axis=1), 1e-15)[:, None]

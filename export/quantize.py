@@ -2,6 +2,7 @@ r"""Write the int8 variant of an exported network, and check its error.
 
     python -m export.quantize src/super_sdf/models/base.onnx \
         --out src/super_sdf/models/base-int8.onnx
+    python -m export.quantize src/super_sdf/models/base-int8.onnx   # optimises its graph again
 
 Only the blocks change; stem, head and the features between the blocks stay float32. Weights are
 integers with one scale per output channel; the inputs of a layer are integers with one step per
@@ -27,7 +28,9 @@ from export.batches import batch_of, encode
 from export.int8_graph import IntBlock, IntLayer, replace_blocks
 from export.network import Block, SuperSdfNet
 from export.to_onnx import read_card, read_network, write_model
+from super_sdf.network.device import OPTIMISED
 from super_sdf.network.network import load_network
+from super_sdf.network.onnx import ort
 
 LEVELS = 255  # of the inputs of a layer: uint8
 # Two products must fit into 16 bits, in which processors without VNNI add them with saturation.
@@ -121,6 +124,29 @@ def quantize(
     replace_blocks(model.graph, blocks)
     onnx.checker.check_model(model)
     onnx.save(model, target)
+    optimise(target)
+
+
+def optimise(path: Path) -> None:
+    """Write the graph of an int8 file as onnxruntime would fuse it each time it is opened.
+
+    The operators are those of the source but for onnxruntime's own, which every version since 1.18
+    has: the values are the same, bit for bit.
+    """
+    options, fused = ort.SessionOptions(), path.with_suffix(".fused.onnx")
+    options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_ENABLE_EXTENDED
+    options.optimized_model_filepath = str(fused)
+    options.log_severity_level = 3
+    ort.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    source, model = onnx.load(path), onnx.load(fused)
+    fused.unlink()
+    model.producer_name, model.producer_version = source.producer_name, ""
+    used = [one for one in model.opset_import if one.domain in ("", "com.microsoft")]
+    del model.opset_import[:], model.metadata_props[:]
+    model.opset_import.extend(used)
+    model.metadata_props.extend(source.metadata_props)
+    model.metadata_props.add(key=OPTIMISED, value=f"onnxruntime {ort.__version__}")
+    onnx.save(model, path)
 
 
 def units_of(ranges: Sequence[Ranges]) -> Tensor:
@@ -192,9 +218,12 @@ def main() -> None:
     """Write the file; keep it only if it is close to its source."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("source", type=Path, help="an .onnx file of export.to_onnx")
-    parser.add_argument("--out", type=Path, required=True, help="the int8 .onnx file")
+    parser.add_argument("--out", type=Path, help="the int8 .onnx file")
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
     options = parser.parse_args()
+    if options.out is None:
+        optimise(options.source)
+        return
     samples = draw_samples(masks=not read_network(options.source).config.keeps_samples)
     quantize(options.source, options.out, samples, options.accuracy)
     apart = distance_apart(options.source, options.out, samples[:SOME]).mean()

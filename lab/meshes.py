@@ -29,6 +29,7 @@ from super_sdf.network.network import Network, find_model, load_network
 from super_sdf.options import DEFAULT_QUALITY
 from super_sdf.slabs import preparing
 from super_sdf.slabs.cutting import Slab, cut
+from super_sdf.surface.extract import reach_in_voxels
 from super_sdf.refine.survey import Band
 
 from . import parser_of
@@ -50,7 +51,7 @@ def cut_into(slabs: int) -> Iterator[None]:
     """Cut every grid into about as many slabs, whatever the memory."""
 
     def plan(band: Band, factor: int, reach: int, *others: Any) -> list[Slab]:
-        return cut(band, slabs, reach, others[-1].planes_beside(factor))
+        return cut(band, slabs, reach, reach_in_voxels(others[-1], factor))
 
     with mock.patch.object(preparing, "plan_slabs", plan) if slabs > 1 else nullcontext():
         yield

@@ -25,7 +25,7 @@ from super_sdf.simplify.simplify import simplify_mesh
 from super_sdf.slabs.cutting import whole
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField, SampleSpheres
-from super_sdf.surface.meshers import extract_mesh
+from super_sdf.surface.extract import extract_mesh
 from super_sdf.refine.nodes import block_ijk, share_parts
 from super_sdf.refine.survey import survey
 from super_sdf.truth.sampling import grid_points

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from super_sdf.errors import WriteError
-from super_sdf.batch.records import RecordFile
+from super_sdf.batch.record import RecordFile
 
 Key = Mapping[str, Any]
 Row = dict[str, Any]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
-from super_sdf.batch.pool import Death, Pool, Work
+from super_sdf.batch.pool import Death, work_in_processes
 
 from .measuring import Measurement, Task, measure_task, reason_of
 from .rows import Rows
@@ -44,7 +44,11 @@ def complete(
     ]
     queue = deque(task for task in sorted(left, key=shape_key) if task.methods)
     done, total, unreadable = 0, len(queue), {}
-    results = Pool(queue, worker).results(jobs) if jobs else ((t, measured(t)) for t in queue)
+    results = (
+        work_in_processes(lambda: queue.popleft() if queue else None, measured_in_time, jobs)
+        if jobs
+        else ((task, measured(task)) for task in queue)
+    )
     for task, outcome in results:
         if isinstance(outcome, Death) and len(task.methods) > 1 and not task.limit:
             queue.extendleft(replace(task, methods=(method,)) for method in task.methods)
@@ -86,16 +90,12 @@ def failure(task: Task, death: Death) -> Measurement:
     return {"error": f"its process {death.cause}"}
 
 
-def worker() -> Work:
-    """Return what works at a task in a process of its own, which ends at the task's limit."""
-
-    def work(task: Task) -> Outcome:
-        signal.setitimer(signal.ITIMER_REAL, task.limit or 0)  # 0: none
-        outcome = measured(task)
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        return outcome
-
-    return work
+def measured_in_time(task: Task) -> Outcome:
+    """Return ``measured`` in a process of its own, which ends at the task's limit."""
+    signal.setitimer(signal.ITIMER_REAL, task.limit or 0)  # 0: none
+    outcome = measured(task)
+    signal.setitimer(signal.ITIMER_REAL, 0)
+    return outcome
 
 
 def measured(task: Task) -> Outcome:

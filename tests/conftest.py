@@ -16,8 +16,6 @@ from hypothesis import HealthCheck, settings
 from super_sdf import SdfGrid
 from super_sdf.network.neighbourhood import NEIGHBOURHOOD
 from super_sdf.network.onnx import ort
-from super_sdf.slabs import cutting
-from super_sdf.refine import survey
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -133,15 +131,6 @@ def run_batch(command):
         return code, said, re.sub(r"; [\d.]+ s\n$", "\n", err)
 
     return go
-
-
-@pytest.fixture
-def bare_plan(monkeypatch):
-    """Let the plan count what grows with the surface, over 100 MB, and nothing else."""
-    for name in ("THREAD_BYTES", "FIXED_BYTES", "NETWORK_FIXED"):
-        monkeypatch.setattr(cutting, name, 0)
-    for module in (cutting, survey):
-        monkeypatch.setattr(module, "held_memory", lambda: 10**8)
 
 
 @pytest.fixture

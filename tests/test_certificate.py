@@ -16,7 +16,7 @@ from solids import cube, inverted, joined, saved, torus
 from super_sdf import Mesh, SdfGrid
 from super_sdf.surface import topology
 from super_sdf.check import check, surface
-from super_sdf.check import search as slabs
+from super_sdf.check import samples as slabs
 from super_sdf.check.check import LIMITS, check_mesh, exceeded, stated_triangles
 from super_sdf.files import mesh_writers
 from super_sdf.machine import extras
@@ -157,8 +157,7 @@ def test_a_vertex_shared_by_two_pieces_is_pinched():
     assert not found.manifold and found.closed
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_what_is_found_depends_neither_on_the_slabs_nor_on_processes(monkeypatch, processes):
+def test_what_is_found_does_not_depend_on_the_slabs(monkeypatch):
     random = np.random.default_rng(3)
     vertices = random.random((90, 3))
     faces = topology.without_collapsed(random.integers(0, 90, (120, 3)).astype(np.int32))
@@ -167,7 +166,7 @@ def test_what_is_found_depends_neither_on_the_slabs_nor_on_processes(monkeypatch
     whole = slabs.search(mesh, points, 0.1, intersections=True)
     assert whole.intersections > 100
     monkeypatch.setattr(slabs, "FACES_IN_SLAB", 7)
-    cut = slabs.search(mesh, points, 0.1, intersections=True, processes=processes)
+    cut = slabs.search(mesh, points, 0.1, intersections=True)
     assert cut.intersections == whole.intersections
     np.testing.assert_allclose(cut.distances, whole.distances, rtol=0, atol=1e-14)
     np.testing.assert_allclose(cut.feet, whole.feet, rtol=0, atol=1e-7)

@@ -7,25 +7,11 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ball, trilinear
-from test_slabs import in_pieces
 
-import super_sdf.convert
-from super_sdf import SdfGrid
 from super_sdf.convert import ConvertOptions, convert
-from super_sdf.errors import FileError, GridError, MeshError, WriteError
+from super_sdf.errors import FileError, GridError, WriteError
 from super_sdf.files import meshes
 from super_sdf.files.meshes import MESH_SUFFIXES
-from super_sdf.surface.mesh import Mesh
-
-
-class Close:
-    """Trilinear interpolation, which says how far it sees."""
-
-    receptive_field = 1
-    __call__ = staticmethod(trilinear)
-
-
-CLOSE = Close()
 
 
 @pytest.fixture(autouse=True)
@@ -51,47 +37,6 @@ def test_options_take_effect_and_the_result_is_reported():
     assert mesh.bounds.mean(0) == pytest.approx(np.array([1, 2, 3]) + 2 * 7.63, abs=0.2)
     assert list(done.seconds) == ["read", "band", "network", "nodes", "isosurface", "write"]
     assert steps == [(30, 1000), (480, 1000), (630, 1000), (1000, 1000)]
-
-
-def without_one(faces, first):
-    """Leave out a triangle that has one side on the plane between the last two slabs."""
-    return np.delete(faces, np.flatnonzero((faces < first).sum(1) == 2)[0], 0)
-
-
-def with_one_twice(faces, first):
-    """Repeat such a triangle."""
-    return np.append(faces, faces[(faces < first).sum(1) == 2][:1], 0)
-
-
-BETWEEN = (
-    "1 open edge at plane {1}, between planes {0} to {2} and planes {1} to {3}: run it again, "
-)
-
-
-@pytest.mark.parametrize(
-    "cap, end, spoil, want",
-    [
-        (True, 9, without_one, BETWEEN),
-        (False, 16, without_one, BETWEEN),
-        (False, 9, with_one_twice, BETWEEN),
-        (True, 16, lambda faces, _: faces[:-1], "3 open edges in planes "),
-    ],
-)
-def test_slabs_that_do_not_meet_and_holes_are_errors(monkeypatch, cap, end, spoil, want):
-    """Whether the surface ends within the grid, is capped or is left open."""
-    values = ball(16, 4.0).values[:, :end]
-    np.save("cut.npy", values)
-    slabs = in_pieces(SdfGrid(values, 1.0), CLOSE, monkeypatch, 3, factor=2, cap=cap)
-    before = sum(slab.counts["vertices"] for slab in slabs[:2])
-    mesh = slabs[2].meshes[0]
-    slabs[2].meshes[0] = Mesh(mesh.vertices, spoil(mesh.faces, before))
-    monkeypatch.setattr(super_sdf.convert, "reconstruct_slabs", lambda *_, **__: iter(slabs))
-    with pytest.raises(MeshError) as caught:
-        convert("cut.npy", "out.ply", trilinear, ConvertOptions(2, cap=cap))
-    assert not os.path.exists("out.ply")
-    (first, start), (_, stop) = slabs[1].planes, slabs[2].planes
-    said = want.format(first, start, start - 1, stop - 1)
-    assert str(caught.value).startswith(f"the mesh is torn, with {said}")
 
 
 def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():

@@ -1,24 +1,15 @@
-"""The choice of a mesher: names, and the same mesh for any slabs, groups, threads and memory."""
+"""The choice of a mesher: names, and the same mesh for any threads."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from batches import rows
-from corpus.random_fields import facets
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from test_slabs import assert_same, in_pieces, joined, rod
 
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf import threads as resources
-from super_sdf.surface.mesh import join_meshes
-from super_sdf.slabs import cutting
-from super_sdf.surface import meshers
-from super_sdf.surface.marching import extract_pieces
-from super_sdf.surface.sharp import mesher as sharp
+from super_sdf.surface.extract import extract
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +28,14 @@ def bar(shape=(44, 13, 12), half=(18.3, 2.8, 2.3)):
     return distance.reshape(shape)
 
 
+def assert_same(one, other):
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    np.testing.assert_array_equal(one.faces, other.faces)
+
+
 FIELDS = {
     "bar": bar(),
     "bar that leaves the grid": bar()[6:38, :8],
-    "rod": rod()[:34],
 }
 
 
@@ -48,7 +43,6 @@ def test_each_name_gives_its_mesh(network):
     grid = SdfGrid.trusted(FIELDS["bar"], 1.0)
     field = upsample(grid, network, 2)
     plain, sharp = (extract_mesh(field, grid, mesher=name) for name in ("marching", "sharp"))
-    assert_same(plain, join_meshes(extract_pieces(field, grid)))
     assert len(sharp.vertices) > len(plain.vertices)
     for name, mesh in {"marching": plain, "sharp": sharp, "auto": sharp}.items():
         assert_same(mesh, reconstruct(grid, network, 2, mesher=name))
@@ -78,58 +72,16 @@ def test_edges_that_a_mask_cannot_show_are_a_note(tmp_path, monkeypatch, command
         assert code == 0 and err.count(note) == count
 
 
-@pytest.mark.parametrize(
-    "name, factor, cap",
-    [("bar", 2, True), ("bar that leaves the grid", 4, False), ("rod", 8, True)],
-)
-def test_slabs_change_nothing(network, monkeypatch, name, factor, cap):
-    grid = SdfGrid.trusted(FIELDS[name], 1.0)
-    options = {"factor": factor, "cap": cap, "mesher": "sharp"}
-    (whole,) = in_pieces(grid, network, monkeypatch, 1, **options)
-    for pieces in (3, 20) if factor == 2 else (6,):
-        parts = in_pieces(grid, network, monkeypatch, pieces, **options)
-        assert len(parts) > 1
-        assert_same(joined(parts), joined([whole]))
-        assert sum(part.counts["vertices"] for part in parts) == whole.counts["vertices"]
-
-
-@settings(max_examples=5)
-@given(st.integers(0, 10**6), st.integers(2, 30), st.booleans())
-def test_slabs_change_nothing_on_random_facets(network, seed, pieces, cap):
-    values = facets(np.random.default_rng(seed), (28, 8, 7))
-    values.flat[0], values.flat[-1] = 1, -1
-    grid = SdfGrid.trusted(values, 1.0)
-    options = {"factor": 2, "cap": cap, "mesher": "sharp"}
-    with pytest.MonkeyPatch.context() as patch:
-        (whole,) = in_pieces(grid, network, patch, 1, **options)
-        parts = in_pieces(grid, network, patch, pieces, **options)
-    assert_same(joined(parts), joined([whole]))
-
-
-def test_slabs_need_all_the_planes_that_the_mesher_names(network, monkeypatch):
-    """With fewer final planes the mesh differs, so the tests above can fail."""
-    grid = SdfGrid.trusted(FIELDS["bar"], 1.0)
-    one = reconstruct(grid, network, factor=2, mesher="sharp")
-    few = replace(meshers.BY_NAME["sharp"], planes_beside=lambda factor: 1)
-    monkeypatch.setitem(meshers.BY_NAME, "sharp", few)
-    monkeypatch.setattr(cutting, "REACH_IN_VOXELS", 1)
-    mesh = joined(in_pieces(grid, network, monkeypatch, 4, factor=2, mesher="sharp"))
-    assert not np.array_equal(mesh.vertices, one.vertices)
-
-
-def test_groups_and_threads_change_nothing(network, monkeypatch, factor=2):
+def test_threads_change_nothing(network, monkeypatch):
     grid = SdfGrid.trusted(FIELDS["bar that leaves the grid"], 1.0)
-    field = upsample(grid, network, factor)
-    mesher = meshers.BY_NAME["sharp"]
-    one = join_meshes(mesher.extract(field, grid, 7, 1))
+    field = upsample(grid, network, 2)
+    one, keys = extract(field, grid, mesher="sharp", cap=True)
     monkeypatch.setattr(resources, "CHUNK", 5000)
     monkeypatch.setattr(resources, "MIN_PER_THREAD", 1000)
-    size = sum(sharp.voxel_bytes(factor)) * len(field.voxel_ijk)
-    for groups, number in ((1, 2), (9, 3)):
-        monkeypatch.setattr(sharp, "GROUP_BYTES", size // groups)
-        pieces = mesher.extract(field, grid, 7, number)
-        assert len(pieces) > 1 or groups == 1
-        assert_same(join_meshes(pieces), one)
+    more, same = extract(field, grid, mesher="sharp", cap=True, threads=3)
+    assert_same(more, one)
+    np.testing.assert_array_equal(keys, same)
+    assert len(np.unique(keys)) == len(keys)
 
 
 def test_the_command_takes_a_mesher_and_says_which(tmp_path, monkeypatch, command):

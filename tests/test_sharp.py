@@ -9,7 +9,7 @@ from test_isosurface import dense_field
 
 from lab.methods import sharp_isosurface
 from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
-from super_sdf.check.search import self_intersections
+from super_sdf.check.samples import self_intersections
 from super_sdf.surface.cell_cases import loop_table, triangle_table
 from super_sdf.surface.marching import find_crossings
 from super_sdf.surface.sharp.features import Rule, is_sharp

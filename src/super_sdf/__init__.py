@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from .refine.field import fine_grid as fine_grid
     from .simplify.simplify import simplify_mesh as simplify_mesh
     from .surface.mesh import Mesh as Mesh
-    from .surface.meshers import extract_mesh as extract_mesh
+    from .surface.extract import extract_mesh as extract_mesh
 
 MODULES = {
     "errors": "SuperSdfError",
@@ -47,7 +47,7 @@ MODULES = {
     "refine.field": "FineField fine_grid",
     "simplify.simplify": "simplify_mesh",
     "surface.mesh": "Mesh",
-    "surface.meshers": "extract_mesh",
+    "surface.extract": "extract_mesh",
 }
 HOMES = {name: module for module, names in MODULES.items() for name in names.split()}
 __all__ = ["__version__", *HOMES]

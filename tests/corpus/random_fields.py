@@ -10,7 +10,6 @@ import numpy as np
 from conftest import count_fans
 
 from super_sdf import Mesh, SdfGrid, pipeline, reconstruct
-from super_sdf.cluster.bricks import Meshed, joined
 from super_sdf.convert import Tally
 from super_sdf.surface.mesh import join_meshes
 from super_sdf.network.network import Network

@@ -14,8 +14,8 @@ from ..errors import SuperSdfError
 from ..pages.html import make_page, write_page
 from ..pages.items import (Entry, Item, entry_of, entry_of_report, find_item, item_name, item_of_files, item_path, items_folder, keep_item, read_meshes, remove_items)
 from .job import Job
-from .ledger import Row, asked_of, is_unchanged
-from .plan import Batch
+from .record import Row, is_unchanged
+from .run import Batch
 
 MOST_WITHIN = 5_000_000  # bytes of meshes that a page may hold itself
 
@@ -23,15 +23,15 @@ MOST_WITHIN = 5_000_000  # bytes of meshes that a page may hold itself
 class BatchPage:
     """The page of a batch as it stands, at its end or interrupted.
 
-    ``jobs`` are all jobs of the run, ``rows`` those of the ledger by output, also of runs with
-    other inputs. Those of labels are left out.
+    It has the rows of the report, also of runs with other inputs; those of labels are left out.
     """
 
-    def __init__(self, path: Path, batch: Batch, jobs: Sequence[Job], rows: dict[str, Row]) -> None:
+    def __init__(self, path: Path, batch: Batch) -> None:
         self.path, self.batch, self.folder = path, batch, items_folder(path)
+        jobs, rows = batch.jobs, batch.record.rows
         self.jobs = {job.target: job for job in jobs}
         rows = rows | {result.job.target: result.row for result in batch.failures()}
-        self.rows = {name: row for name, row in rows.items() if asked_of(row).get("labels") is None}
+        self.rows = {name: row for name, row in rows.items() if (row.get("asked") or {}).get("labels") is None}
         finished = {result.job.target for result in (*batch.results(), *batch.failures())}
         self.unfinished = [job for job in jobs if job.target not in finished]
 

@@ -6,13 +6,16 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import IntArray
 from ..surface.mesh import Mesh
-from ..surface.topology import (Edges, count_fans, pair_edges, vertex_components, without_collapsed)
-
-FACES_AT_ONCE = 1 << 18  # for area and volume
+from ..surface.topology import (
+    Edges,
+    count_fans,
+    pair_edges,
+    vertex_components,
+    without_collapsed,
+)
 
 
 @dataclass(frozen=True)
@@ -51,11 +54,10 @@ class Surface:
 
     def faults(self) -> list[str]:
         """Return what keeps the mesh from being the boundary of a solid, in words."""
-        edges = self.edges
         counts = {
-            "open edges": edges.open_edges,
-            "edges of more than two triangles": edges.crowded_edges,
-            "edges between triangles of opposite orientation": edges.flipped_edges,
+            "open edges": self.edges.open_edges,
+            "edges of more than two triangles": self.edges.crowded_edges,
+            "edges between triangles of opposite orientation": self.edges.flipped_edges,
             "vertices where several fans of triangles meet": self.pinched_vertices,
             "pairs of triangles that intersect": self.self_intersections or 0,
         }
@@ -75,22 +77,14 @@ def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surfac
     faces, count = without_collapsed(mesh.faces), len(mesh.vertices)
     opposite, edges = pair_edges(faces, count)
     pinched = int(np.count_nonzero(count_fans(faces, opposite) > 1))
-    del opposite
-    pieces, size = count_components(faces, count), measure(mesh.vertices, faces)
-    return Surface(count, len(faces), edges, pinched, pieces, self_intersections, *size)
+    whole = Mesh(mesh.vertices, faces)
+    a, b, c = mesh.vertices[faces.T].astype(np.float64)
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    components = count_components(faces, count)
+    size = components, self_intersections, whole.volume(), area
+    return Surface(count, len(faces), edges, pinched, *size)
 
 
 def count_components(faces: IntArray, count: int) -> int:
     """Return the number of pieces of a mesh that share no vertex; unused vertices do not count."""
     return len(np.unique(vertex_components(faces, count)[faces[:, 0]]))
-
-
-def measure(vertices: NDArray[Any], faces: IntArray) -> tuple[float, float]:
-    """Return the enclosed volume and the area, in cubic and square world units."""
-    middle = vertices.mean(0, dtype=np.float64)
-    volume = area = 0.0
-    for first in range(0, len(faces), FACES_AT_ONCE):
-        a, b, c = vertices[faces[first : first + FACES_AT_ONCE].T] - middle
-        volume += float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
-        area += float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-    return volume, area

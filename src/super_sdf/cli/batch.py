@@ -20,8 +20,7 @@ from .common import option, print_stderr, print_stdout
 
 if TYPE_CHECKING:
     from ..batch.job import Job
-    from ..batch.plan import Batch
-    from ..batch.run import Run
+    from ..batch.run import Batch
 
 HELP = f"""Convert many grids to meshes in the folder DIR, each as upsample would.
 
@@ -69,9 +68,8 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     options = common.chosen_options(given)
     from ..batch.inputs import find_jobs
     from ..batch.job import Settings
-    from ..batch.ledger import Ledger, folder_lock
-    from ..batch.plan import Planner
-    from ..batch.run import Run
+    from ..batch.record import folder_lock
+    from ..batch.run import Batch
     from ..labels.files import check_options
     from ..labels.names import read_names
     from ..network.network import find_model
@@ -91,14 +89,11 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     where = (folder, model, options.precision, options.device, options.threads, given["jobs"])
     settings = Settings(*where, items=items, names=names, **some)
     if given["dry_run"]:
-        plan = Planner(jobs, settings, Ledger(folder)).plan()
-        plan.unread = unread
-        print_plan(plan, given["as_json"])
+        print_plan(Batch(jobs, settings, unread), given["as_json"])
         return
     with folder_lock(folder):
-        run = Run(jobs, settings)
-        batch, total = run.batch, len(run.batch.waiting)
-        batch.unread = unread
+        batch = Batch(jobs, settings, unread)
+        total = len(batch.waiting)
         for line in () if quiet else made_again_lines(batch):
             print_stderr(line)
         try:
@@ -108,11 +103,11 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
                     if progress:
                         progress(len(batch.done) + len(batch.failed), total)
 
-                run.complete(show, lambda text: print_stderr(f"Warning: {text}"))
-            write_page(run, jobs, page)
+                batch.run(show)
+            write_page(batch, page)
         except KeyboardInterrupt:
             with suppress(SuperSdfError):
-                write_page(run, jobs, page, "interrupted")
+                write_page(batch, page, "interrupted")
             done = f"{len(batch.done)} of {total} are done and kept"
             raise common.Stopped(f"{done}; run it again to go on") from None
     batch.seconds = time.perf_counter() - start
@@ -147,19 +142,19 @@ def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) 
     return beside
 
 
-def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = "") -> None:
+def write_page(batch: Batch, path: Path | None, interrupted: str = "") -> None:
     """Write the page, if one was asked for; after an interrupt, at once and without drawing."""
     if path is None:
         return
     from ..batch.page import BatchPage
     from ..pages.html import is_page
 
-    page, alert = BatchPage(path, run.batch, jobs, run.ledger.rows), ""
+    page, alert = BatchPage(path, batch), ""
     if page.unfinished or interrupted:
         why = f", {interrupted}" if interrupted else ""
         alert = f"Incomplete{why}: {len(page.unfinished)} not finished; run it again to go on"
-    title, force = f"Batch: {run.settings.folder}", run.settings.force or is_page(path)
-    page.write(title, sentence(run.batch), alert, force=force, draw=not interrupted)
+    title, force = f"Batch: {batch.settings.folder}", batch.settings.force or is_page(path)
+    page.write(title, sentence(batch), alert, force=force, draw=not interrupted)
 
 
 def print_plan(plan: Batch, as_json: bool) -> None:

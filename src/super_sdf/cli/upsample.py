@@ -93,9 +93,7 @@ def check_outputs(source: str, target: str, options: Options, given: dict[str, A
         outputs = (target, field) if field else (target,)
         common.check_page("--report", given["report"], [*files_of(source), *outputs], force=force)
     if given["cluster"] is not None:
-        from ..cluster.bricks import check_can_brick
-
-        check_can_brick(source, options, field)
+        raise OptionError("--cluster is for batch: leave it out")
     elif given["jobs"]:
         raise OptionError(f"--jobs {given['jobs']} is for --cluster local: give that, or no --jobs")
 
@@ -119,29 +117,16 @@ def upsample_grid(
     force, page, certificate = given["force"], given["report"], None
     with common.progress_bar("upsampling", given["quiet"]) as progress:
         told = {"force": force, "progress": progress, "announce": announce}
-        if given["cluster"] is None:
-            from ..convert import convert
+        from ..convert import convert
 
-            keep = bool(given["check"] or page)
-            done = convert(
-                source, target, network, options, save_field=given["save_field"], keep=keep, **told
-            )
-        else:
-            from ..cluster.bricks import convert_on_cluster
-            from ..cluster.checking import Needs
-            from ..cluster.connecting import connect
-
-            needs = Needs(options.network()["model"], options.precision, options.device)
-            limits: dict[str, Any] = {"threads": options.threads, "max_memory": options.max_memory}
-            with connect(given["cluster"], workers=given["jobs"], **limits) as cluster:
-                done = convert_on_cluster(source, target, cluster, needs, options, **told)
+        done = convert(source, target, network, options, save_field=given["save_field"], **told)
     watch.take(done.seconds)
     report |= done.report()
     if given["check"]:
         from ..check.check import check_files
 
         try:
-            certificate = check_files(target, source, options, kept=done.kept)
+            certificate = check_files(target, source, options, made=done)
         except SuperSdfError as error:
             raise type(error)(f"{error}; {target} is written, but not checked") from error
         report["check"] = certificate.report()
@@ -150,7 +135,7 @@ def upsample_grid(
         from ..pages.html import page_of_conversion, write_page
 
         said = {"seconds": watch.rounded(), "notes": [*done.remarks(), *network.notes]}
-        text = page_of_conversion({**report, **said}, options, done.kept, certificate)
+        text = page_of_conversion({**report, **said}, options, done, certificate)
         write_page(text, page, force=force)
         watch.lap("page")
     lines = [f"Note: {note}" for note in (*done.notes, *done.remarks(), *network.notes)]

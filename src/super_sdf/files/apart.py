@@ -52,9 +52,8 @@ class _Process:
         self.left = request.left
         if self.left is None and bound is not None:
             self.left = bound - self.start
-        from ..batch.pool import isolated_python  # imports multiprocessing, for 10 ms
-
-        self.process = Popen(isolated_python(START), stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
+        command = [sys.executable, "-I", "-c", f"import sys; sys.path[:] = {sys.path!r}; {START}"]
+        self.process = Popen(command, stdin=PIPE, stdout=PIPE, stderr=DEVNULL)
         threading.Thread(target=self._watch, daemon=True).start()
 
     def ask(self, question: Any) -> Any:

@@ -18,7 +18,7 @@ from ..machine.extras import check_modules
 from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
 from ..surface.cap import check_all_seen
-from ..refine.field import FineField, fine_grid, lattice_shape, own_planes
+from ..refine.field import FineField, fine_grid, lattice_shape, lattice_planes
 from .sparse import SparseWriter
 from .level_set import VdbWriter
 
@@ -36,7 +36,7 @@ class NpyWriter:
 
     def add(self, field: FineField) -> None:
         """Write the planes of nodes of a slab."""
-        for _, planes in own_planes(field):
+        for _, planes in lattice_planes(field):
             self.file.write(little_endian(planes))
 
     def finish(self) -> None:
@@ -58,7 +58,7 @@ class VtiWriter:
     def add(self, field: FineField) -> None:
         """Copy the planes of nodes of a slab."""
         self.grid = fine_grid(field)
-        for first, planes in own_planes(field):
+        for first, planes in lattice_planes(field):
             self.values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
 
     def finish(self) -> None:

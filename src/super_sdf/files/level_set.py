@@ -24,7 +24,7 @@ from ..errors import NoSurfaceError, OptionError
 from .output import little_endian, spool_beside
 from .vdb_writer import (INSIDE, LEAF, MIXED, OUTSIDE, LevelSet, Sides, leaf_bytes, write_level_set)
 from ..grid.sdf_grid import SdfGrid
-from ..refine.field import FineField, fine_grid, own_planes
+from ..refine.field import FineField, fine_grid, lattice_planes
 
 HALF_WIDTH = 3  # voxels of the narrow band to either side of the surface; OpenVDB's tools want 3
 BEYOND = HALF_WIDTH - 1  # voxels beyond the lattice that can be active
@@ -58,7 +58,7 @@ class VdbWriter:
             self.grid = fine_grid(field)
             _check_size(self.grid.voxel_size)
             self.background = np.float32(HALF_WIDTH * self.grid.voxel_size)
-        for first, planes in own_planes(field):
+        for first, planes in lattice_planes(field):
             for number, plane in enumerate(planes, first):
                 self._close(plane, number)
                 for away in range(BEYOND, 0, -1) if number == 0 else ():

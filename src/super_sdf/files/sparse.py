@@ -57,7 +57,7 @@ class SparseWriter:
         if self.values is None:
             self._begin(field)
         assert self.values is not None
-        rows = field.own_rows
+        rows = slice(0, len(field.voxel_ijk))
         self._extend("voxels", field.voxel_ijk[rows])
         step = max(CHUNK // len(field.blocks), 1)
         for first in range(rows.start, rows.stop, step):
@@ -65,7 +65,7 @@ class SparseWriter:
             self.values.write(self._bytes("values", field.block_distances(some)))
         self._add_samples(field)
         if field.leaves:
-            self._extend("border_inside", find_border_inside(field, *field.planes))
+            self._extend("border_inside", find_border_inside(field))
 
     def finish(self) -> None:
         """Complete the archive with the arrays of which the length is known only now."""
@@ -99,15 +99,14 @@ class SparseWriter:
             array = np.asarray(value)
             with self._open(name, array.shape, array.dtype) as member:
                 member.write(little_endian(array))
-        self.values = self._open("values", (field.decoded_voxels, side, side, side), exact)
+        self.values = self._open("values", (len(field.voxel_ijk), side, side, side), exact)
 
     def _add_samples(self, field: FineField) -> None:
         spheres = field.spheres
         if spheres is None:
             return
-        first, last = np.searchsorted(spheres.voxel_ijk[:, 0], field.planes)
-        self._extend("sample_voxels", spheres.voxel_ijk[first:last])
-        distances = field.in_world_units(spheres.distance[first:last])
+        self._extend("sample_voxels", spheres.voxel_ijk)
+        distances = field.in_world_units(spheres.distance)
         self._extend("sample_distances", distances)
 
     def _extend(self, name: str, rows: NDArray[Any]) -> None:
@@ -207,9 +206,7 @@ class _Reader:
             voxels,
             blocks,
             parts,
-            (0, shape[0]),
             spheres=SampleSpheres(shape, samples, _in_half_voxels(distance, grid)),  # type: ignore[arg-type]
-            decoded_voxels=len(voxels),
             grid=grid,
             offset=float(self._array("offset", "f", ())),
             leaves=bool(self._array("leaves", "b", ())),

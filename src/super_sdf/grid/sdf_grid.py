@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Triple
+from ..arrays import BoolArray, Triple
 from ..errors import GridError, OptionTypeError, seen
 from ..options import AUTO, FieldKind, Inside, ReadOptions
 from .census import Census, Extremes, not_finite
@@ -77,6 +77,7 @@ class SdfGrid:
     high: float
     field: Field
     space: str | None
+    on_sample: tuple[BoolArray, ...] | None  # of each axis, if resampled: which planes are samples
 
     def __init__(
         self,
@@ -133,6 +134,7 @@ class SdfGrid:
             high=-low if positive_inside else high,
             field=field or Field(),
             space=None,
+            on_sample=None,
         )
         return grid
 

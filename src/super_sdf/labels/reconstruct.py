@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import BoolArray, IntArray
-from ..errors import GridError, OptionError, OutOfMemoryError, seen
+from ..errors import GridError, OptionError, seen
 from ..files.grids import read_array
 from ..grid.derived import REACH, extremes_of_masks, mask_planes
 from ..grid.field import NONE_EXACT, Field
@@ -27,16 +27,14 @@ from ..grid.placement import as_samples, check_kind, check_spacing, is_cubic, pl
 from ..grid.planes import NoPlanes, SampleArray, SamplePlanes, changed
 from ..grid.refusals import named
 from ..grid.sdf_grid import SdfGrid, with_fields
-from ..machine.memory import advised, give_back, held_memory, in_words
-from ..threads import Resources, allot, check_count
+from ..threads import check_count, useful_threads
 from ..surface.mesh import Mesh, join_meshes, vertex_type
 from ..network.neighbourhood import CENTRE
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import network_for
 from ..options import (ALL, MASK, OPTIONS, AxisOrder, Space, check_factor, check_label, check_labels, check_max_memory, check_network, check_progress)
-from ..pipeline import refine
+from ..pipeline import refine_band
 from ..progress import Progress, StepCounter, part_of
-from ..slabs.cutting import Slab, equal_parts, slab_bytes, slab_of
 from ..refine.nodes import VoxelIndex
 from ..refine.survey import Band, survey
 from .walls import Labels, Part, absent_parts, extract_walls, put_together
@@ -45,9 +43,6 @@ from .volumes import keep_volumes, mean_spacing
 MOST_LABELS = 1000  # more values than these are densities
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
 BAND_SHARE = 0.05  # of the time
-NO_ROWS = np.empty((0, 27), np.int32)
-# Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
-NODE_BYTES, CELL_BYTES = 14, 250
 
 Box = tuple[slice, slice, slice]
 
@@ -348,24 +343,24 @@ def label_slabs(
     factor = check_factor(factor)
     chosen = adapt(network_for(network, MASK))
     vertex_type(image.grid, factor)  # raises if not even float64 resolves the vertices
-    resources = allot(chosen.threads, check_max_memory(max_memory))
-    work = Work(image, chosen, factor, resources, _bands(image, resources))
+    check_max_memory(max_memory)
+    threads = useful_threads(chosen.threads)
+    work = Work(image, chosen, factor, threads, _bands(image, threads))
     if progress:
         progress(round(1000 * BAND_SHARE), 1000)
-    slabs = work.plan()
+    slabs = [(0, image.grid.shape[0])]
     written = np.zeros(len(image.labels) + 1, np.int64)  # vertices of each label so far
     for nth, planes in enumerate(slabs):
-        give_back()
         share = [BAND_SHARE + (1 - BAND_SHARE) * (nth + n) / len(slabs) for n in (0, 1)]
         yield from work.pieces(planes, written, part_of(progress, *share))
 
 
-def _bands(image: LabelImage, resources: Resources) -> list[Band]:
+def _bands(image: LabelImage, threads: int) -> list[Band]:
     """Return the band of each label in its box; first, that of what is beside all of them.
 
     Of that, only those voxels are decoded that two labels or more have in their bands, too.
     """
-    bands = [survey(image.mask(nth), 0.0, resources) for nth in range(len(image.labels) + 1)]
+    bands = [survey(image.mask(nth), 0.0, threads=threads) for nth in range(len(image.labels) + 1)]
     keys = [
         VoxelIndex(band.voxel_ijk + low, image.grid.shape).keys
         for band, low in zip(bands, image.corners)
@@ -382,46 +377,8 @@ class Work:
     image: LabelImage
     network: Adapter
     factor: int
-    resources: Resources
+    threads: int
     bands: list[Band]
-
-    def plan(self) -> list[tuple[int, int]]:
-        """Return the planes of each slab, of few slabs that fit in memory."""
-        count = self.image.grid.shape[0]
-        before = np.zeros(count + 1, np.int64)
-        for band, box in zip(self.bands, self.image.boxes):
-            planes = np.clip(np.arange(count + 1) - box[0].start, 0, band.shape[0])
-            before += band.voxels_before[planes]
-        bound, need = self.resources.memory, 0
-        for pieces in (*(2**n for n in range((count - 1).bit_length())), count):
-            slabs = equal_parts(before, pieces)
-            need = (held_memory() or 0) + max(map(self.bytes_of, slabs))
-            if bound is None or need <= bound:
-                return slabs
-        raise OutOfMemoryError(
-            f"factor {self.factor} on {int(before[-1]):,} voxels of {len(self.bands) - 1} labels "
-            f"needs {advised(need)} of memory, {in_words(bound or 0)} may be used; use a smaller "
-            "factor, or allow more (--max-memory)"
-        )
-
-    def bytes_of(self, planes: tuple[int, int]) -> int:
-        """Return about how much memory the work on some planes takes."""
-        most = count = 0
-        for number, band in enumerate(self.bands):
-            slab, own = self.slab(number, planes)
-            if own.start < own.stop:
-                args = slab.seen, slab.decoded, slab.planes, self.factor, self.network.memory_bytes
-                most = max(most, slab_bytes(band, *args, self.resources.threads))
-                count += own.stop - own.start
-        return most + count * (NODE_BYTES * (self.factor + 1) ** 3 + CELL_BYTES * self.factor**2)
-
-    def slab(self, number: int, planes: tuple[int, int]) -> tuple[Slab, slice]:
-        """Return what some planes need of the band of a label, and which rows are their own."""
-        start, count = self.image.boxes[number][0].start, self.bands[number].shape[0]
-        low, high = (min(max(plane - start, 0), count) for plane in planes)
-        reach = self.network.receptive_field  # all planes if it states none
-        slab = slab_of(self.bands[number], low, high, count if reach is None else reach, 1)
-        return slab, self.bands[number].rows(low, high)
 
     def pieces(
         self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
@@ -475,20 +432,16 @@ class Work:
     ) -> Iterator[tuple[int, Part]]:
         """Yield the fields of all labels that have voxels in some planes, in order; always of 0."""
         for number, band in enumerate(self.bands):
-            slab, own = self.slab(number, planes)
-            if number and own.start == own.stop:
+            voxel_ijk = band.voxel_ijk + self.image.corners[number]
+            if number and not len(voxel_ijk):
                 continue
-            around = slab.decoded
-            table = band.network_inputs(around)[1] if own.start < own.stop else NO_ROWS
-            table = table[own.start - around.start : own.stop - around.start]
-            voxel_ijk = band.voxel_ijk[own] + self.image.corners[number]
-            inside = band.patches[own, CENTRE] <= 0
-            absent = absent_parts(table.T.copy(), voxel_ijk, inside, self.image.grid.shape)
+            inside = band.patches[:, CENTRE] <= 0
+            table = band.table.T.copy()
+            absent = absent_parts(table, voxel_ijk, inside, self.image.grid.shape)
             blocks = np.full(((self.factor + 1) ** 3, len(voxel_ijk)), np.nan, np.float32)
-            if band.count_decoded(own):
+            if band.decoded.any():
                 share = number / len(self.bands), (number + 1) / len(self.bands)
                 steps = StepCounter(part_of(progress, *share), ["network", "nodes"])
-                threads = self.resources.threads
-                field = refine(band, self.network, self.factor, slab, threads, steps)
-                blocks[:, band.decoded[own]] = field.blocks[:, field.own_rows]
+                field = refine_band(band, self.network, self.factor, self.threads, steps)
+                blocks[:, band.decoded] = field.blocks
             yield number, Part(voxel_ijk, absent, blocks)

@@ -271,7 +271,7 @@ def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, Labels]:
     of_filled = np.broadcast_to(filled[:, 3].astype(np.int16), (len(field.holder), len(filled)))
     voxel_ijk = np.concatenate([field.voxel_ijk, filled[:, :3]])
     holder, order = np.concatenate([field.holder, of_filled], axis=1), np.lexsort(voxel_ijk.T[::-1])
-    outer = outer_voxels(voxel_ijk, field.shape)
+    outer = outer_voxels(voxel_ijk, np.array([(0, 0, 0), field.shape]))
     ends = [-1 if at == 0 else at + (at == field.shape[0]) for at in field.planes]
     outer = outer[(outer[:, 0] >= ends[0]) & (outer[:, 0] < ends[1])]  # others are of other planes
     beside = np.clip(outer, 0, shape - 1)

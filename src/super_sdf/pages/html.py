@@ -19,7 +19,7 @@ from typing import Any
 from .. import __version__
 from ..check import check
 from ..check.check import Certificate
-from ..convert import ConvertOptions, Kept, convert
+from ..convert import ConvertOptions, convert
 from ..files.formats import is_grid
 from ..files.output import replacing
 from ..network.decoder import Decoder
@@ -101,17 +101,16 @@ def is_page(path: Path) -> bool:
 def page_of_conversion(
     report: Mapping[str, Any],
     options: ConvertOptions,
-    kept: Kept | None = None,
+    made: Any = None,
     certificate: Certificate | None = None,
-    processes: int = 1,
 ) -> str:
     """Return the page of a conversion.
 
     ``report`` is what ``upsample --json`` prints, with ``input`` and ``output``; these are read
-    unless the conversion has ``kept`` what is in them. The mesh is checked unless there is a
+    unless what was ``made`` has ``mesh`` and ``grid``. The mesh is checked unless there is a
     certificate already.
     """
-    given = options, kept, certificate, processes
+    given = options, made, certificate
     item = item_of_files(report["output"], report["input"], *given)
     name = Path(report["output"]).name
     entry = entry_of_report(name, report, item)
@@ -154,8 +153,8 @@ def _viewed_grid(source: str, network: Decoder, options: ConvertOptions) -> tupl
     """Refine a grid; return what the page says and shows of it."""
     with TemporaryDirectory(prefix="super-sdf-") as folder:
         target = Path(folder, "mesh.ply")
-        done = convert(source, target, network, options, keep=True)
-        item = item_of_files(target, source, options, done.kept, processes=0)
+        done = convert(source, target, network, options)
+        item = item_of_files(target, source, options, done)
     report = {**done.report(), "input": source, "asked": options.digest(), "seconds": done.seconds}
     return entry_of_report(Path(source).name, report, item), item
 

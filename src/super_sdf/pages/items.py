@@ -11,12 +11,12 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..check.check import Certificate, band_of, check_kept, read_for_check
-from ..convert import ConvertOptions, Kept
+from ..check.check import Certificate, band_of, check_mesh, read_for_check
+from ..options import ConvertOptions
 from ..errors import SuperSdfError
 from ..files.output import naming, replacing
 from ..grid.cubic import cubic_grid
@@ -29,7 +29,7 @@ COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
 LISTS = ("facts", "certificate", "stages", "faults", "notes", "warnings", "remarks")
 NUMBERS = ("seconds", "residual", "thumbnail", "meshes")
-COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "slabs")
+COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "tiles")
 NOT_DRAWN = "not drawn: run the command again for its picture and its meshes"
 
 Entry = dict[str, Any]
@@ -77,42 +77,32 @@ def item_of_files(
     mesh: str | Path,
     grid: str | Path,
     options: ConvertOptions,
-    kept: Kept | None = None,
+    made: Any = None,
     certificate: Certificate | None = None,
-    processes: int = 1,
 ) -> Item:
     """Return the item of a mesh and its grid; what cannot be made is said in it.
 
-    The files are read unless the conversion has ``kept`` what is in them.
+    The files are read unless what was ``made`` has the ``mesh`` and the ``grid``. The mesh is
+    checked unless there is a certificate already.
     """
     try:
-        kept = read_for_check(mesh, grid, options, kept)
+        shown, samples = read_for_check(mesh, grid, options, made)
     except SuperSdfError as error:
         return Item(certificate={"error": str(error)}, remarks=[f"not shown: {error}"])
-    return item_of(kept, options, certificate, processes)
-
-
-def item_of(
-    kept: Kept,
-    options: ConvertOptions,
-    certificate: Certificate | None = None,
-    processes: int = 1,
-) -> Item:
-    """Return the item of a mesh and its grid, checked unless there is a certificate already."""
-    item, memory = Item(), options.max_memory
+    item, memory, band = Item(), options.max_memory, None
     try:
-        kept = replace(kept, band=band_of(kept, options))
-        certificate = certificate or check_kept(kept, options, processes=processes)
+        band = band_of(samples, options)
+        certificate = certificate or check_mesh(shown, samples, options)
         item.certificate = certificate.report()
     except SuperSdfError as error:
         item.certificate = {"error": str(error)}
-    item.show(RESULT, kept.mesh, certificate, memory)
-    if kept.band:
-        lattice, checked = cubic_grid(kept.grid, options.offset), None
-        coarse = coarse_surface(kept.band, lattice)
+    item.show(RESULT, shown, certificate, memory)
+    if band:
+        lattice, checked = cubic_grid(samples, options.offset), None
+        coarse = coarse_surface(band, lattice)
         if certificate and len(coarse.faces):
-            checked = check_kept(replace(kept, mesh=coarse), options, intersections=False)
-        title = COARSE + (", made equally spaced" if lattice.shape != kept.grid.shape else "")
+            checked = check_mesh(coarse, samples, options, intersections=False)
+        title = COARSE + (", made equally spaced" if lattice.shape != samples.shape else "")
         item.show(title, coarse, checked, memory)
     return item
 

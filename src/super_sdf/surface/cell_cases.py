@@ -94,6 +94,7 @@ class LoopTable(NamedTuple):
 
     times: NDArray[np.int64]  # (C,), how many loops a case has
     first: NDArray[np.int64]  # (C,), which is its first
+    nth: NDArray[np.int64]  # (L,), its place among the loops of its case
     sides: NDArray[np.int64]  # (L,), how many edges a loop has
     edges: NDArray[np.int64]  # (L, S), in order, counter-clockwise from outside; -1 after the last
     triangles: NDArray[np.int64]  # (L, T, 3), places in the loop; there are ``sides - 2``
@@ -113,7 +114,9 @@ def loop_table() -> LoopTable:
         place = {edge: nth for nth, edge in enumerate(loop)}
         cut = [[place[edge] for edge in triangle] for triangle in triangulate(loop)]
         triangles[row, : len(cut)] = cut
-    return LoopTable(count, np.cumsum(count) - count, sides, edges, triangles)
+    first = np.cumsum(count) - count
+    nth = np.arange(len(flat)) - np.repeat(first, count)
+    return LoopTable(count, first, nth, sides, edges, triangles)
 
 
 def _loops(inside: int, joined: int) -> Iterator[tuple[int, ...]]:

@@ -18,16 +18,35 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import BoolArray
-from ...threads import map_chunks
+from ...arrays import BoolArray, IntArray
 from ...refine.field import FineField, SampleSpheres
-from .patches import (Index, Numbers, Patches, Placed, Vectors, dilate, dot, length, unfolded, unit)
-from .planes import Planes, settle_planes
+from ...threads import map_chunks
+from ..cell_cases import loop_table
+from ..marching import CAP_HEIGHT, Crossings
+from ..mesh import CLEARANCE
+from .folds import REACH, without_folds
+from .patches import (
+    Index,
+    Numbers,
+    Patches,
+    Placed,
+    Vectors,
+    beside,
+    dilate,
+    dot,
+    find_patches,
+    length,
+    triangles_of,
+    unfolded,
+    unit,
+    voxels_near_kinks,
+)
+from .planes import ROUNDS, Planes, planes_at_crossings, settle_planes
 from .wedges import Nearby, Wedges, contact_of, find_spheres, lean, wedges_of
 
 SHARP_COSINE = 0.85  # normals of a patch that differ by more, 32 degrees, may make a feature
@@ -45,6 +64,10 @@ OF_PATCH = 4  # numbers of evidence that are not averaged along the chain
 LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and normals say nothing
 TEMPORARIES = 1000  # numbers per patch in the search for its spheres among 125 samples
 TOUCHED_ALONG = 1.0  # coarse spacings along an edge in which spheres are counted
+# Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
+# is the fan beside.
+REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + REACH + 5
+REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,6 +106,71 @@ class Candidates:
     def share(self) -> Numbers:
         """Return how far the vertex of each goes from the middle to the edge, (f,), 0 to 1."""
         return np.where(self.spheres < LEAST_SPHERES, 0, RULE.share(self.evidence))
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """The vertices and triangles in voxels that may hold an edge, and what is left of the others.
+
+    Vertices have the numbers of their edges among the own edges of all crossings, then those of
+    features, in their order.
+    """
+
+    used: Index  # (m,), own edges of the crossings ...
+    position: Vectors  # (m, 3), ... and the positions of their vertices
+    peak: Vectors  # (f, 3), the positions of the features' vertices
+    cell_ijk: Index  # (f, 3), the low nodes of their cells
+    nth: Index  # (f,), which patch of the cell has the feature
+    faces: IntArray  # (t, 3), the triangles of all these voxels
+    plain: Crossings  # the crossings, with the cells of the other voxels only
+
+
+def find_features(
+    field: FineField, crossings: Crossings, border: IntArray, threads: int = 1
+) -> Features | None:
+    """Look for edges and corners in voxels where the field has kinks, and beside them."""
+    kinked = voxels_near_kinks(field, threads)
+    voxels = beside(field, kinked, -(-(RINGS + 1) // field.factor))
+    patches, used = find_patches(field, crossings, voxels)
+    if not len(used):
+        return None
+    own = planes_at_crossings(field, crossings, used, border, threads)
+    placed = place_features(patches, own, kinked, field)
+    box = field.factor * border.astype(np.float64)
+    position = _kept_in_grid(placed.position, own.point, box)
+    peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, box)
+    placed = replace(placed, position=position, peak=peak)
+    placed = without_folds(patches, placed, own.point)
+    _, corners = triangles_of(patches, placed)
+    count, features = len(crossings.own_row), len(placed.peak)
+    numbers = np.concatenate([used, np.arange(count, count + features)]).astype(np.int32)
+    plain = ~voxels[crossings.cell_row]
+    return Features(
+        used,
+        placed.position,
+        placed.peak,
+        patches.low[placed.feature].astype(np.int64),
+        loop_table().nth[patches.loop[placed.feature]],
+        numbers[corners],
+        replace(
+            crossings,
+            cell_row=crossings.cell_row[plain],
+            cell=crossings.cell[plain],
+            case=crossings.case[plain],
+        ),
+    )
+
+
+def _kept_in_grid(position: Vectors, start: Vectors, box: Vectors) -> Vectors:
+    """Return positions (n, 3) that do not leave the grid, nor its border if they started there.
+
+    An open surface ends on the border, and a cap is flat there. ``start``, (n, 3), is where a
+    vertex was on its lattice edge, or the middle of its cell; ``box``, (2, 3), are the corners of
+    the grid.
+    """
+    at_border = (start <= box[0]) | (start >= box[1])
+    flat = np.clip(start, box[0] - CAP_HEIGHT, box[1] + CAP_HEIGHT)
+    return np.where(at_border, flat, np.clip(position, box[0] + CLEARANCE, box[1] - CLEARANCE))
 
 
 def place_features(patches: Patches, own: Planes, kinked: BoolArray, field: FineField) -> Placed:

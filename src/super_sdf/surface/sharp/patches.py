@@ -72,15 +72,15 @@ def sums_at(place: Index, vectors: Vectors, count: int) -> Vectors:
     return np.stack([np.bincount(place, component, count) for component in vectors.T], 1)
 
 
-def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolArray:
-    """Return the voxels, (D,), of some rows in which slopes change at a node as at an edge."""
-    near = np.zeros(len(field.voxel_ijk), bool)
-
-    def look(some: slice) -> None:
-        here = slice(rows.start + some.start, rows.start + some.stop)
-        near[here] = _largest_bends(field, here) > BEND
-
-    map_chunks(look, rows.stop - rows.start, TEMPORARIES * len(field.blocks), threads)
+def voxels_near_kinks(field: FineField, threads: int = 1) -> BoolArray:
+    """Return the voxels, (D,), in which slopes change at a node as at an edge."""
+    bends = map_chunks(
+        lambda rows: _largest_bends(field, rows),
+        len(field.voxel_ijk),
+        TEMPORARIES * len(field.blocks),
+        threads,
+    )
+    near: BoolArray = np.concatenate([np.empty(0, np.float32), *bends]) > BEND
     return near
 
 

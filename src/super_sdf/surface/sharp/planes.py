@@ -63,21 +63,24 @@ class Planes:
         return dot(self.point, self.normal)
 
 
-def planes_at_crossings(field: FineField, crossings: Crossings, chosen: Index) -> Planes:
+def planes_at_crossings(
+    field: FineField, crossings: Crossings, chosen: Index, border: IntArray, threads: int = 1
+) -> Planes:
     """Return the planes on chosen ones of the crossed edges that voxels own, by the field alone."""
     parts = map_chunks(
         lambda some: _planes_of_chunk(
-            field, crossings.own_row[chosen[some]], crossings.own_edge[chosen[some]]
+            field, crossings.own_row[chosen[some]], crossings.own_edge[chosen[some]], border
         ),
         len(chosen),
         TEMPORARIES,
+        threads,
     )
     empty = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
     return Planes(*(np.concatenate(arrays) for arrays in zip(empty, *parts)))
 
 
 def _planes_of_chunk(
-    field: FineField, row: IntArray, edge: NDArray[np.int16]
+    field: FineField, row: IntArray, edge: NDArray[np.int16], border: IntArray
 ) -> tuple[Vectors, Vectors, Numbers]:
     """Return the arrays of ``Planes`` for some edges of voxels' blocks.
 
@@ -85,7 +88,7 @@ def _planes_of_chunk(
     """
     axis, node = np.divmod(edge.astype(np.int64), len(field.blocks))
     low_ijk = block_ijk(field.factor)[node]
-    position = lattice_positions(field, row, edge).T
+    position = lattice_positions(field, row, edge, border).T
     start = (field.factor * field.voxel_ijk[row] + low_ijk)[np.arange(len(row)), axis]
     share = np.clip(position[np.arange(len(row)), axis] - start, 0, 1)
     low, high = (_gradient(field, row, end) for end in (node, edge_ends(field.factor)[edge]))
