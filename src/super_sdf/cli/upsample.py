@@ -50,7 +50,7 @@ NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh."""
     options, watch = common.chosen_options(given), Stopwatch()
-    common.check_names(given["names"], options.labels)
+    
     if options.labels is None:
         check_outputs(source, target, options, given)
     from ..network.network import digest_of_model, load_network
