@@ -18,7 +18,6 @@ from super_sdf import Mesh, load_network, make_grid, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.labels.files import MOST_FILES, label_paths
 from super_sdf.labels.reconstruct import Work, reconstruct_labels
-from super_sdf.slabs.cutting import equal_parts
 
 
 @pytest.fixture(scope="module")
@@ -217,19 +216,6 @@ def test_wrong_labels_and_values_that_are_none_are_one_line(message):
     with pytest.raises(OptionError if message.startswith("labels ") else GridError) as caught:
         reconstruct_labels(*UNFIT[message], trilinear)
     assert str(caught.value) == message
-
-
-def test_less_memory_makes_more_slabs_and_too_little_is_an_error(bare_plan, monkeypatch):
-    cuts = []
-    plan = Work.plan
-    monkeypatch.setattr(Work, "plan", lambda work: cuts.append(plan(work)) or cuts[-1])
-    monkeypatch.setattr("super_sdf.labels.held_memory", lambda: 10**8)
-    labels = IMAGES["no ground"]
-    for bound in (10**9, 112 * 10**6):
-        reconstruct_labels(labels, network=trilinear, spacing=1, max_memory=bound)
-    assert len(cuts[0]) == 1 < len(cuts[1])
-    with pytest.raises(OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels of 8 labels needs "):
-        reconstruct_labels(labels, network=trilinear, spacing=1, max_memory=105 * 10**6)
 
 
 @pytest.fixture
