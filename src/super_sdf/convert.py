@@ -23,7 +23,6 @@ from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid, describe_place
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP, Options
-from .options import Options as ConvertOptions  # noqa: F401
 from .pipeline import mesh_grid
 from .progress import Progress, Stopwatch, part_of, share_of
 from .refine.field import lattice_shape

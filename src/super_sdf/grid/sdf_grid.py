@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import BoolArray, Triple
 from ..errors import GridError, OptionTypeError, seen
-from ..options import AUTO, FieldKind, Inside, ReadOptions
+from ..options import AUTO, FieldKind, Inside, Options
 from .census import Census, Extremes, not_finite
 from .distances import check_negative_inside, choose_spacing
 from .field import Field
@@ -270,7 +270,7 @@ def make_grid(
     OptionError
         If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
-    wanted = ReadOptions(inside=inside, field=field, label=label, level=level, scale=scale)
+    wanted = Options(inside=inside, field=field, label=label, level=level, scale=scale)
     given = placed(values, spacing, origin)
     taken, notes = interpret(as_samples(given.values), wanted, given.spacing)
     origin = given.origin
