@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 from super_sdf import Mesh, write_mesh
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import SuperSdfError
-from super_sdf.machine.memory import forget_peak, held_memory
+from super_sdf.threads import forget_peak, held_memory
 from super_sdf.network.decoder import Decoder
 
 from .measuring import network_of

@@ -17,7 +17,7 @@ import super_sdf
 from super_sdf.check.surface import count_components
 from super_sdf.errors import SuperSdfError
 from super_sdf.files.regular import check_regular_file
-from super_sdf.machine.memory import forget_peak, held_memory
+from super_sdf.threads import forget_peak, held_memory
 from super_sdf.surface.mesh import Mesh
 from super_sdf.network.decoder import Decoder
 from super_sdf.network.network import (KIND_MODELS, find_model, float32_name, load_network, shipped_models)

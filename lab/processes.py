@@ -16,7 +16,7 @@ import numpy as np
 
 from super_sdf.errors import SuperSdfError
 from super_sdf.threads import count_cores
-from super_sdf.machine.system import described, processor_name
+from super_sdf.threads import described, processor_name
 from super_sdf.truth.sampling import sample_solid, unit_layout
 
 from .forms import torus

@@ -21,7 +21,7 @@ from super_sdf.errors import FileError, OptionError, seen
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.files.regular import check_regular_file
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
-from super_sdf.machine.memory import check_fits
+from super_sdf.threads import check_fits
 from super_sdf.surface.mesh import Mesh
 from super_sdf.options import check_factor
 from super_sdf.refine.band import find_band, rescale

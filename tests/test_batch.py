@@ -17,6 +17,7 @@ from super_sdf.batch import job as batch_job
 from super_sdf.batch.job import Result, Settings
 from super_sdf.batch.ledger import fingerprint, is_unchanged
 from super_sdf.batch.plan import Batch
+from super_sdf.cli.batch_report import describe_progress, duration
 from super_sdf.convert import convert
 from super_sdf.files.regular import files_of
 from super_sdf.network.network import shipped_models
@@ -283,3 +284,14 @@ def test_options_are_checked_before_the_work(run_batch, command):
     Path("bad.onnx").write_text("x")
     code, _, err = command("batch", "in", "--out", "out", "--jobs", 2, "--model", "bad.onnx")
     assert code == 1 and err.startswith("Error: bad.onnx is no ONNX file that onnxruntime can run")
+
+
+def test_progress_has_rate_and_time_left(run_batch, monkeypatch):
+    result = Result(None, {})
+    batch = Batch(Settings(Path("out")), done=[result] * 9, failed=[result], seconds=5.0)
+    batch.work, batch.work_done = 400.0, 100.0
+    assert describe_progress(batch, 30) == "10/30, 2 files/s, 15 s left, 1 failed"
+    assert [duration(s) for s in (0.04, 59, 200, 7300)] == ["0.0 s", "59 s", "3 min", "2 h 2 min"]
+    monkeypatch.setattr("super_sdf.cli.batch_report.sys.stderr.isatty", lambda: True)
+    _, _, err = run_batch("in")
+    assert err.startswith("0/4\r") and "\r1/4, " in err and "\r\x1b[KFailed: in/bad" in err

@@ -20,7 +20,7 @@ from super_sdf.batch.inputs import find_jobs
 from super_sdf.batch.job import Settings
 from super_sdf.batch.run import Queue, Run, choose_workers, useful_workers
 from super_sdf.convert import ConvertOptions
-from super_sdf.machine.memory import held_memory
+from super_sdf.threads import held_memory
 from super_sdf.batch.pool import Death, Pool
 from super_sdf.threads import Resources, allot_each, count_cores
 
@@ -194,8 +194,8 @@ def test_fail_fast_begins_nothing_more_in_several_processes():
 
 
 def test_the_bound_is_shared_by_those_that_run(monkeypatch):
-    monkeypatch.setattr("super_sdf.machine.resources.memory_bound", lambda asked: asked)
-    monkeypatch.setattr("super_sdf.machine.resources.held_memory", lambda: 10**8)
+    monkeypatch.setattr("super_sdf.threads.memory_bound", lambda asked: asked)
+    monkeypatch.setattr("super_sdf.threads.held_memory", lambda: 10**8)
     assert allot_each(3, 1, 10**9) == Resources(1, 3 * 10**8)
     Path("out").mkdir()
     run = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, Settings(Path("out")))

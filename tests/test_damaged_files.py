@@ -25,7 +25,7 @@ from super_sdf.errors import SuperSdfError
 from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
 from super_sdf.files.readers.raw_files import TYPES
-from super_sdf.machine.memory import forget_peak, held_memory
+from super_sdf.threads import forget_peak, held_memory
 
 AFFINE = affine_of(np.eye(3))
 VALUES = sampled(AFFINE)
@@ -81,7 +81,7 @@ ENDS_OF_TEXT = {".mha": b"= LOCAL\n", ".nrrd": b"\n\n", ".vti": b'<AppendedData 
 @pytest.mark.parametrize("name", CHECKED)
 def test_no_flipped_bit_in_checked_data_passes(name, monkeypatch):
     """Of 60 anywhere behind the text of a header, for which no format has a checksum."""
-    monkeypatch.setattr("super_sdf.machine.memory.left_memory", lambda: None)  # it takes a while
+    monkeypatch.setattr("super_sdf.threads.left_memory", lambda: None)  # it takes a while
     CHECKED[name](name)
     whole, end = Path(name).read_bytes(), ENDS_OF_TEXT.get(Path(name).suffix, b"")
     first = whole.index(end) + len(end)

@@ -648,7 +648,7 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatc
     names = [*(name for name in SUFFIXES if find_format(name).extra), "series"]
     for name in names:
         save_any(name)
-    monkeypatch.setattr("super_sdf.machine.extras.find_spec", lambda module: None)
+    monkeypatch.setattr("super_sdf.errors.find_spec", lambda module: None)
     for name in names:
         format_, said = find_format(name), said_of(name)
         wanted = f"pip install -e '.[{format_.extra}]' in a clone of super-sdf"

@@ -20,7 +20,7 @@ from super_sdf.labels import reconstruct as whole_run
 from super_sdf.labels.files import MOST_FILES, label_paths
 from super_sdf.labels.image import find_image
 from super_sdf.labels.reconstruct import reconstruct_labels
-from super_sdf.machine.memory import held_memory
+from super_sdf.threads import held_memory
 
 
 @pytest.fixture(scope="module")

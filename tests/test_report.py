@@ -111,7 +111,7 @@ def test_a_page_is_replaced_with_force_only_and_replaces_no_input(command, folde
 @pytest.mark.parametrize("arguments", [UPSAMPLE, ("batch", "a.npy", "--out", "out")])
 def test_a_missing_extra_is_said_before_the_work(command, folder, monkeypatch, arguments):
     found = {"pyfqmr": None}
-    monkeypatch.setattr("super_sdf.machine.extras.find_spec", lambda name: found.get(name, 1))
+    monkeypatch.setattr("super_sdf.errors.find_spec", lambda name: found.get(name, 1))
     said = "--report needs pyfqmr: pip install -e '.[report]' in a clone of super-sdf"
     assert command(*arguments, "--report", "a.html") == (1, "", f"Error: {said}\n")
     assert os.listdir() == ["a.npy"]
@@ -257,6 +257,6 @@ def test_without_a_browser_that_is_said_and_errors_leave_nothing(command, opened
     note = "Note: no browser can be started here: open that address in yours"
     assert code == 0 and re.fullmatch(rf"file://\S+/view.html\n{note}\n", err)
     found = {"pyfqmr": None}
-    monkeypatch.setattr("super_sdf.machine.extras.find_spec", lambda name: found.get(name, 1))
+    monkeypatch.setattr("super_sdf.errors.find_spec", lambda name: found.get(name, 1))
     said = "view needs pyfqmr: pip install -e '.[report]' in a clone of super-sdf"
     assert command("view", "a.npy") == (1, "", f"Error: {said}\n") and not opened

@@ -27,8 +27,8 @@ from distributed import Client, KilledWorker, LocalCluster, get_worker, wait
 from .. import __version__
 from ..errors import ClusterError, SuperSdfError
 from ..files.formats import find_format, split_member
-from ..machine.extras import EXTRAS, missing_modules
-from ..machine.memory import reuse_freed
+from ..errors import EXTRAS, missing_modules
+from ..threads import reuse_freed
 from ..network.network import find_model, shipped_models
 from ..threads import allot_each, count_cores
 from .job import Job, Settings, convert_job

@@ -26,7 +26,7 @@ from typing import Any
 
 from .. import __version__
 from ..files.output import naming
-from ..machine.memory import free_memory
+from ..threads import free_memory
 from ..network.device import available_devices
 from ..network.network import find_model
 from ..threads import Resources, allot_each, count_cores

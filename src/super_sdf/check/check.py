@@ -23,7 +23,7 @@ from ..files.output import check_free
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import give_back, held_memory, in_words, memory_bound
+from ..threads import give_back, held_memory, in_words, memory_bound
 from ..threads import useful_threads
 from ..surface.mesh import Mesh
 from ..options import LENGTHS, MASK, ConvertOptions, check_distance, check_max_memory

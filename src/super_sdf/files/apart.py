@@ -21,7 +21,7 @@ from typing import IO, Any
 import numpy as np
 
 from ..errors import FileError, OutOfMemoryError, SuperSdfError
-from ..machine.memory import held_memory, in_words, memory_bound
+from ..threads import held_memory, in_words, memory_bound
 from .volume import Request, Volume
 
 STEP = 0.02  # seconds between two looks at the memory

@@ -11,7 +11,7 @@ from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from ..errors import OptionError
-from ..machine.extras import check_modules
+from ..errors import check_modules
 from ..options import MESH_FORMATS, OPTIONS
 
 # What people give by mistake: surfaces, which have to be sampled first.

@@ -15,9 +15,9 @@ import numpy as np
 
 from ..errors import FileError, OptionError, SuperSdfError
 from ..grid.placement import STRAIGHT
-from ..grid.planes import InputFile, check_planes
+from ..grid.planes import InputFile
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
-from ..machine.memory import ROOM_SHARE, held_memory, memory_bound
+from ..threads import held_memory, memory_bound
 from ..options import AxisOrder, ReadOptions, Space, Values, check_path
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .numpy_files import NUMPY_READERS
@@ -29,6 +29,7 @@ from .volume import PLACE, Request, Volume, find_placement, place_in_world
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
+ROOM_SHARE = 0.25  # of what a bound leaves, the share that an unpacked array may take
 UNKNOWN_ROOM = 1 << 28  # bytes that an unpacked array may take if the memory left is unknown
 
 
@@ -109,7 +110,6 @@ def read_array(
         if given["direction"] is not None:
             volume = volume.turned(order)
         arrays = take(volume, str(path), room, given, left)
-    check_planes(arrays["values"], bound)
     return arrays | {"notes": volume.notes, "space": volume.space}
 
 

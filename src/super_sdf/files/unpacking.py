@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, OutOfMemoryError
 from ..grid.placement import check_kind
 from ..grid.planes import InputFile, PlaneFile, SampleArray
-from ..machine.memory import in_words, is_in_memory
+from ..threads import in_words
 from .volume import Box, Placement, Volume, find_placement, in_words_of, place_in_world
 
 PIECE = 1 << 23  # bytes at a time
@@ -188,7 +188,7 @@ def scratch_folder() -> str:
 def _scratch_file(size: int, what: str) -> FileIO:
     """Return an empty unnamed file with room for an array, on a disk: memory would count."""
     folder = scratch_folder()
-    if is_in_memory(folder):
+    if folder == "/dev/shm":
         raise OutOfMemoryError(
             f"{what}, is too large to unpack into memory, and {folder} is in memory, "
             "too: set TMPDIR to a folder on a disk, or allow more (--max-memory)"

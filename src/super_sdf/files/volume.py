@@ -22,7 +22,7 @@ from ..arrays import Triple
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError
 from ..grid.placement import Direction, as_direction, check_direction
 from ..grid.planes import SampleArray
-from ..machine.memory import in_words
+from ..threads import in_words
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
 MOST_NAMED = 10  # arrays that an error lists

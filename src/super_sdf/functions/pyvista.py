@@ -19,7 +19,7 @@ import pyvista
 from ..errors import FileError
 from ..files.grids import grid_from_image
 from ..grid.sdf_grid import SdfGrid
-from ..machine.extras import check_modules, how_to_install
+from ..errors import check_modules, how_to_install
 from ..network.decoder import Decoder
 from ..options import DEFAULT_MESHER, ConvertOptions, MesherName, Quality, Values
 from ..pipeline import reconstruct

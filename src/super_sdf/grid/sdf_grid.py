@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from .distances import check_negative_inside, choose_spacing
 from .field import Field
 from .interpret import interpret
 from .placement import (STRAIGHT, Direction, as_samples, as_triple, check_direction, check_kind, check_spacing, in_rows, is_cubic, placed)
-from .planes import NoPlanes, SampleArray, SamplePlanes
+from .planes import Index, SampleArray, SamplePlanes, cropped
 
 MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
@@ -316,9 +316,24 @@ def with_fields(grid: SdfGrid, **fields: Any) -> SdfGrid:
     return other
 
 
-def without_samples(grid: SdfGrid) -> SdfGrid:
-    """Return a grid that knows all but its samples: their shape and type, place and field."""
-    return with_fields(grid, samples=NoPlanes(grid.shape, grid.samples.dtype))
+def crop(grid: SdfGrid, low: Index, high: Index) -> SdfGrid:
+    """Return the samples from index ``low`` (3,) to before ``high`` as a grid at their place.
+
+    What the values are stays decided, and so do their extremes.
+    """
+    field = grid.field
+    smooth, unseen = (
+        None if array is None else cropped(array, low, high)
+        for array in (field.smooth, field.unseen)
+    )
+    known = grid.on_sample
+    return with_fields(
+        grid,
+        samples=cropped(grid.samples, low, high),
+        origin=as_triple(grid.to_world(low), "origin"),
+        field=replace(field, smooth=smooth, unseen=unseen),
+        on_sample=known and tuple(axis[a:b] for axis, a, b in zip(known, low, high)),
+    )
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:

@@ -10,14 +10,14 @@ from typing import Any
 
 from ..convert import describe_place
 from ..errors import MeshError, OptionError, seen
+from ..files.mesh_writers import World
 from ..files.meshes import (
-    World,
     check_format_holds,
     check_mesh_suffix,
     check_target,
     format_of,
     local_origin_note,
-    write_together,
+    write_meshes,
 )
 from ..files.output import check_apart
 from ..files.regular import files_of
@@ -102,7 +102,7 @@ def convert_labels(
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
-    about = check_format_holds(target, grid, options.factor)
+    check_format_holds(target, grid, options.factor)
     watch.lap("read")
     meshes = label_meshes(image, network, options.factor, max_memory=bound, progress=progress)
     torn = [label for label, mesh in zip(called, meshes) if mesh.open_edges()]
@@ -114,24 +114,24 @@ def convert_labels(
         made = zip(called.values(), meshes, volumes)
         off = volume_notes({entry.name: (mesh.volume(), volume) for entry, mesh, volume in made})
     watch.lap("mesh")
-    files: dict[Path, dict[str, list[Mesh]]] = {path: {} for path in paths}
+    files: dict[Path, dict[str, Mesh]] = {path: {} for path in paths}
     rows = []
     for path, (label, entry), mesh, volume in zip(paths, called.items(), meshes, volumes):
-        files[path][entry.name] = [mesh]
+        files[path][entry.name] = mesh
         row = {"label": label, "name": entry.name, "output": str(path)}
         row |= {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
         row |= {"volume": mesh.volume(), "components": mesh.components()[0], "closed": True}
         rows.append({**row, "sample_volume": volume})
     colours = {entry.name: entry.colour for entry in called.values() if entry.colour}
     world = World(options.unit, grid.space, colours)
-    write_together(files, force=force, world=world, about=about)
+    write_meshes(files, force=force, world=world)
     watch.lap("write")
     missing = names_of(image.missing(wanted), known)
     return LabelConversion(
         grid,
         rows,
         [{"label": label, "name": entry.name} for label, entry in missing.items()],
-        (*local_origin_note(target, about), *off),
+        (*local_origin_note(target, meshes), *off),
         watch.seconds,
     )
 

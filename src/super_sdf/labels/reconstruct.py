@@ -25,7 +25,6 @@ from ..errors import OutOfMemoryError
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
 from ..grid.interpret import labelled
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import advised, held_memory, in_words, memory_bound
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import network_for
 from ..options import (
@@ -45,7 +44,7 @@ from ..refine.field import FineField
 from ..refine.nodes import SHARING, VoxelIndex, part_of_node
 from ..refine.survey import survey
 from ..surface.mesh import Mesh, vertex_type
-from ..threads import check_count, useful_threads
+from ..threads import check_count, held_memory, in_words, memory_bound, useful_threads
 from .image import LabelImage, find_image, in_order
 from .volumes import keep_volumes, mean_spacing
 from .walls import Labelled, Walls, extract_walls, join_walls
@@ -188,7 +187,7 @@ def plan_ranges(
             return ranges
     raise OutOfMemoryError(
         f"factor {factor} on {int(before[-1]):,} voxels at the walls of {len(image.labels)} labels "
-        f"needs {advised(need)} of memory, {in_words(bound)} may be used; use a smaller factor, or "
+        f"needs {in_words(need)} of memory, {in_words(bound)} may be used; use a smaller factor, or "
         "allow more (--max-memory)"
     )
 

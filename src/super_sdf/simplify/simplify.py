@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import OutOfMemoryError
-from ..machine.extras import check_modules
-from ..machine.memory import give_back, held_memory, in_words, memory_bound
+from ..errors import check_modules
+from ..threads import give_back, held_memory, in_words, memory_bound
 from ..surface.mesh import Mesh, check_mesh
 from ..options import check_goal, check_max_memory
 from ..progress import ShareCallback

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, MeshError, OutOfMemoryError, SuperSdfError
 from ..files.regular import check_regular_file
-from ..machine.memory import held_memory, in_words, memory_bound
+from ..threads import held_memory, in_words, memory_bound
 from ..surface.mesh import Mesh
 from ..surface.topology import row_keys
 

@@ -18,7 +18,7 @@ from scipy import ndimage
 from ..arrays import FloatArray
 from ..errors import MeshError, OptionError, seen
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import check_fits
+from ..threads import check_fits
 from ..surface.mesh import Mesh
 from .solid import Points, Solid
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ...errors import FileError, GridError, seen
 from ...grid.planes import InputFile
-from ...machine.extras import check_modules
+from ...errors import check_modules
 from ..streams import Deflate, Read, TextValues, Unpacker, bytes_from, next_planes
 from ..volume import Planes, Request, Volume, in_words_of
 from .vtk import ImageLattice
