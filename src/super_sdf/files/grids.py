@@ -21,7 +21,7 @@ from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
 from ..grid.placement import STRAIGHT, check_kind
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
-from ..options import AxisOrder, ReadOptions, Space, Values, check_path
+from ..options import AxisOrder, Options, Space, Values, check_path
 from ..threads import held_memory, memory_bound
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .output import check_free, replacing
@@ -95,7 +95,7 @@ def read_grid(
         If the suffix, ``axes``, ``inside`` or ``field`` is unknown; if a direction is given, but
         files of the format state it; if a space is given, but the file states none.
     """
-    ReadOptions(space=space, **values)  # checks them
+    Options(space=space, **values)  # checks them
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arrays = read_array(path, given, axes, space, max_memory)
     notes, space = arrays.pop("notes"), arrays.pop("space")
@@ -263,7 +263,7 @@ def grid_from_image(
     OptionError
         If ``inside`` or ``field`` is unknown, or ``image`` is no image data (``OptionTypeError``).
     """
-    ReadOptions(**values)  # checks them
+    Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image
 
     volume = volume_of_image(image, scalars)
