@@ -113,9 +113,7 @@ def _files_below(folder: Path, unread: Unread) -> Iterator[Path]:
         yield from (Path(path, name) for name in (*stores, *names))
 
 
-def _read_list(
-    path: Path, suffix: str, options: Options, names: Names | None
-) -> Iterator[Job]:
+def _read_list(path: Path, suffix: str, options: Options, names: Names | None) -> Iterator[Job]:
     """Yield a job for each line of a list; OptionError with the number of one that is not valid.
 
     Blank lines, and in ``.txt`` lines that start with ``#``, are skipped. The text is UTF-8; a byte

@@ -140,12 +140,13 @@ def _make_labels(job: Job, settings: Settings, stage: Path, network: Network) ->
     """Convert the labels of a file; return what its row says of their meshes."""
     target, names = stage / job.mesh, settings.names
     made = convert_labels(job.source, target, network, job.options, names=names, force=True)
-    for row in made["labels"]:
-        row["output"] = Path(row["output"]).relative_to(stage).as_posix()
-    files = {row["output"]: fingerprint(stage / row["output"]) for row in made["labels"]}
+    labels = [
+        {**row, "output": Path(row["output"]).relative_to(stage).as_posix()} for row in made.labels
+    ]
+    files = {row["output"]: fingerprint(stage / row["output"]) for row in labels}
     output = files if job.has_label_files else files[job.mesh]
-    return {"output": output, **made, "closed": all(r["closed"] for r in made["labels"]),
-            "warnings": []}  # fmt: skip
+    facts = {"labels": labels, "closed": made.closed, "warnings": []}
+    return {"output": output, **made.report(), **facts}
 
 
 def _reason(error: Exception) -> str:

@@ -11,7 +11,20 @@ from urllib.parse import quote
 
 from ..errors import SuperSdfError
 from ..pages.html import make_page, write_page
-from ..pages.items import (Entry, Item, entry_of, entry_of_report, find_item, item_name, item_of_files, item_path, items_folder, keep_item, read_meshes, remove_items)
+from ..pages.items import (
+    Entry,
+    Item,
+    entry_of,
+    entry_of_report,
+    find_item,
+    item_name,
+    item_of_files,
+    item_path,
+    items_folder,
+    keep_item,
+    read_meshes,
+    remove_items,
+)
 from .job import Job
 from .record import is_unchanged
 from .run import Batch

@@ -26,10 +26,9 @@ from typing import Any
 
 from .. import __version__
 from ..files.output import naming
-from ..threads import free_memory
 from ..network.device import available_devices
 from ..network.network import find_model
-from ..threads import Resources, allot_each, count_cores
+from ..threads import Resources, allot_each, count_cores, free_memory
 from .job import Job, Result, Settings, convert_job
 from .pool import Death, work_in_processes
 from .record import STAGE_NAME, Record, Row, file_state, fingerprint, is_unchanged, outputs_of

@@ -23,13 +23,12 @@ from ..files.output import check_free
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
-from ..threads import give_back, held_memory, in_words, memory_bound
-from ..threads import useful_threads
-from ..surface.mesh import Mesh
+from ..labels.volumes import volume_of_samples
 from ..options import LENGTHS, MASK, Options, check_distance, check_max_memory
 from ..refine.survey import Band, no_surface, survey
+from ..surface.mesh import Mesh
+from ..threads import give_back, held_memory, in_words, memory_bound, useful_threads
 from ..truth.mesh_files import merged, read_mesh
-from ..labels.volumes import volume_of_samples
 from .samples import (
     NOTICEABLE,
     REACH,

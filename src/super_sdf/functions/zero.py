@@ -23,8 +23,8 @@ from .function import DistanceFunction
 from ..grid.sdf_grid import SdfGrid
 from ..surface.mesh import Mesh
 from ..options import EXACT
-from ..surface.sharp.patches import Numbers, Vectors, cross, dot, length, sums_at, unit
-from ..surface.sharp.triangle_pairs import intersecting, overlapping_boxes
+from ..arrays import Numbers, Vectors, cross, dot, length, sums_at, unit
+from ..surface.sharp.folds import intersecting, overlapping_boxes
 
 Value: TypeAlias = Callable[[Vectors], Numbers]
 

@@ -11,12 +11,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import OutOfMemoryError
-from ..errors import check_modules
-from ..threads import give_back, held_memory, in_words, memory_bound
-from ..surface.mesh import Mesh, check_mesh
+from ..errors import OutOfMemoryError, check_modules
 from ..options import check_goal, check_max_memory
 from ..progress import ShareCallback
+from ..surface.mesh import Mesh, check_mesh
+from ..threads import give_back, held_memory, in_words, memory_bound
 
 # Peak of memory beside the mesh, measured on meshes of 120,000 to 760,000 triangles: 680 to 1,230,
 # with the libraries that it loads.
