@@ -124,12 +124,12 @@ def _make_labels(job: Job, settings: Settings, stage: Path, network: Network) ->
     made = convert_labels(job.source, target, network, job.options, names=names, force=True)
     labels = [
         {**row, "output": Path(row["output"]).relative_to(stage).as_posix()}
-        for row in made["labels"]
+        for row in made.labels
     ]
     files = {row["output"]: _fingerprint_of(stage / row["output"]) for row in labels}
     output = files if job.has_label_files else files[job.mesh]
-    closed = all(row["closed"] for row in labels)
-    return {"output": output, **made, "labels": labels, "closed": closed, "warnings": []}
+    facts = {"labels": labels, "closed": made.closed, "warnings": []}
+    return {"output": output, **made.report(), **facts}
 
 
 def _fingerprint_of(path: Path) -> Fingerprint:

@@ -173,7 +173,7 @@ def upsample_labels(
     watch: Stopwatch,
 ) -> list[str]:
     """Convert the labels of an image to meshes; return what to print."""
-    from ..labels.files import check_options, convert_labels, missing_note
+    from ..labels.files import check_options, convert_labels
     from ..labels.names import read_names
 
     check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
@@ -182,9 +182,9 @@ def upsample_labels(
         made = convert_labels(
             source, target, network, options, names=names, force=given["force"], progress=progress
         )
-    watch.lap("convert")
-    report |= made
-    notes = (*made["inferred"], *missing_note(made["missing"]), *network.notes)
+    watch.take(made.seconds)
+    report |= made.report()
+    notes = (*made.grid.notes, *made.notes, *made.remarks(), *network.notes)
     return [
         *(f"Note: {note}" for note in notes),
         *(
@@ -192,7 +192,7 @@ def upsample_labels(
             f"{row['triangles']:,} triangles, "
             f"{row['components']:,} closed component{'s' * (row['components'] != 1)}, "
             f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
-            for row in made["labels"]
+            for row in made.labels
         ),
-        f"{len(made['labels'])} labels, {sum(watch.seconds.values()):.1f} s",
+        f"{len(made.labels)} labels, {sum(watch.seconds.values()):.1f} s",
     ]
