@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from pyfqmr import Simplify
 
 from ..arrays import BoolArray, IntArray
-from ..surface.mesh import Mesh
+from ..surface.mesh import Mesh, row_keys
 from ..progress import ShareCallback
-from ..surface.topology import OpenEdges, irregular_places, row_keys, vertex_components
 from ..truth.solid import Points, Solid
 from .measuring import Original, mean_side
 
@@ -127,8 +126,8 @@ class Passes:
     def _keep_lost(self, result: Mesh) -> int:
         """Keep the components of which nothing is left, in all passes; -1 if there are none."""
         base = self.meshes[0]
-        component = vertex_components(base.faces, len(base.vertices))[base.faces[:, 0]]
-        first = np.unique(vertex_components(result.faces, len(result.vertices))[result.faces[:, 0]])
+        component = base.components()[1][base.faces[:, 0]]
+        first = np.unique(result.components()[1][result.faces[:, 0]])
         found = component[self.solids[0].nearest_face(result.vertices[first])]
         lost = base.vertices[np.unique(base.faces[~np.isin(component, found)])]
         self.places = np.concatenate([self.places, lost])
@@ -147,9 +146,7 @@ class Passes:
 
     @cached_property
     def _is_closed(self) -> bool:
-        edges = OpenEdges()  # much faster than ``irregular_places``
-        edges.add(self.meshes[0].faces)
-        return not len(edges)
+        return self.meshes[0].is_closed()  # much faster than ``irregular_places``
 
     @cached_property
     def _before(self) -> NDArray[np.float64]:
@@ -177,7 +174,7 @@ def same_topology(one: Mesh, other: Mesh) -> bool:
     """
 
     def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
-        component = vertex_components(mesh.faces, len(mesh.vertices))
+        _, component = mesh.components()
         used = np.bincount(mesh.faces.ravel(), minlength=len(component)) > 0
         triangles = np.bincount(component[mesh.faces[:, 0]])
         vertices = np.bincount(component[used])
@@ -242,3 +239,28 @@ def _renumbered(faces: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray
     """Return which of ``count`` vertices faces (m, 3) use, and the faces with these numbered."""
     used = np.bincount(faces.ravel(), minlength=count) > 0
     return np.flatnonzero(used), (np.cumsum(used, dtype=np.int32) - 1)[faces]
+
+
+def irregular_places(mesh: Mesh) -> NDArray[np.float64]:
+    """Return where a mesh is no closed manifold, (n, 6): the two ends of an edge, or a point twice.
+
+    These are the edges, in the direction of their triangle, without exactly one triangle that
+    passes them in the other direction, and the vertices at which several fans of triangles meet, or
+    that are at the position of another one, or at which two triangles have the same three corners.
+    """
+    positions, faces = mesh.vertices.astype(np.float64), mesh.faces
+    opposite, _, _ = mesh.pair_edges()
+    fans = mesh.count_fans(opposite)
+    unpaired = np.flatnonzero(opposite < 0)
+    start, end = faces.ravel()[unpaired], np.roll(faces, -1, axis=1).ravel()[unpaired]
+    pinched = np.flatnonzero(fans > 1)
+    doubled = _doubled(np.sort(faces, axis=1).astype(np.float64))
+    both = np.concatenate([pinched, _doubled(positions), faces[doubled].astype(np.intp).ravel()])
+    ends = np.concatenate([start, both]), np.concatenate([end, both])
+    return np.concatenate([positions[ends[0]], positions[ends[1]]], axis=1)
+
+
+def _doubled(rows: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the rows that are equal to another row."""
+    _, inverse, uses = np.unique(row_keys(rows), return_inverse=True, return_counts=True)
+    return np.flatnonzero(uses[inverse] > 1)

@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, MeshError, OutOfMemoryError, SuperSdfError
 from ..files.regular import check_regular_file
 from ..threads import held_memory, in_words, memory_bound
-from ..surface.mesh import Mesh
-from ..surface.topology import row_keys
+from ..surface.mesh import Mesh, row_keys
 
 # Products and squares of larger coordinates overflow.
 LARGEST_COORDINATE = 1e30
