@@ -15,6 +15,7 @@ from super_sdf.check.samples import self_intersections
 from super_sdf.surface.sharp import features
 from super_sdf.surface.sharp.folds import intersecting, without_folds
 from super_sdf.surface.sharp.patches import Patches, Placed, triangles_of, unfolded
+from super_sdf.truth.mesh_files import read_mesh
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 BOX = np.array([6.2, 5.1, 4.3])
@@ -50,7 +51,9 @@ def test_edges_of_a_box_are_kept_and_most_corners():
     sharp = extract_sharp(upsample(grid, load_network()), grid)
     assert sharp.is_closed() and (count_fans(sharp.faces) == 1).all()
     signs = np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
-    nearest = np.linalg.norm(sharp.vertices[:, None] - ((BOX * signs) @ TURN.T + 11.13), axis=2).min(0)
+    nearest = np.linalg.norm(
+        sharp.vertices[:, None] - ((BOX * signs) @ TURN.T + 11.13), axis=2
+    ).min(0)
     assert (nearest < 0.12).sum() >= 6 and nearest.max() < 0.3
     assert sharp.volume() == pytest.approx(8 * BOX.prod(), rel=2e-3)
     local, apart = np.abs((sharp.vertices - 11.13) @ TURN), []
@@ -75,10 +78,28 @@ def test_by_itself_it_is_sharp_where_samples_are_exact(kind):
     assert (len(sharp.vertices) > len(plain.vertices)) == (kind == "truncated")
 
 
+def test_the_command_takes_a_mesher_and_says_which(folder, command):
+    np.save("in.npy", turned_box().values)
+    np.save("mask.npy", turned_box().values < 0)
+    words = ("--spacing", 1, "--quality", "fast", "--factor", 2, "--force")
+    sizes, note = {}, "mask values show no edges: the mesh is that of marching cubes"
+    for name in ("auto", "sharp", "marching"):
+        asked = () if name == "auto" else ("--mesher", name)
+        code, out, _ = command("upsample", "in.npy", "a.ply", *asked, *words, "--json")
+        assert code == 0 and json.loads(out)["asked"]["mesher"] == name
+        sizes[name] = len(read_mesh("a.ply").vertices)
+        code, _, err = command(
+            "upsample", "mask.npy", "m.ply", *asked, *words, "--inside", "positive"
+        )
+        assert code == 0 and (note in err) == (name == "sharp")
+    assert sizes["auto"] == sizes["sharp"] > sizes["marching"]
+    assert command("upsample", "in.npy", "x.ply", "--mesher", "dual", *words)[0] == 2
+
+
 def test_the_rule_of_the_package_has_a_weight_for_each_evidence():
     rule = json.loads(features.RULE.read_text())
-    assert features.load_rule() == features.Rule(rule["bias"], tuple(rule["weights"].values()))
-    assert len(rule["weights"]) == 10
+    assert len(features.load_rule().weights) == len(rule["weights"]) == 10
+    assert features.load_rule().share(np.zeros((1, 10))) == np.clip(rule["bias"], 0, 1)
 
 
 @pytest.fixture
@@ -187,7 +208,11 @@ def fans(loops, peaks):
 
 @pytest.mark.parametrize(
     ("peak", "want"),
-    [([0.9, 0.2, 0], [0.9, 0.2, 0]), ([0.9, 0.2, 5], [0.9, 0.2, 5]), ([2.5, 0.5, 0], [1.5, 0.5, 0])],
+    [
+        ([0.9, 0.2, 0], [0.9, 0.2, 0]),
+        ([0.9, 0.2, 5], [0.9, 0.2, 5]),
+        ([2.5, 0.5, 0], [1.5, 0.5, 0]),
+    ],
 )
 def test_a_vertex_beyond_a_side_of_its_fan_goes_half_way_to_the_middle(peak, want):
     """One over its patch stays."""
