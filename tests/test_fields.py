@@ -291,10 +291,8 @@ def limit_files():
     resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, 600_000))
 
 
-@pytest.mark.parametrize(
-    ("suffix", "reason"), [(".npz", "File too large"), (".vti", "VTK says 'File too large'")]
-)
-def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix, reason):
+@pytest.mark.parametrize("suffix", [".npz", ".vti"])
+def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix):
     np.savez("grid.npz", values=ball(12, 3.0).values[:8], spacing=1.0)
     words = ["upsample", "grid.npz", "a.ply", "--save-field", "f" + suffix]
     done = subprocess.run(
@@ -304,7 +302,7 @@ def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix, reason)
         text=True,
     )
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == f"Error: f{suffix} cannot be written: {reason}\n"
+    assert done.stderr == f"Error: f{suffix} cannot be written: File too large\n"
     assert os.listdir() == ["grid.npz"]
 
 
@@ -377,16 +375,13 @@ def test_the_command_refuses_in_one_line_and_writes_nothing(options, command):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".vti", ".vdb"])
-@pytest.mark.parametrize("broken", ["disk", "mesh", "taken", "interrupt"])
+@pytest.mark.parametrize("broken", ["disk", "mesh", "taken"])
 def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
     np.savez("grid.npz", values=ball().values, spacing=1.0)
     target, write = "field" + suffix, writing.FIELD_TABLE[suffix]
 
     def full(*_, **__):
         raise OSError(28, "No space left on device")
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
 
     def taken(field, part):
         write(field, part)
@@ -395,11 +390,11 @@ def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
     if broken == "mesh":
         monkeypatch.setattr("super_sdf.files.output._rename", full)
     else:
-        ends = {"disk": full, "interrupt": interrupted, "taken": taken}
+        ends = {"disk": full, "taken": taken}
         monkeypatch.setitem(writing.FIELD_TABLE, suffix, ends[broken])
     run = "upsample", "grid.npz", "a.ply", "--save-field", target, "--quality=fast", "-q"
     code, _, said = command(*run)
-    assert code == (130 if broken == "interrupt" else 1) and len(said.splitlines()) <= 1
+    assert code == 1 and len(said.splitlines()) <= 1
     assert sorted(os.listdir()) == ([target, "grid.npz"] if broken == "taken" else ["grid.npz"])
     if broken == "disk":
         assert said == f"Error: {target} cannot be written: No space left on device\n"

@@ -42,7 +42,7 @@ NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 @common.shared("names", "cluster", "jobs", "check")
 @option("--save-field", metavar="FIELD",
     help="Also write the refined field: .npz for the values near the surface, .vdb for a level set "
-    "of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti.")
+    "of OpenVDB, .npy or .vti for the whole fine lattice.")
 @common.shared("report", "force", "json", "quiet")
 @option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
 # fmt: on

@@ -17,13 +17,12 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray
+from ..arrays import BoolArray, Numbers, Vectors, cross, dot, length, sums_at, unit
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..options import EXACT
 from ..surface.mesh import Mesh
-from ..surface.sharp.patches import Numbers, Vectors, cross, dot, length, sums_at, unit
-from ..surface.sharp.triangle_pairs import intersecting, overlapping_boxes
+from ..surface.sharp.folds import intersecting, overlapping_boxes
 from .function import DistanceFunction
 
 Value: TypeAlias = Callable[[Vectors], Numbers]

@@ -17,13 +17,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CORNERS
+from ..arrays import CORNERS, Vectors, dot, length, sums_at
 from ..errors import OptionError
 from ..functions.zero import face_normals
 from ..grid.sdf_grid import SdfGrid
 from ..options import MASK
 from ..surface.mesh import Mesh
-from ..surface.sharp.patches import Vectors, dot, length, sums_at
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move

@@ -24,7 +24,7 @@ from ..network.neighbourhood import CENTRE, CORNERS, STRIDES
 from ..simplify.collapsing import collapse_to
 from ..simplify.measuring import points_within
 from ..simplify.simplify import check_room
-from ..surface.cell_cases import EDGE_AXIS, EDGE_START, triangle_table
+from ..surface.cell_cases import EDGE_AXIS, EDGE_START, tables
 from ..refine.survey import Band
 
 MOST_TRIANGLES = 200_000  # of a mesh in a page: 1 to 2 MB, and fluent without a GPU
@@ -97,10 +97,11 @@ def coarse_surface(band: Band, grid: SdfGrid) -> Mesh:
     has a corner in the band, and the samples around that.
     """
     number, values = _crossed_cells(band)
-    counts, table = triangle_table()
-    case = (values <= 0) @ (1 << np.arange(8))
-    edge = table[case][np.arange(table.shape[1]) < counts[case, None]].ravel()
-    cell = np.repeat(np.arange(len(case)), 3 * counts[case])
+    table, case = tables(), (values <= 0) @ (1 << np.arange(8))
+    times = table.times[case]
+    nth = np.arange(times.sum()) + np.repeat(table.first[case] - (np.cumsum(times) - times), times)
+    edge = table.triangles[nth].ravel()
+    cell = np.repeat(np.arange(len(case)), 3 * times)
     start, axis = np.array(EDGE_START)[edge], np.array(EDGE_AXIS)[edge]
     low = np.stack(np.unravel_index(number[cell], band.shape), 1) + CORNERS[start]
     key = 3 * np.ravel_multi_index(tuple(low.T), band.shape) + axis
