@@ -19,7 +19,7 @@ from ..errors import FileError, check_modules, how_to_install
 from ..files.grids import grid_from_image
 from ..grid.sdf_grid import SdfGrid
 from ..network.decoder import Decoder
-from ..options import DEFAULT_MESHER, ConvertOptions, MesherName, Quality, Values
+from ..options import DEFAULT_MESHER, Options, MesherName, Quality, Values
 from ..pipeline import reconstruct
 from ..progress import Progress
 
@@ -123,7 +123,7 @@ class ImageAccessor:
         if residuals:
             from ..check.check import check_mesh
 
-            options = ConvertOptions(offset=offset, max_memory=max_memory)
+            options = Options(offset=offset, max_memory=max_memory)
             found = check_mesh(mesh, grid, options, intersections=False)
             surface.point_data["residual"] = found.residuals_at(found.mesh.vertices)
         return surface

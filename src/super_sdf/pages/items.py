@@ -88,6 +88,7 @@ def item_of_files(
         item.certificate = {"error": str(error)}
     item.show(RESULT, shown, certificate)
     lattice = cubic_grid(samples, options.offset)
+    hidden = lattice.field.unseen is not None
     if lattice.field.unseen is None and len(
         (coarse := coarse_surface(lattice, options.offset)).faces
     ):
