@@ -204,7 +204,6 @@ def test_the_command_says_what_it_resamples(folder, command):
     report = json.loads(out)
     assert "Note: the spacing differs between axes: the values are resampled along z" in err
     assert code == 0 and report["spacing"] == list(spacing) and report["shape"] == [25, 20, 19]
-    assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.1)
     mesh = trimesh.load("a.ply")
     assert np.abs(pear(mesh.vertices - [1, 2, 3])).max() < 0.15 and mesh.is_watertight
     options = ("--quality", "fast", "--spacing", "0.4,0.4,0.6", "--origin", "1,2,3")

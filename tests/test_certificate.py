@@ -311,7 +311,7 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals_whole_or_not_there(here, com
     def full(faces):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(mesh_writers, "_ply_rows", full)
+    monkeypatch.setattr(mesh_writers, "_write_ply", full)
     Path("c.ply").write_text("old")
     before = sorted(os.listdir())
     want = (1, "", "Error: c.ply cannot be written: No space left on device\n")

@@ -77,8 +77,7 @@ def test_the_precision_follows_the_coordinates_of_the_turned_grid():
     grid = SdfGrid.trusted(values, 1.0, (1e4, 0, 0), direction=half)
     assert vertex_type(grid, 4) is np.float64
     assert vertex_type(SdfGrid.trusted(values, 1.0, (3, 0, 0), direction=half), 4) is np.float32
-    middle = check_format_holds("a.glb", grid, 4)
-    assert middle == (1e4 - 1, -1.0, 1.0)
+    check_format_holds("a.glb", grid, 4)
 
 
 def test_npz_keeps_the_direction(folder):

@@ -16,7 +16,7 @@ from super_sdf import (SdfGrid, extract_mesh, fine_grid, make_grid, read_grid, r
 from super_sdf.errors import OptionError
 from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
-from super_sdf.files.vdb_writer import (ACTIVE_MASK, INSIDE, MIXED, OUTSIDE, LevelSet, leaf_bytes, write_level_set)
+from super_sdf.files.vdb_writer import (ACTIVE_MASK, INSIDE, MIXED, OUTSIDE, LevelSet, leaf_bytes, write_tree)
 
 PAD = 8  # voxels that are looked at beyond the lattice
 
@@ -225,9 +225,9 @@ def test_trees_of_many_nodes_have_the_right_side_everywhere(tmp_path):
     packed = [leaf_bytes(values.astype("f4"), np.abs(values) < 0.75) for values in leaves]
     count = sum(int((np.abs(values) < 0.75).sum()) for values in leaves)
     box = np.full(3, -8), np.array([4119, 319, 319])
-    tree = LevelSet(ball(), np.float32(0.75), sides, packed.__getitem__, count, box, bytes(16))
+    tree = LevelSet(ball(), np.float32(0.75), sides, packed, count, box, bytes(16))
     with open("a.vdb", "wb") as file:
-        write_level_set(file, tree)
+        write_tree(file, tree)
     expected = np.full(sides.shape, 0.75, np.float32)
     expected[sides == INSIDE] = -0.75
     found, first, _ = held("a.vdb", ball())

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from .arrays import Triple
 from .files.grids import read_grid
-from .files.meshes import (CERTAIN_SHARE, World, check_format_holds, check_target, expect, local_origin_note, write_pieces)
+from .files.meshes import check_format_holds, check_target, local_origin_note, write_mesh
 from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.cubic import cubic_grid
@@ -50,7 +50,7 @@ class Conversion:
 
     grid: SdfGrid  # as it was read
     mesh: Mesh  # as it was written
-    counts: dict[str, int]  # those of ``COUNTS``, ``expected_triangles`` and ``expected_bytes``
+    counts: dict[str, int]  # those of ``COUNTS``
     bounds: tuple[Triple, Triple]  # lowest and highest coordinates, in world units
     closed: bool  # no edge is open; else the surface leaves the grid and is not capped
     capped: bool  # the solid runs out of the grid, and was closed along the border
@@ -91,15 +91,13 @@ def convert(
     force: bool = False,
     progress: Progress | None = None,
     before_rename: Callable[[Path], None] | None = None,
-    announce: Callable[[str], None] | None = None,
     save_field: str | Path | None = None,
 ) -> Conversion:
     """Convert a grid file to a mesh file, in formats of ``read_grid`` and ``write_mesh``.
 
     ``force`` replaces the target, and the field's file, if they exist. ``progress`` is called with
     (done, total), see ``progress.Progress``; an exception in it ends the work. ``before_rename`` is
-    called with the path of the finished temporary file, before it is renamed to ``target``;
-    ``announce`` before the work with a sentence on the size of the mesh file, if it will be large.
+    called with the path of the finished temporary file, before it is renamed to ``target``.
     ``save_field`` is a file for the refined field, in a format of ``write_field``: it and the mesh
     file are both complete at the end, or neither is written.
 
@@ -120,19 +118,11 @@ def convert(
 
         check_has_volume(grid, options.offset, cap=options.cap)
     lattice = cubic_grid(grid, options.offset)
-    about = check_format_holds(target, lattice, options.factor)
-    expected = expect(grid, options.factor, options.offset, target, cap=options.cap)
-    if options.goals():  # imported here, as few conversions need it
-        from .simplify.simplify import check_room
-
-        least = int(expected.triangles * CERTAIN_SHARE)
-        check_room(least, options.max_memory, estimated=True)
-    elif announce and (sentence := expected.warning(target)):
-        announce(sentence)
+    check_format_holds(target, lattice, options.factor)
     watch.lap("read")
     shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
     with _field_file(save_field, grid, options, force=force) as file:
-        save = file.add if file else None
+        save = file.write if file else None
         made = mesh_grid(grid, network, options, progress=shown, save_field=save)
         watch.take(made.seconds)
         mesh, simplified, off = made.mesh, None, list[str]()
@@ -142,19 +132,22 @@ def convert(
 
         def complete(part: Path) -> None:
             if file:
-                file.finish()
                 check_free(file.path, force=force)  # both files appear, or none
             if before_rename:
                 before_rename(part)
 
-        world = World(options.unit, grid.space)
-        more = {"world": world, "about": about, "before_rename": complete}
-        write_pieces(iter([mesh]), target, force=force, **more)
+        write_mesh(
+            mesh,
+            target,
+            force=force,
+            unit=options.unit,
+            space=grid.space,
+            before_rename=complete,
+        )
         watch.lap("write")
     counts = {**made.counts, "vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
     counts["tiles"] = made.tiles
     counts = {name: counts[name] for name in COUNTS}
-    counts |= {"expected_triangles": expected.triangles, "expected_bytes": expected.size}
     is_open = made.open_edges > 0
     warnings = find_warnings(grid, options.offset, counts, is_open=is_open)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
@@ -168,11 +161,11 @@ def convert(
         warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
         notes=(
-            *(*lattice.notes, *edges_note(lattice, options), *local_origin_note(target, about)),
+            *(*lattice.notes, *edges_note(lattice, options), *local_origin_note(target, [mesh])),
             *off,
         ),
         seconds=watch.seconds,
-        saved_field=file.report() if file else None,
+        saved_field=file.report if file else None,
     )
 
 
@@ -199,7 +192,7 @@ def _field_file(
     check_can_close(grid, cap=options.cap)
     path, shape = check_field_target(path, force=force), lattice_shape(grid.shape, options.factor)
     check_field_fits(path, shape, options.max_memory)
-    return saving_field(path, shape, force=force)
+    return saving_field(path, force=force)
 
 
 def _reworked(

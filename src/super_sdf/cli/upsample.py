@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from typing import Any
 
 import click
@@ -108,15 +107,9 @@ def upsample_grid(
     watch: Stopwatch,
 ) -> list[str]:
     """Convert a grid, check its mesh and write its page if asked for; return what to print."""
-
-    def announce(line: str) -> None:
-        """Print, before the work, what may make the user stop it; the bar is redrawn below."""
-        if not given["quiet"]:
-            print_stderr(f"\r{line}\x1b[K" if sys.stderr.isatty() else line)
-
     force, page, certificate = given["force"], given["report"], None
     with common.progress_bar("upsampling", given["quiet"]) as progress:
-        told = {"force": force, "progress": progress, "announce": announce}
+        told = {"force": force, "progress": progress}
         from ..convert import convert
 
         done = convert(source, target, network, options, save_field=given["save_field"], **told)

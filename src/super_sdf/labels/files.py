@@ -14,8 +14,8 @@ import numpy as np
 
 from ..convert import describe_place
 from ..errors import MeshError, OptionError, seen
-from ..files.mesh_writers import Colour
-from ..files.meshes import (World, check_format_holds, check_mesh_suffix, check_target, format_of, local_origin_note, write_together)
+from ..files.mesh_writers import Colour, World
+from ..files.meshes import check_format_holds, check_mesh_suffix, check_target, format_of, local_origin_note, write_meshes
 from ..files.output import check_apart, naming
 from ..files.regular import files_of
 from ..files.volume import PLACE
@@ -139,7 +139,7 @@ def convert_labels(
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
-    about = check_format_holds(target, grid, options.factor)
+    check_format_holds(target, grid, options.factor)
     with naming(paths[0]), tempfile.TemporaryFile(dir=paths[0].parent) as waiting:
         meshes = {
             label: LabelMesh(label, entry.name, path, waiting)
@@ -155,14 +155,14 @@ def convert_labels(
         if options.keep_volume:
             off = _move(list(meshes.values()), volumes, mean_spacing(grid))
         world = World(options.unit, grid.space, colours_of(called.values()))
-        files: dict[Path, dict[str, Iterator[Mesh]]] = {path: {} for path in paths}
+        files: dict[Path, dict[str, Mesh]] = {path: {} for path in paths}
         for mesh in meshes.values():
-            files[mesh.path][mesh.name] = mesh.pieces()
+            files[mesh.path][mesh.name] = join_meshes(list(mesh.pieces()))
         rows = [
             {**mesh.report(), "sample_volume": volume}
             for mesh, volume in zip(meshes.values(), volumes)
         ]
-        write_together(files, force=force, world=world, about=about, before_rename=before_rename)
+        write_meshes(files, force=force, world=world, before_rename=before_rename)
     return {
         **describe_place(grid),
         "labels": rows,
@@ -170,7 +170,7 @@ def convert_labels(
             {"label": label, "name": entry.name}
             for label, entry in names_of(image.missing(wanted), known).items()
         ],
-        "inferred": [*grid.notes, *local_origin_note(target, about), *off],
+        "inferred": [*grid.notes, *local_origin_note(target, files[paths[0]].values()), *off],
     }
 
 
