@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .arrays import Triple
+from .errors import check_modules
 from .files.grids import read_grid
 from .files.meshes import check_format_holds, check_target, local_origin_note, write_mesh
 from .files.output import check_apart, check_free
@@ -20,15 +21,14 @@ from .files.regular import files_of
 from .grid.cubic import cubic_grid
 from .grid.placement import as_triple
 from .grid.sdf_grid import SdfGrid
-from .errors import check_modules
-from .surface.mesh import Mesh
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP
 from .options import ConvertOptions as ConvertOptions
 from .pipeline import mesh_grid
 from .progress import Progress, Stopwatch, part_of, share_of
-from .surface.cap import check_can_close
 from .refine.field import lattice_shape
+from .surface.cap import check_can_close
+from .surface.mesh import Mesh
 
 if TYPE_CHECKING:
     from .files.fields import FieldFile
@@ -39,10 +39,7 @@ CAPPED = (
     "--open)"
 )
 SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
-COUNTS = (
-    *("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "pinned_nodes"),
-    *("vertices", "triangles", "tiles"),
-)
+
 
 @dataclass(frozen=True, eq=False)
 class Conversion:
@@ -50,7 +47,7 @@ class Conversion:
 
     grid: SdfGrid  # as it was read
     mesh: Mesh  # as it was written
-    counts: dict[str, int]  # those of ``COUNTS``
+    counts: dict[str, int]  # ``refine.field.COUNTS``, vertices, triangles, tiles
     bounds: tuple[Triple, Triple]  # lowest and highest coordinates, in world units
     closed: bool  # no edge is open; else the surface leaves the grid and is not capped
     capped: bool  # the solid runs out of the grid, and was closed along the border
@@ -147,7 +144,6 @@ def convert(
         watch.lap("write")
     counts = {**made.counts, "vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
     counts["tiles"] = made.tiles
-    counts = {name: counts[name] for name in COUNTS}
     is_open = made.open_edges > 0
     warnings = find_warnings(grid, options.offset, counts, is_open=is_open)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
