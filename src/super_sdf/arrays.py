@@ -1,4 +1,4 @@
-"""Types of the arrays that the steps exchange, and the order of the voxels in a neighbourhood."""
+"""Types of the arrays that the steps exchange, the places of a neighbourhood, and vectors."""
 
 from __future__ import annotations
 
@@ -23,6 +23,42 @@ CENTRE = 13
 """Index of the centre voxel itself."""
 STRIDES = np.array([9, 3, 1])
 """Difference of the indices of two places next to each other along each axis."""
+
+Index: TypeAlias = NDArray[np.int64]
+Numbers: TypeAlias = NDArray[np.float64]
+Vectors: TypeAlias = NDArray[np.float64]
+"""A vector in each row, (n, 3)."""
+
+
+def dot(a: Vectors, b: Vectors) -> Numbers:
+    """Return the products of vectors, (n,)."""
+    product: Numbers = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    return product
+
+
+def cross(a: Vectors, b: Vectors) -> Vectors:
+    """Return the cross products of vectors, (n, 3)."""
+    product: Vectors = np.empty_like(a)
+    for k in range(3):
+        product[..., k] = a[..., k - 2] * b[..., k - 1] - a[..., k - 1] * b[..., k - 2]
+    return product
+
+
+def length(vectors: Vectors) -> Numbers:
+    """Return the lengths of vectors, (n,)."""
+    lengths: Numbers = np.sqrt(dot(vectors, vectors))
+    return lengths
+
+
+def unit(vectors: Vectors) -> Vectors:
+    """Return vectors of length 1; 0 stays 0."""
+    units: Vectors = vectors / np.maximum(length(vectors), 1e-12)[..., None]
+    return units
+
+
+def sums_at(place: Index, vectors: Vectors, count: int) -> Vectors:
+    """Return the sums of vectors (m, 3) at each of ``count`` places, (count, 3)."""
+    return np.stack([np.bincount(place, component, count) for component in vectors.T], 1)
 
 
 def without_device(values: Any) -> Any:

@@ -20,12 +20,12 @@ from ..errors import FileError, GridError, OptionError, SuperSdfError
 from ..grid.field import Field
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..threads import check_fits
 from ..options import check_factor, check_path
 from ..refine.band import neighbour_table
 from ..refine.field import FineField, SampleSpheres
 from ..refine.nodes import copies_agree, share_parts
 from ..surface.cap import find_border_inside
+from ..threads import check_fits
 from .regular import check_regular_file
 
 VERSION = 1

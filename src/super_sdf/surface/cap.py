@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import CORNERS, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError
 from ..grid.sdf_grid import SdfGrid
-from ..network.neighbourhood import CORNERS, NEIGHBOURHOOD
 from ..refine.band import neighbour_table, rescale
 from ..refine.field import FineField
 from ..refine.nodes import (
@@ -93,7 +92,8 @@ def find_border_inside(field: FineField, border: IntArray | None = None) -> IntA
     border = np.array([(0, 0, 0), field.shape]) if border is None else border
     grid, found = field.placed, [np.empty((0, 3), np.int64)]
     ends = [
-        np.isin(np.arange(n), (low, high - 1)) for n, low, high in zip(field.shape, *border.tolist())
+        np.isin(np.arange(n), (low, high - 1))
+        for n, low, high in zip(field.shape, *border.tolist())
     ]
     for planes in chunks_of(field.shape[0], field.shape[1] * field.shape[2]):
         inside = rescale(grid, field.offset, planes.start, planes.stop) <= 0

@@ -63,8 +63,8 @@ def extract(
     field : FineField
         Of a grid, or of a part of it.
     lattice : SdfGrid
-        The field's samples: it is from ``cubic_grid``. Mirrored axes turn triangles inward, so these
-        are turned over.
+        The field's samples: it is from ``cubic_grid``. Mirrored axes turn triangles inward, so
+        these are turned over.
     mesher : str
         From ``choose_mesher``.
     cap : bool
@@ -84,7 +84,7 @@ def extract(
     field = close(field, cap=cap, border=border)
     crossings = marching.find_crossings(field, threads)
     features = None
-    if mesher == SHARP and field.spheres is not None:
+    if mesher == SHARP and field.spheres is not None and len(field.spheres.distance):
         from .sharp.features import find_features
 
         features = find_features(field, crossings, border, threads)
@@ -117,7 +117,7 @@ def extract(
 
 
 def keys_of(node_ijk: IntArray, shape: NDArray[Any], factor: int) -> NDArray[np.int64]:
-    """Return the keys of nodes (n, 3), counted from the first of the whole grid: see ``extract``."""
+    """Return the keys of nodes (n, 3), counted from the first of the whole: see ``extract``."""
     _, ny, nz = (factor * (shape + 2) + 1).tolist()
     i, j, k = node_ijk.T.astype(np.int64) + factor
     keys: NDArray[np.int64] = KEYS_PER_NODE * ((i * ny + j) * nz + k)

@@ -26,13 +26,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, IntArray
-from ..threads import map_chunks, map_threads, rows_in_chunk, worthwhile_threads
-from .mesh import CLEARANCE
-from ..network.neighbourhood import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES
-from .cell_cases import EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
+from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, IntArray
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, part_of_node
+from ..threads import map_chunks, map_threads, rows_in_chunk, worthwhile_threads
+from .cell_cases import EDGE_AXIS, EDGE_START, FACES, tables
+from .mesh import CLEARANCE
 
 # Nodes beyond the grid's border (of a cap, see ``cap.close``) are placed this far outside it,
 # in fine spacings: enough for distinct vertices.
@@ -132,7 +131,7 @@ def choose_cases(
     The inside corners of an ambiguous face are joined where bilinear interpolation on it is
     negative at its saddle (Nielson and Hamann 1991).
     """
-    table = choices()
+    table = tables()
     case: NDArray[np.int16] = corners.astype(np.int16)
     unsure = np.flatnonzero(table.ambiguous[corners])
     low, row = cells_low_nodes(field.factor)[cell[unsure]], row[unsure]
@@ -192,8 +191,9 @@ def connect(field: FineField, crossings: Crossings, threads: int = 1) -> IntArra
     have a table of all edges of their blocks, to which the plane before belongs: voxels in it may
     own edges of the run.
     """
-    counts, starts, table = _flat_triangles(field.factor)
-    times = counts[crossings.case]
+    table = tables()
+    from_low = edge_steps(field.factor)[table.triangles]
+    times = table.times[crossings.case]
     end = np.cumsum(times, dtype=np.int64)
     faces = np.empty((int(end[-1]) if len(end) else 0, 3), np.int32)
     plane = field.voxel_ijk[:, 0]
@@ -220,8 +220,8 @@ def connect(field: FineField, crossings: Crossings, threads: int = 1) -> IntArra
         begin = int(end[some.start] - times[some.start]) if some.start < some.stop else 0
         each = times[some]
         nth = np.arange(begin, begin + each.sum())
-        nth += np.repeat(starts[crossings.case[some]] - (end[some] - each), each)
-        corners = table[nth] + np.repeat(low, each)[:, None]
+        nth += np.repeat(table.first[crossings.case[some]] - (end[some] - each), each)
+        corners = from_low[nth] + np.repeat(low, each)[:, None]
         vertex_at.take(corners, out=faces[begin : begin + len(corners)], mode="clip")
 
     runs = list(zip(cuts[:-1].tolist(), cuts[1:].tolist()))
@@ -300,12 +300,3 @@ def edge_steps(factor: int) -> NDArray[np.int64]:
     start = (CORNERS @ strides(factor))[np.array(EDGE_START)]
     steps: NDArray[np.int64] = start + np.array(EDGE_AXIS) * (factor + 1) ** 3
     return steps
-
-
-@lru_cache
-def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
-    """Return the triangles of all cases: how many, the first, edges from the cell's low node."""
-    counts, table = triangle_table()
-    edge = edge_steps(factor)
-    used = np.arange(table.shape[1]) < counts[:, None]
-    return counts, (np.cumsum(counts) - counts).astype(np.int32), edge[table[used]]
