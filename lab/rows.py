@@ -11,8 +11,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from super_sdf.errors import WriteError
 from super_sdf.batch.record import RecordFile
+from super_sdf.errors import WriteError
 
 Key = Mapping[str, Any]
 Row = dict[str, Any]

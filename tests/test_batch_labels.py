@@ -17,7 +17,7 @@ from processes import start_command, wait_for_lines
 from test_labels import corners_of
 
 from super_sdf import load_network
-from super_sdf.convert import ConvertOptions
+from super_sdf.options import Options
 from super_sdf.labels.files import convert_labels
 from super_sdf.labels.names import read_names
 from super_sdf.options import LABELS
@@ -54,7 +54,7 @@ def made(tmp_path_factory):
     for number in range(CASES):
         write_case(number, number)
         case, target = f"cases/case{number:02}.nii.gz", f"want/case{number:02}.stl"
-        convert_labels(case, target, network, ConvertOptions(factor=2), names=names)
+        convert_labels(case, target, network, Options(factor=2), names=names)
     os.chdir(before)
     return here
 

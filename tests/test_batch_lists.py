@@ -13,7 +13,7 @@ from batches import files
 from conftest import ball
 
 from super_sdf.batch.inputs import find_jobs
-from super_sdf.convert import ConvertOptions
+from super_sdf.options import Options
 from super_sdf.files.formats import GRID_SUFFIXES
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.options import BATCH_LISTS
@@ -168,8 +168,8 @@ def test_patterns_find_what_the_shell_would(run_batch):
     for pattern in patterns:
         want = {Path(p) for p in glob.glob(pattern, recursive=True)}
         want = {path for path in want if path.suffix in (".npy", ".npz")}
-        assert {job.source for job in find_jobs([pattern], ".ply", ConvertOptions()).jobs} == want
-    below = find_jobs(["in"], ".ply", ConvertOptions()).jobs
+        assert {job.source for job in find_jobs([pattern], ".ply", Options()).jobs} == want
+    below = find_jobs(["in"], ".ply", Options()).jobs
     assert Path("in/.hidden/a.npy") in {job.source for job in below}
 
 

@@ -19,7 +19,7 @@ from super_sdf.batch import job as batch_job
 from super_sdf.batch.inputs import find_jobs
 from super_sdf.batch.job import Settings
 from super_sdf.batch.run import Queue, Run, choose_workers, useful_workers
-from super_sdf.convert import ConvertOptions
+from super_sdf.options import Options
 from super_sdf.threads import held_memory
 from super_sdf.batch.pool import Death, Pool
 from super_sdf.threads import Resources, allot_each, count_cores
@@ -185,7 +185,7 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
 def test_fail_fast_begins_nothing_more_in_several_processes():
     Path("out").mkdir()
     settings = Settings(Path("out"), fail_fast=True)
-    run = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, settings)
+    run = Run(find_jobs(["in"], ".ply", Options()).jobs, settings)
     queue = Queue(run)
     assert len(queue) == 4
     first = queue.popleft()
@@ -198,7 +198,7 @@ def test_the_bound_is_shared_by_those_that_run(monkeypatch):
     monkeypatch.setattr("super_sdf.threads.held_memory", lambda: 10**8)
     assert allot_each(3, 1, 10**9) == Resources(1, 3 * 10**8)
     Path("out").mkdir()
-    run = Run(find_jobs(["in"], ".ply", ConvertOptions()).jobs, Settings(Path("out")))
+    run = Run(find_jobs(["in"], ".ply", Options()).jobs, Settings(Path("out")))
     queue = Queue(run, 3 * 10**8)
     assert [queue.popleft().options.max_memory for _ in range(4)] == 4 * [3 * 10**8]
 

@@ -11,13 +11,14 @@ import trimesh
 from conftest import ball, refusal, trilinear
 
 from super_sdf import Mesh, reconstruct, write_mesh
-from super_sdf.convert import ConvertOptions, convert
+from super_sdf.convert import convert
+from super_sdf.options import Options
 from super_sdf.errors import FileError, GridError, OptionError
 from super_sdf.files import mesh_writers
 from super_sdf.files.mesh_writers import World
 from super_sdf.files.meshes import MESH_SUFFIXES, write_meshes
 
-OPTIONS = ConvertOptions(4, inside="negative")
+OPTIONS = Options(4, inside="negative")
 
 pytestmark = pytest.mark.usefixtures("folder")
 

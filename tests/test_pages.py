@@ -16,7 +16,8 @@ from skimage.measure import marching_cubes
 
 from super_sdf import Mesh, SdfGrid, reconstruct
 from super_sdf.check.check import FULL, check_mesh
-from super_sdf.convert import ConvertOptions, Kept
+from super_sdf.convert import Kept
+from super_sdf.options import Options
 from super_sdf.grid.cubic import cubic_grid
 from super_sdf.pages import meshes
 from super_sdf.pages.html import is_page, make_page, write_page
@@ -111,7 +112,7 @@ def test_coarse_marching_cubes_are_those_of_a_library():
 def test_an_item_has_the_residuals_of_both_meshes_and_the_certificate():
     grid = SdfGrid(wedge(), (1.0, 1.0, 1.0))
     mesh = reconstruct(grid, factor=2)
-    item = item_of(Kept(grid, mesh), ConvertOptions())
+    item = item_of(Kept(grid, mesh), Options())
     ours, coarse = item.meshes
     assert ours["caption"] == f"super-sdf: {len(mesh.faces):,} triangles"
     assert coarse["caption"].startswith("marching cubes of the samples: ")
@@ -120,7 +121,7 @@ def test_an_item_has_the_residuals_of_both_meshes_and_the_certificate():
     assert 0 < means[0] < means[1]  # coarse marching cubes cut off the edges
     assert item.thumbnail and item.remarks == []
     thick = SdfGrid(wedge()[:, :, ::2], (1.0, 1.0, 2.0))
-    caption = item_of(Kept(thick, mesh), ConvertOptions()).meshes[1]["caption"]
+    caption = item_of(Kept(thick, mesh), Options()).meshes[1]["caption"]
     assert caption.startswith("marching cubes of the samples, made equally spaced: ")
 
 

@@ -16,7 +16,8 @@ from solids import cube, joined, sphere, square, torus
 from lab.surfaces import isosurface
 from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
 from super_sdf.check.surface import count_components
-from super_sdf.convert import ConvertOptions, convert
+from super_sdf.convert import convert
+from super_sdf.options import Options
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
 from super_sdf.files.meshes import write_mesh
 from super_sdf import errors as extras
@@ -326,7 +327,7 @@ def test_the_file_is_the_same_for_any_threads_and_slabs_and_in_the_library(here,
     command("upsample", "ball.npz", "two.ply", "--simplify", 0.02, "--threads", 2, *QUICK)
     network = load_network("fast", threads=1)
     for name, memory in {"all": None, "few": (held_memory() or 0) + 10**8}.items():
-        options = ConvertOptions(factor=2, simplify=0.02, max_memory=memory)
+        options = Options(factor=2, simplify=0.02, max_memory=memory)
         convert("ball.npz", f"{name}.ply", network, options)
     mesh = reconstruct(read_grid("ball.npz"), network, factor=2)
     write_mesh(simplify_mesh(mesh, error=0.02 * 0.5).mesh, "library.ply")

@@ -25,7 +25,7 @@ from .grid.cubic import cubic_grid
 from .grid.sdf_grid import SdfGrid, check_grid
 from .network.decoder import Decoder, adapt, decode
 from .network.network import given_or_loaded, network_for
-from .options import ConvertOptions
+from .options import Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
@@ -232,7 +232,7 @@ def reconstruct(
     exact = None if function is None else as_function(function)
     grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
     network = given_or_loaded(network, quality, device=device, precision=precision, threads=threads)
-    chosen = ConvertOptions(
+    chosen = Options(
         factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory
     )
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
@@ -259,7 +259,7 @@ class Result:
 def mesh_grid(
     grid: SdfGrid,
     network: Decoder,
-    chosen: ConvertOptions,
+    chosen: Options,
     *,
     progress: Progress | None = None,
     save_field: Callable[[FineField], None] | None = None,

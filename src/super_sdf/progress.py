@@ -73,11 +73,6 @@ class StepCounter:
         self.done = 0.0
         self.watch = Stopwatch()
 
-    def divide(self, slabs: int) -> None:
-        """Expect every step but the first once per slab."""
-        for name in self.lengths.keys() - {"band"}:
-            self.lengths[name] /= slabs
-
     def finish(self, name: str) -> None:
         """Report that a step is done, and record its time."""
         self.watch.lap(name)

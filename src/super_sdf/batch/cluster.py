@@ -12,28 +12,25 @@ import concurrent.futures
 import logging
 import os
 import pkgutil
-import tempfile
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import dask
 from distributed import Client, KilledWorker, LocalCluster, get_worker, wait
 
 from .. import __version__
-from ..errors import ClusterError, SuperSdfError
+from ..errors import EXTRAS, ClusterError, SuperSdfError, missing_modules
 from ..files.formats import find_format, split_member
-from ..errors import EXTRAS, missing_modules
-from ..threads import reuse_freed
 from ..network.network import find_model, shipped_models
-from ..threads import allot_each, count_cores
+from ..threads import count_cores
 from .job import Job, Settings, convert_job
 from .pool import Death
-from .record import Row, fingerprint
+from .record import Row
 
 Task = TypeVar("Task")
 LOCAL = "local"
@@ -43,62 +40,47 @@ LOOK_SECONDS = 1.0  # between two looks at whether there are workers
 PATIENCE_SECONDS = 60.0  # without any worker
 MOST_FILES = 100  # whose presence each worker checks
 SHARE = 0.75  # of a worker's limit: Dask gives it no more work at 0.8, and kills it at 0.95
-VERSION = "super_sdf:__version__"
 LOGGERS = ("distributed", "tornado", "asyncio")
 CONFIG = {
     "distributed.nanny.pre-spawn-environ": {},  # it would stay in the environment of this process
     "distributed.scheduler.allowed-failures": 1,
-    "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
 }
 CANCELLED = concurrent.futures.CancelledError, asyncio.CancelledError
 TIMEOUTS = TimeoutError, asyncio.TimeoutError  # the same from Python 3.11 on
 
 
-class Needs(NamedTuple):
-    """What every worker has to have: files and a folder at the same paths, a network, packages."""
-
-    files: tuple[Path, ...] = ()
-    folder: Path | None = None
-    network: tuple[Path, Any] | None = None  # a file that does not come with the package, its hash
-    modules: tuple[str, ...] = ()
-
-    def lacking(self) -> str:
-        """Return what this process lacks, "" if nothing."""
-        for path in self.files:
-            if not path.exists():
-                return f"does not see {path}: put the inputs where all machines see them"
-        if self.folder and not (self.folder.is_dir() and os.access(self.folder, os.W_OK)):
-            return f"cannot write to {self.folder}: give a folder that all machines share"
-        if self.network and (fingerprint(self.network[0]) or {}).get("sha256") != self.network[1]:
-            return f"has another file of the network {self.network[0]}: copy the one from here"
-        if missing := missing_modules(self.modules):
-            return f"lacks {', '.join(missing)}: install there what is installed here"
-        return ""
-
-
 @contextmanager
-def connect(
-    address: str, *, workers: int = 0, threads: int = 0, max_memory: int | None = None
-) -> Iterator[Client]:
+def connect(address: str, workers: int = 0, max_memory: int | None = None) -> Iterator[Client]:
     """Connect to a cluster; at the end, and after errors, everything that was started is closed.
 
     The address is "local", for processes of this machine (``workers`` of them, 0: one per core),
     that of a Dask scheduler, such as tcp://10.0.0.1:8786, or its scheduler file. ``max_memory`` are
     the bytes of all workers together for "local". ClusterError if nobody answers, or if there is no
-    worker.
+    worker of this version of super-sdf.
     """
     with ExitStack() as stack:
         for logger in map(logging.getLogger, LOGGERS):
             stack.callback(logger.setLevel, logger.level)
             logger.setLevel(logging.CRITICAL + 1)
-        given: dict[str, Any] = {"address": address}
-        if address == LOCAL:
-            given["address"] = stack.enter_context(_local_cluster(workers, max_memory))
-        elif Path(address).is_file():
-            given = {"scheduler_file": address}
+        server: Any = {"address": address}
+        if address != LOCAL and Path(address).is_file():
+            server = {"scheduler_file": address}
         try:
-            client = Client(**given, timeout=CONNECT_SECONDS, set_as_default=False)
+            if address == LOCAL:
+                os.environ.setdefault("PYTHONSAFEPATH", "1")  # import nothing from this folder
+                stack.enter_context(dask.config.set(CONFIG))
+                cluster = LocalCluster(
+                    n_workers=workers or count_cores(),
+                    threads_per_worker=1,
+                    host="127.0.0.1",  # nobody else hears them
+                    dashboard_address=None,
+                    worker_dashboard_address=None,
+                    memory_limit=(max_memory or 0) // (workers or count_cores()),
+                    silence_logs=logging.CRITICAL,
+                )
+                server = {"address": stack.enter_context(cluster)}
+            client = Client(**server, timeout=CONNECT_SECONDS, set_as_default=False)
         except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
             is_silent = isinstance(error, (OSError, *TIMEOUTS)) or not str(error)
             why = "" if is_silent else f" ({' '.join(str(error).split())})"
@@ -109,61 +91,19 @@ def connect(
         stack.callback(client.close, timeout=CONNECT_SECONDS)
         with suppress(*TIMEOUTS):
             client.wait_for_workers(1, timeout=FIRST_WORKER_SECONDS)
-        if not client.nthreads():
-            raise ClusterError(
-                f"the Dask scheduler at {address} has no workers: start some with "
-                f"'dask worker {address}'"
-            )
-        yield client
-
-
-@contextmanager
-def _local_cluster(count: int, max_memory: int | None) -> Iterator[LocalCluster]:
-    """Run worker processes on this machine, which listen on the loopback interface only."""
-    os.environ.setdefault("PYTHONSAFEPATH", "1")  # they import nothing from the current folder
-    count = count or count_cores()
-    bound = allot_each(count, 0, max_memory).memory if max_memory else None
-    with tempfile.TemporaryDirectory(prefix="super-sdf-", ignore_cleanup_errors=True) as scratch:
-        with dask.config.set({**CONFIG, "temporary-directory": scratch}):
-            try:
-                cluster = LocalCluster(
-                    n_workers=count,
-                    threads_per_worker=1,
-                    host="127.0.0.1",
-                    dashboard_address=None,
-                    worker_dashboard_address=None,
-                    memory_limit=int(bound / SHARE) if bound else 0,
-                    silence_logs=logging.CRITICAL,
-                )
-            except Exception as error:  # of many kinds; a worker was killed as it started, say
+        # This question needs nothing of super-sdf where it is answered.
+        answers = client.run(pkgutil.resolve_name, "super_sdf:__version__", on_error="return")
+        if not answers:
+            way_out = f"start some with 'dask worker {address}'"
+            raise ClusterError(f"the Dask scheduler at {address} has no workers: {way_out}")
+        for worker, answer in answers.items():
+            if answer != __version__:
+                has = "none" if isinstance(answer, Exception) else answer
                 raise ClusterError(
-                    f"the local workers do not start ({' '.join(str(error).split())}): run it "
-                    "again, with fewer --jobs if memory is short"
-                ) from error
-            with closing(cluster):
-                yield cluster
-
-
-def check_workers(client: Client, needs: Needs) -> None:
-    """Raise ClusterError if a worker has no super-sdf, another version of it, or lacks something.
-
-    The first question needs nothing of this package where it is answered.
-    """
-    for address, answer in client.run(
-        pkgutil.resolve_name, VERSION, on_error="return"
-    ).items():
-        if isinstance(answer, ImportError):
-            fault = f"does not have super-sdf: install version {__version__} of it there"
-        else:
-            fault = (
-                f"has super-sdf {answer}, and here is {__version__}: install the same version "
-                "there and here"
-            )
-        if answer != __version__:
-            raise ClusterError(f"worker {address} {fault}")
-    for address, answer in client.run(needs.lacking, on_error="return").items():
-        if answer:
-            raise ClusterError(f"worker {address} {answer}")
+                    f"worker {worker} has another super-sdf ({has}) than here ({__version__}): "
+                    "install the same version there and here"
+                )
+        yield client
 
 
 def completed(
@@ -177,34 +117,26 @@ def completed(
     there is no worker any more; SuperSdfError as a worker raised it.
     """
     running: dict[Any, Task] = {}
-    seen = time.monotonic()
-    lost = ClusterError(
-        "the connection to the Dask scheduler was lost: run it again when the scheduler is back"
-    )
+    threads, seen = 0, time.monotonic()
     try:
         while True:
             with suppress(OSError, *TIMEOUTS):
                 threads = sum(client.nthreads().values())
-            if client.status != "running":
-                raise lost
             seen = time.monotonic() if threads else seen
-            if time.monotonic() - seen > PATIENCE_SECONDS:
-                raise ClusterError(
-                    f"the cluster has had no worker for {PATIENCE_SECONDS:g} s: start some, and "
-                    "run it again"
-                )
+            if client.status != "running" or time.monotonic() - seen > PATIENCE_SECONDS:
+                raise ClusterError("the Dask scheduler, or all workers, were lost: run it again")
             while len(running) < max(threads, 1) and (task := take()) is not None:
                 call = partial(_at_worker, __version__, work)
                 running[client.submit(call, task, pure=False)] = task
             if not running:
                 return
-            done: Iterable[Any] = ()
+            done = set[Any]()
             with suppress(*TIMEOUTS), client.as_current():
                 done = wait(list(running), LOOK_SECONDS, "FIRST_COMPLETED").done
             for future in done:
                 yield running.pop(future), _result_of(future)
     except CANCELLED:
-        raise lost from None
+        raise ClusterError("the Dask scheduler was lost: run it again") from None
     finally:
         with suppress(Exception):  # the connection may be lost: then the scheduler knows it, too
             client.cancel(list(running))
@@ -214,10 +146,8 @@ def _at_worker(version: str, work: Callable[..., Any], task: Any) -> Any:
     """Work at a task in a worker, which may have come after the others were checked."""
     worker = get_worker()
     if version != __version__:
-        raise ClusterError(
-            f"worker {worker.address} has super-sdf {__version__}, and {version} is needed there"
-        )
-    reuse_freed()
+        said = f"worker {worker.address} has super-sdf {__version__}, and here is {version}"
+        raise ClusterError(f"{said}: install the same version there and here")
     limit = worker.memory_manager.memory_limit
     return work(task, memory=int(SHARE * limit / worker.state.nthreads) if limit else None)
 
@@ -226,9 +156,7 @@ def _result_of(future: Any) -> Any:
     """Return the result of a future that is done, or a Death."""
     try:
         return future.result()
-    except CANCELLED:
-        raise
-    except SuperSdfError:
+    except (SuperSdfError, *CANCELLED):
         raise
     except KilledWorker as error:
         times = error.allowed_failures + 1
@@ -248,28 +176,40 @@ def convert_on_cluster(
 ) -> Generator[tuple[Job, Any], None, None]:
     """Yield the jobs that ``take`` returns with their rows, as they are converted on a cluster.
 
-    ``jobs`` are all jobs, for the checks before the work; ``workers`` are processes of this
-    machine, for ``--cluster local``.
+    ``jobs`` are all jobs, for the check of the workers: they have to see the inputs and the output
+    folder by the same paths. ``workers`` are processes of this machine, for ``--cluster local``.
     """
     path, _ = find_model(settings.model, settings.precision)
-    is_own = path not in shipped_models().values()
+    model = settings.model if path in shipped_models().values() else os.path.abspath(settings.model)
     items = settings.items and settings.items.absolute()
-    model = str(Path(settings.model).absolute()) if is_own else settings.model
     there = replace(settings, folder=settings.folder.absolute(), items=items, model=model)
     files = [split_member(job.source)[0].absolute() for job in jobs]
-    some = tuple(file for file in files[:: max(1, len(files) // MOST_FILES)] if file.exists())
+    some = [file for file in files[:: len(files) // MOST_FILES + 1] if file.exists()]
+    some += [Path(model)] if model != settings.model else []
     extras = {find_format(job.source).extra for job in jobs} - {None, ""}
     extras |= {"report"} if settings.check or settings.items else set()
     extras |= {"simplify"} if any(job.options.goals() for job in jobs) else set()
-    modules = tuple(sorted({module for extra in extras for module in EXTRAS[str(extra)]}))
-    here = tuple(set(modules).difference(missing_modules(modules)))  # without others, files fail
-    network = (path.absolute(), (fingerprint(path) or {}).get("sha256")) if is_own else None
+    modules = {module for extra in extras for module in EXTRAS[str(extra)]}
+    here = tuple(modules.difference(missing_modules(tuple(modules))))  # without others, files fail
     work = partial(_convert, settings=there, stage=stage.absolute(), base=Path.cwd())
     memory = jobs[0].options.max_memory
-    with connect(str(settings.cluster), workers=workers, max_memory=memory) as client:
-        check_workers(client, Needs(some, there.folder, network, here))
+    with connect(str(settings.cluster), workers, memory) as client:
+        for worker, lack in client.run(_lacking, some, stage.absolute(), here).items():
+            if lack:
+                raise ClusterError(f"worker {worker} {lack}")
         with closing(completed(client, take, work)) as results:
             yield from results
+
+
+def _lacking(files: Sequence[Path], folder: Path, modules: tuple[str, ...]) -> str:
+    """Return what this process lacks, "" if nothing."""
+    for path in files:
+        if not path.exists():
+            return f"does not see {path}: put it where all machines see it by this path"
+    if not os.access(folder, os.W_OK):
+        return f"cannot write to {folder.parents[1]}: give a folder that all machines share"
+    missing = missing_modules(modules)
+    return f"lacks {', '.join(missing)}: install there what is installed here" if missing else ""
 
 
 def _convert(job: Job, settings: Settings, stage: Path, base: Path, memory: int | None) -> Row:

@@ -16,7 +16,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..errors import FileError, OptionError
 from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
@@ -24,25 +24,21 @@ from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix
 from ..files.regular import is_store, reason_of
 from ..labels.files import with_numbers
 from ..labels.names import Names
-from ..options import BATCH_LISTS, GOALS, OPTIONS, ConvertOptions
+from ..options import BATCH_LISTS, GOALS, OPTIONS, Options
 from .job import Job
 from .record import OWN_NAMES
 
 LIST_SUFFIXES = (".txt", ".jsonl")
 USAGE = 'give an object, {"in": "a.npy"}'
-LONGEST = 240  # characters of a line or an error that a message quotes
+LONGEST = 120  # characters of each end of a line that a message quotes
 
-
-class Inputs(NamedTuple):
-    """The jobs, and the folders that could not be read, each with the reason."""
-
-    jobs: list[Job]
-    unread: list[tuple[str, str]]
+Unread = list[tuple[str, str]]
+"""Folders that could not be read, each with the reason."""
 
 
 def find_jobs(
-    arguments: Sequence[str], suffix: str, options: ConvertOptions, names: Names | None = None
-) -> Inputs:
+    arguments: Sequence[str], suffix: str, options: Options, names: Names | None = None
+) -> tuple[list[Job], Unread]:
     """Return the jobs that the arguments name, each once: files, folders, patterns, lists.
 
     ``suffix`` is the mesh file format, such as ".ply"; a list may say otherwise, and it may have
@@ -50,8 +46,8 @@ def find_jobs(
     if an argument names no grid, if two inputs would become one output, or if an option does not go
     with labels; FileError if a list, or the only folder, cannot be read.
     """
-    unread: list[tuple[str, str]] = []
-    chosen, by_target = with_numbers(options, names), dict[str, Job]()
+    unread, by_target = Unread(), dict[str, Job]()
+    chosen = with_numbers(options, names)
     for argument in arguments:
         for job in _expand(argument, suffix, chosen, names, unread):
             other = by_target.setdefault(os.path.normcase(job.target), job)
@@ -67,58 +63,45 @@ def find_jobs(
                     f"{job.source} would become {job.target}, but the first of these names is the "
                     "batch's own: rename it"
                 )
-    return Inputs(list(by_target.values()), list(dict.fromkeys(unread)))
+    return list(by_target.values()), list(dict.fromkeys(unread))
 
 
 def _expand(
-    argument: str,
-    suffix: str,
-    options: ConvertOptions,
-    names: Names | None,
-    unread: list[tuple[str, str]],
+    argument: str, suffix: str, options: Options, names: Names | None, unread: Unread
 ) -> list[Job]:
     """Return the jobs that one argument stands for, and note the folders that cannot be read."""
-    path = Path(argument)
-    if argument and path.suffix.lower() in LIST_SUFFIXES and os.path.isfile(path):
-        return _read_list(path, suffix, options, names)
-    if is_store(path):
-        root, paths = path.parent, [path]
-    elif argument and os.path.isdir(path):
+    path, kinds = Path(argument), ", ".join(GRID_SUFFIXES)
+    if path.suffix.lower() in LIST_SUFFIXES and path.is_file():
+        return list(_read_list(path, suffix, options, names))
+    if argument and path.is_dir() and not is_store(path):
         root, paths = path, list(_files_below(path, unread))
     elif is_grid(path) and os.path.lexists(split_member(path)[0]):
         root, paths = split_member(path)[0].parent, [path]
     elif glob.has_magic(argument):
         fixed = next(i for i, part in enumerate(path.parts) if glob.has_magic(part))
-        root, pattern = Path(*path.parts[:fixed]), str(Path(*path.parts[fixed:]))
-        hidden = pattern.startswith(".") or f"{os.sep}." in pattern
-        if pattern.endswith("**"):  # for pathlib the folders alone
-            pattern = str(Path(pattern, "*"))
-        found = root.glob(pattern)  # follows links to folders in a named part, but not for **
-        paths = [p for p in found if hidden or not _is_hidden(p.relative_to(root))]
+        root, parts = Path(*path.parts[:fixed]), list(path.parts[fixed:])
+        parts += ["*"] * (parts[-1] == "**")  # for pathlib, ** are folders alone
+        found = root.glob("/".join(parts))  # follows links to folders where they are named
+        hidden = any(part.startswith(".") for part in parts)
+        shown = (p for p in found if hidden or "/." not in f"/{p.relative_to(root).as_posix()}")
+        paths = list(shown)
     elif not argument or not os.path.lexists(path):
-        raise OptionError(
-            f"{argument or repr(argument)} does not exist: give grids, folders, patterns or a list"
-        )
+        said = f"{argument or repr(argument)} does not exist"
+        raise OptionError(f"{said}: give grids, folders, patterns or a list")
     else:
-        raise OptionError(
-            f"{argument} is neither a grid ({', '.join(GRID_SUFFIXES)}) nor a list "
-            f"({', '.join(LIST_SUFFIXES)})"
-        )
+        lists = ", ".join(LIST_SUFFIXES)
+        raise OptionError(f"{argument} is neither a grid ({kinds}) nor a list ({lists})")
     # Anything with a grid's suffix counts. If it is no regular file, its job fails and names it.
     grids = sorted({p for p in paths if is_grid(p) and (is_store(p) or not p.is_dir())})
+    if not grids and unread:
+        raise FileError(" ".join(unread[-1]))
     if not grids:
-        if unread:
-            raise FileError(" ".join(unread[-1]))
-        raise OptionError(f"{argument} holds no grid ({', '.join(GRID_SUFFIXES)})")
+        raise OptionError(f"{argument} holds no grid ({kinds})")
     targets = (mesh_path(grid.relative_to(root), suffix, options.label) for grid in grids)
     return [Job(grid, target.as_posix(), options) for grid, target in zip(grids, targets)]
 
 
-def _is_hidden(path: Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)
-
-
-def _files_below(folder: Path, unread: list[tuple[str, str]]) -> Iterator[Path]:
+def _files_below(folder: Path, unread: Unread) -> Iterator[Path]:
     """Yield the files below a folder, and the folders that are grids."""
 
     def note(error: OSError) -> None:
@@ -130,10 +113,8 @@ def _files_below(folder: Path, unread: list[tuple[str, str]]) -> Iterator[Path]:
         yield from (Path(path, name) for name in (*stores, *names))
 
 
-def _read_list(
-    path: Path, suffix: str, options: ConvertOptions, names: Names | None
-) -> list[Job]:
-    """Return a job for each line of a list; OptionError with the number of one that is not valid.
+def _read_list(path: Path, suffix: str, options: Options, names: Names | None) -> Iterator[Job]:
+    """Yield a job for each line of a list; OptionError with the number of one that is not valid.
 
     Blank lines, and in ``.txt`` lines that start with ``#``, are skipped. The text is UTF-8; a byte
     order mark and CRLF line ends are accepted.
@@ -142,41 +123,26 @@ def _read_list(
         lines = path.read_text("utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
         raise FileError(f"{path} cannot be read: {getattr(error, 'strerror', error)}") from None
-    is_text, jobs = path.suffix.lower() == ".txt", []
+    is_text = path.suffix.lower() == ".txt"
+    if not any(map(str.strip, lines)):
+        raise OptionError(f"{path} names no file: give a path a line")
     for number, line in enumerate(map(str.strip, lines), 1):
         if line and not (is_text and line.startswith("#")):
             try:
-                entry = {"in": line} if is_text else _parse(line)
-                jobs.append(_job(entry, path.parent, suffix, options, names))
-            except OptionError as error:
-                said = _shorten(str(error))
+                entry = {"in": line} if is_text else json.loads(line)
+                if not isinstance(entry, dict):
+                    raise OptionError(f"{line}: {USAGE}")
+                yield _job(entry, path.parent, suffix, options, names)
+            except (ValueError, RecursionError) as error:
+                kind = "" if isinstance(error, OptionError) else "no JSON: "
+                said = f"{kind}{error}"
+                if len(said) > 2 * LONGEST:
+                    said = f"{said[:LONGEST]}...{said[-LONGEST:]}"
                 raise OptionError(f"{path}, line {number}: {said}") from None
-    if not jobs:
-        raise OptionError(f"{path} names no file: give a path a line")
-    return jobs
-
-
-def _parse(line: str) -> dict[str, Any]:
-    """Return the JSON object of a line."""
-    try:
-        entry = json.loads(line)
-    except ValueError as error:
-        raise OptionError(f"no JSON: {error}") from None
-    except RecursionError:
-        raise OptionError(f"nested too deeply: {USAGE}") from None
-    if not isinstance(entry, dict):
-        raise OptionError(f"{_shorten(line)}: {USAGE}")
-    return entry
-
-
-def _shorten(text: str) -> str:
-    """Return a text for a message; the middle of a long one is left out."""
-    half = LONGEST // 2
-    return text if len(text) <= LONGEST else f"{text[:half]}...{text[-half:]}"
 
 
 def _job(
-    entry: dict[str, Any], home: Path, suffix: str, options: ConvertOptions, names: Names | None
+    entry: dict[str, Any], home: Path, suffix: str, options: Options, names: Names | None
 ) -> Job:
     """Return the job that a line describes."""
     source, target = entry.pop("in", None), entry.pop("out", None)
@@ -190,27 +156,11 @@ def _job(
     chosen = with_numbers(replace(options, **asked), names)
     if target is None:
         path = mesh_path(PurePath(source), suffix, chosen.label)
-        path = PurePath(path.name) if _is_outside(path) else path
-    else:
-        path = PurePath(target) if isinstance(target, str) else PurePath()
-        if path.suffix.lower() not in MESH_SUFFIXES:
-            kinds = ", ".join(MESH_SUFFIXES)
-            raise OptionError(f"'out' is {target!r}: give a file, one of {kinds}")
-        if _is_outside(path):
-            raise OptionError(f"'out' is {target!r}: give a path within the output folder")
-    for name, given in (("in", source), ("out", str(path))):
-        if not _is_possible(given):
-            raise OptionError(f"{name!r} is {given!r}: no file can have this name")
+        inside = not path.is_absolute() and ".." not in path.parts
+        return Job(home / source, path.as_posix() if inside else path.name, chosen)
+    path = PurePath(target) if isinstance(target, str) else PurePath()
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise OptionError(f"'out' is {target!r}: give a file, one of {', '.join(MESH_SUFFIXES)}")
+    if path.is_absolute() or ".." in path.parts:
+        raise OptionError(f"'out' is {target!r}: give a path within the output folder")
     return Job(home / source, path.as_posix(), chosen)
-
-
-def _is_outside(path: PurePath) -> bool:
-    return path.is_absolute() or ".." in path.parts
-
-
-def _is_possible(name: str) -> bool:
-    """Return whether a file can have a name: without NUL and halves of surrogate pairs."""
-    try:
-        return b"\0" not in os.fsencode(name)
-    except UnicodeEncodeError:
-        return False

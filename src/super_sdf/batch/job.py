@@ -10,7 +10,7 @@ from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
-from ..convert import Conversion, ConvertOptions, convert
+from ..convert import convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.meshes import format_of
 from ..files.output import naming
@@ -18,8 +18,8 @@ from ..files.regular import check_grid_file
 from ..labels.files import convert_labels
 from ..labels.names import Names
 from ..network.network import Network, load_network
-from ..options import AUTO, AUTO_PRECISION, Device, Precision
-from .record import Fingerprint, Row, fingerprint
+from ..options import AUTO, AUTO_PRECISION, Device, Options, Precision
+from .record import Row, fingerprint
 
 load_once = lru_cache(maxsize=1)(load_network)
 
@@ -49,7 +49,7 @@ class Job:
 
     source: Path
     mesh: str
-    options: ConvertOptions
+    options: Options
 
     @property
     def has_label_files(self) -> bool:
@@ -63,6 +63,12 @@ class Job:
         if not self.has_label_files:
             return self.mesh
         return path.with_name(f"{path.stem}-*{path.suffix}").as_posix()
+
+    def failed(self, reason: str, *, retry: bool = True, content: Any = None) -> Row:
+        """Return the row of the job if it failed."""
+        row = {"in": os.path.abspath(self.source), "out": self.target, "status": "failed"}
+        row |= {"reason": reason, "retry": retry, "content": content}
+        return {**row, "output": None, "seconds": 0.0}
 
 
 class Result(NamedTuple):
@@ -80,25 +86,25 @@ class Result(NamedTuple):
 def convert_job(job: Job, settings: Settings, stage: Path, threads: int) -> Row:
     """Convert a file to meshes in the folder ``stage``, by the names that they will have.
 
-    An error becomes a row, too. The network is loaded once in each process; NetworkError or
-    FileError if it cannot be.
+    An error becomes a row, too. The network is loaded once in each process; what that raises is
+    raised here.
     """
-    start, content = time.perf_counter(), fingerprint(job.source)
+    start, content, precision = time.perf_counter(), fingerprint(job.source), settings.precision
     network = load_once(
-        settings.model, device=settings.device, threads=threads, precision=settings.precision
+        settings.model, device=settings.device, threads=threads, precision=precision
     )
+    row = job.failed("", content=content)
     try:
         check_grid_file(job.source)
-        folder = (stage / job.mesh).parent
         with naming(settings.folder / job.mesh):
-            folder.mkdir(parents=True, exist_ok=True)
+            (stage / job.mesh).parent.mkdir(parents=True, exist_ok=True)
         make = _make_mesh if job.options.labels is None else _make_labels
-        row = {**_paths(job), "status": "ok", "reason": None, "retry": False, "content": content}
         row |= make(job, settings, stage, network)
+        row |= {"status": "ok", "reason": None, "retry": False}
     except Exception as error:  # a bug that one file shows must not cost the others
         by_input = isinstance(error, (GridError, OptionError, FileError))
-        retry = not by_input or isinstance(error, WriteError)
-        row = failed_row(job, _reason(error), retry=retry, content=content)
+        row["retry"] = not by_input or isinstance(error, WriteError)
+        row["reason"] = _reason(error)
     row["seconds"] = round(time.perf_counter() - start, 4)
     # sentences may name files, which will be in the output folder
     staged, final = (json.dumps(str(path))[1:-1] for path in (stage, settings.folder))
@@ -106,68 +112,41 @@ def convert_job(job: Job, settings: Settings, stage: Path, threads: int) -> Row:
     return moved
 
 
-def _make_mesh(job: Job, settings: Settings, stage: Path, network: Network) -> dict[str, Any]:
+def _make_mesh(job: Job, settings: Settings, stage: Path, network: Network) -> Row:
     """Convert a file; return what its row says of the mesh."""
     target = stage / job.mesh
     keep = settings.check or settings.items is not None
     done = convert(job.source, target, network, job.options, force=True)
-    output, facts = _fingerprint_of(target), done.report()
-    if keep:
-        facts["check"] = _certify(job, done, target, output, settings)
     stages = {stage: round(seconds, 4) for stage, seconds in done.seconds.items()}
-    return {"output": output, **facts, "stages": stages}
-
-
-def _make_labels(job: Job, settings: Settings, stage: Path, network: Network) -> dict[str, Any]:
-    """Convert the labels of a file; return what its row says of their meshes."""
-    target, names = stage / job.mesh, settings.names
-    made = convert_labels(job.source, target, network, job.options, names=names, force=True)
-    labels = [
-        {**row, "output": Path(row["output"]).relative_to(stage).as_posix()}
-        for row in made.labels
-    ]
-    files = {row["output"]: _fingerprint_of(stage / row["output"]) for row in labels}
-    output = files if job.has_label_files else files[job.mesh]
-    facts = {"labels": labels, "closed": made.closed, "warnings": []}
-    return {"output": output, **made.report(), **facts}
-
-
-def _fingerprint_of(path: Path) -> Fingerprint:
-    made = fingerprint(path)
-    if made is None:
-        raise WriteError(f"{path} cannot be read again")
-    return made
-
-
-def _certify(
-    job: Job, done: Conversion, mesh: Path, output: Fingerprint, settings: Settings
-) -> dict[str, Any]:
-    """Return the certificate of a finished mesh, or under ``error`` why it has none.
-
-    What a page shows of the mesh is written into the folder for that, if there is one.
-    """
+    row = {"output": fingerprint(target), **done.report(), "stages": stages}
+    if not keep:
+        return row
     from ..check.check import check_files
 
     try:
         if settings.items is None:
-            return check_files(mesh, job.source, job.options, made=done).report()
+            found = check_files(target, job.source, job.options, made=done)
+            return {**row, "check": found.report()}
         from ..pages.items import item_of_files, keep_item
 
-        item = item_of_files(mesh, job.source, job.options, done)
-        keep_item(item, settings.items, job.target, output["sha256"])
-        return item.certificate or {}
+        item = item_of_files(target, job.source, job.options, done)
+        keep_item(item, settings.items, job.target, row["output"]["sha256"])
+        return {**row, "check": item.certificate or {}}
     except Exception as error:  # the mesh is good all the same
-        return {"error": _reason(error)}
+        return {**row, "check": {"error": _reason(error)}}
 
 
-def failed_row(job: Job, reason: str, *, retry: bool = True, content: Any = None) -> Row:
-    """Return the row of a job that failed."""
-    outcome = {"status": "failed", "reason": reason, "retry": retry, "content": content}
-    return {**_paths(job), **outcome, "output": None, "seconds": 0.0}
-
-
-def _paths(job: Job) -> Row:
-    return {"in": os.path.abspath(job.source), "out": job.target}
+def _make_labels(job: Job, settings: Settings, stage: Path, network: Network) -> Row:
+    """Convert the labels of a file; return what its row says of their meshes."""
+    target, names = stage / job.mesh, settings.names
+    made = convert_labels(job.source, target, network, job.options, names=names, force=True)
+    labels = [
+        {**row, "output": Path(row["output"]).relative_to(stage).as_posix()} for row in made.labels
+    ]
+    files = {row["output"]: fingerprint(stage / row["output"]) for row in labels}
+    output = files if job.has_label_files else files[job.mesh]
+    facts = {"labels": labels, "closed": made.closed, "warnings": []}
+    return {"output": output, **made.report(), **facts}
 
 
 def _reason(error: Exception) -> str:

@@ -31,18 +31,7 @@ Fingerprint = dict[str, Any]
 """``sha256``, ``size`` in bytes and ``mtime_ns`` of a file, as written in JSON."""
 
 Row = dict[str, Any]
-"""A line of the report.
-
-in, out : absolute path of the input; path of the output, relative to the output folder
-status, reason : "ok" and None, or "failed" and why
-retry : whether another run may succeed with the same input and options
-content, output : fingerprints of the input and of the mesh; of files of labels by their names
-version, network : of this package, and the SHA-256 of the network's file
-model, precision, asked : what was asked for, and the options of the conversion
-options : digest of all that the mesh depends on, besides the input
-check : with ``--check`` the certificate, or why there is none
-seconds : time in all; that of each stage is in ``stages``
-"""
+"""A line of the report; docs/reference/json.md says what its keys mean."""
 
 
 class RecordFile:
@@ -131,14 +120,12 @@ def outputs_of(row: Row) -> dict[str, Fingerprint]:
 
 def _is_row(row: Any) -> bool:
     """Return whether a parsed line is a row, with what is looked up in one."""
-    texts, dicts = ("in", "out", "status", "options"), ("content", "output")
-    return (
-        isinstance(row, dict)
-        and all(isinstance(row.get(key), str) for key in texts)
-        and all(isinstance(row.get(key, 0), (dict, type(None))) for key in dicts)
-        and isinstance(row.get("retry"), bool)
-        and all(isinstance(known, dict) and "sha256" in known for known in outputs_of(row).values())
-    )
+    try:
+        texts = all(isinstance(row[key], str) for key in ("in", "out", "status", "options"))
+        known = [*outputs_of(row).values(), row["content"] or {"sha256": ""}]
+        return texts and isinstance(row["retry"], bool) and all("sha256" in each for each in known)
+    except (TypeError, KeyError, AttributeError):
+        return False
 
 
 def fingerprint(path: Path) -> Fingerprint | None:
@@ -188,18 +175,14 @@ def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = Tru
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Make an output folder and hold its lock within the block; FileError if a batch has it.
-
-    It is the operating system's lock on an open file, so it ends with its process in any case.
-    """
+    """Make an output folder and hold its lock within the block; FileError if a batch has it."""
     lock = FileLock(folder / LOCK_NAME, timeout=0)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout:
-        raise FileError(
-            f"{folder} is in use by another batch: wait for it, or give another"
-        ) from None
+        said = f"{folder} is in use by another batch: wait for it, or give another"
+        raise FileError(said) from None
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise WriteError(f"{folder} cannot be written: {error.strerror}") from error

@@ -17,7 +17,7 @@ import os
 import secrets
 import shutil
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
@@ -26,11 +26,10 @@ from typing import Any
 
 from .. import __version__
 from ..files.output import naming
-from ..threads import free_memory
 from ..network.device import available_devices
 from ..network.network import find_model
-from ..threads import Resources, allot_each, count_cores
-from .job import Job, Result, Settings, convert_job, failed_row
+from ..threads import Resources, allot_each, count_cores, free_memory
+from .job import Job, Result, Settings, convert_job
 from .pool import Death, work_in_processes
 from .record import STAGE_NAME, Record, Row, file_state, fingerprint, is_unchanged, outputs_of
 
@@ -98,7 +97,7 @@ class Batch:
                     self.waiting.append(job)  # once more, after the others
                     continue
                 if isinstance(row, Death):
-                    row = failed_row(job, f"the process that converted it {row.cause}, twice")
+                    row = job.failed(f"the process that converted it {row.cause}, twice")
                 result = Result(job, self._keep(job, row, stage))
                 (self.done if result.row["status"] == "ok" else self.failed).append(result)
                 self.work_done += expected_work(job)
@@ -123,12 +122,9 @@ class Batch:
         """Convert in this process, in processes or on a cluster; yield jobs with their rows."""
         settings, threads = self.settings, self.settings.threads
         memory = self.waiting[0].options.max_memory
-        if settings.workers:
-            workers, note = useful_workers(settings.workers, len(self.waiting), memory)
-            self.notes += [note] if note else []
-        else:
-            is_large = settings.cluster is not None or self.work > SMALL_BATCH
-            workers = choose_workers(settings.device, len(self.waiting) if is_large else 1, memory)
+        is_large = settings.workers or settings.cluster is not None or self.work > SMALL_BATCH
+        jobs = len(self.waiting) if is_large else 1
+        workers = count_workers(settings.workers, settings.device, jobs, memory)
         share = Resources(threads, memory)
         if workers > 1 and settings.cluster is None:  # before the workers fill the memory
             share = allot_each(workers, threads, memory)
@@ -158,63 +154,58 @@ class Batch:
         If they may not be written, the row that is returned says why.
         """
         folder, names = self.settings.folder, list(outputs_of(row))
-        why = next(filter(None, (self._why_not(job, name) for name in names)), None)
-        if why:
-            row = failed_row(job, why, content=row["content"])
-        row |= self._how(job)
+        if why := self._why_not(job, names):
+            row = job.failed(why, content=row["content"])
         if "labels" in row:
             others = self.record.made.get(job.target, {}).keys() - set(names)
             row["beside"] = sorted(name for name in others if os.path.lexists(folder / name))
-        self.record.add(row)
-        if row["status"] == "ok":
-            try:
-                for name in names:
-                    (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                    os.replace(stage / name, folder / name)
-                    self.written[name] = job.target
-            except OSError as error:
-                why = f"{folder / name} cannot be written: {error.strerror}"
-                row = failed_row(job, why, content=row["content"]) | self._how(job)
-                self.record.add(row)
-        return row
+        self.record.add(row | self._how(job))
+        try:
+            for name in names if row["status"] == "ok" else ():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(stage / name, folder / name)
+                self.written[name] = job.target
+        except OSError as error:
+            why = f"{folder / name} cannot be written: {error.strerror}"
+            self.record.add(job.failed(why, content=row["content"]) | self._how(job))
+        return self.record.rows[job.target]
 
-    def _why_not(self, job: Job, name: str) -> str | None:
-        """Return why a job may not write a file, None if it may."""
-        path, owner = self.settings.folder / name, self.written.get(name)
-        if owner not in (None, job.target):
-            return f"{path} was written while this batch ran: give its inputs other names (out)"
-        if not os.path.lexists(path):
-            return None
-        if path.is_symlink():
-            return f"{path} is a link: remove it"
-        if os.path.realpath(path) in self.inputs:
-            return f"{path} is an input: give another folder, or another name (out)"
-        known = self.record.made.get(job.target, {}).get(name, set())
-        if self.settings.force or (known and (fingerprint(path) or {}).get("sha256") in known):
-            return None
-        why = "was changed after a batch made it" if known else "was not made by a batch"
-        return f"{path} exists and {why}: remove it or use --force"
+    def _why_not(self, job: Job, names: Iterable[str]) -> str | None:
+        """Return why a job may not write some files, None if it may."""
+        for name in names:
+            path, owner = self.settings.folder / name, self.written.get(name, job.target)
+            if owner != job.target:
+                way_out = "give its inputs other names (out)"
+                return f"{path} was written while this batch ran: {way_out}"
+            if path.is_symlink():
+                return f"{path} is a link: remove it"
+            if os.path.realpath(path) in self.inputs:
+                return f"{path} is an input: give another folder, or another name (out)"
+            if os.path.exists(path) and not self.settings.force:
+                known = self.record.made.get(job.target, {}).get(name, set())
+                if (fingerprint(path) or {}).get("sha256") not in known:
+                    why = "changed after a batch made it" if known else "not made by a batch"
+                    return f"{path} exists and was {why}: remove it or use --force"
+        return None
 
     def _plan(self, job: Job) -> None:
         """Put a job among those that are done, failed for good, refused, or to be done."""
-        row, digest = self.record.rows.get(job.target), self._digest(job)
-        if row is not None and self._holds(job, row, digest):
+        row, how = self.record.rows.get(job.target), json.loads(json.dumps(self._how(job)))
+        if row and self._holds(job, row, how["options"]):
             before = self.done_before if row["status"] == "ok" else self.failed_before
             before.append(Result(job, row))
             return
         # of files of labels those of the row are known; others show when the job has made its own
-        names = outputs_of(row or {"output": None}) if job.has_label_files else [job.target]
-        why = next(filter(None, (self._why_not(job, name) for name in names)), None)
-        if why:
-            self.failed_before.append(Result(job, failed_row(job, why) | self._how(job)))
+        names = [job.target] if not job.has_label_files else outputs_of(row) if row else []
+        if why := self._why_not(job, names):
+            self.failed_before.append(Result(job, job.failed(why) | how))
             return
         self.waiting.append(job)
-        if row is not None and row["status"] == "ok" and row["options"] != digest:
-            now = json.loads(json.dumps(self._how(job)))  # as rows are read: without tuples
-            asked, before = now["asked"], row.get("asked") or {}
+        if row and row["status"] == "ok" and row["options"] != how["options"]:
+            asked, before = how["asked"], row.get("asked") or {}
             changed = [name for name in {**asked, **before} if asked.get(name) != before.get(name)]
             others = ("version", "model", "precision", "network")
-            changed += [key for key in others if now[key] != row.get(key)]
+            changed += [key for key in others if how[key] != row.get(key)]
             self.changed[job.target] = changed or ["version"]
 
     def _holds(self, job: Job, row: Row, digest: str) -> bool:
@@ -229,32 +220,25 @@ class Batch:
             is_unchanged(settings.folder / name, known) for name, known in outputs_of(row).items()
         )
 
-    def _digest(self, job: Job) -> str:
-        """Return the hash of all that a mesh depends on, besides its grid.
-
-        Device, threads and memory do not count: the mesh asked for is the same. If the precision
-        follows the device, the network for the CPU counts.
-        """
-        settings = [self._asked(job), self.network, __version__]
-        return hashlib.sha256(json.dumps(settings).encode()).hexdigest()
-
     def _how(self, job: Job) -> Row:
-        """Return what a row says of how a mesh was made: enough to make it again."""
+        """Return what a row says of how a mesh was made: enough to make it again.
+
+        The digest is of all that a mesh depends on, besides its grid. Device, threads and memory do
+        not count: the mesh asked for is the same. If the precision follows the device, the network
+        for the CPU counts.
+        """
+        asked, names = job.options.digest(), self.settings.names
+        if job.options.labels is not None and names:  # a hash stands for the table
+            asked["names"] = hashlib.sha256(json.dumps(names).encode()).hexdigest()
+        digest = hashlib.sha256(json.dumps([asked, self.network, __version__]).encode())
         return {
             "version": __version__,
             "network": self.network[0],
             "model": self.settings.model,
             "precision": self.settings.precision,
-            "asked": self._asked(job),
-            "options": self._digest(job),
+            "asked": asked,
+            "options": digest.hexdigest(),
         }
-
-    def _asked(self, job: Job) -> Row:
-        """Return the options of a job; of names of labels, a hash stands for the table."""
-        asked, names = job.options.digest(), self.settings.names
-        if job.options.labels is None or not names:
-            return asked
-        return {**asked, "names": hashlib.sha256(json.dumps(names).encode()).hexdigest()}
 
 
 def expected_work(job: Job) -> float:
@@ -266,23 +250,14 @@ def expected_work(job: Job) -> float:
     return 1000 + float(size ** (2 / 3))
 
 
-def choose_workers(device: str, jobs: int, max_memory: int | None = None) -> int:
-    """Return how many processes to use: one per core if memory allows; one on a GPU."""
-    if device == "cuda" or (device == "auto" and "cuda" in available_devices()):
+def count_workers(asked: int, device: str, jobs: int, max_memory: int | None = None) -> int:
+    """Return how many processes to use: those asked for, or one per core, but one on a GPU.
+
+    There are no more than cores, jobs, and what the memory allows.
+    """
+    if not asked and (device == "cuda" or (device == "auto" and "cuda" in available_devices())):
         return 1
     free = max_memory or free_memory()
-    room = count_cores() if free is None else free // BYTES_PER_WORKER
-    return max(1, min(count_cores(), room, jobs))
-
-
-def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tuple[int, str | None]:
-    """Return how many of the processes asked for are useful, and a note if that is fewer."""
-    limits = [
-        (jobs, "there is no more to do"),
-        (count_cores(), "this process may use no more cores"),
-    ]
-    if max_memory is not None:
-        room = max(1, max_memory // MIN_BYTES_PER_WORKER)
-        limits.append((room, "--max-memory has no room for more"))
-    most, cause = min(limits)
-    return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"
+    each = MIN_BYTES_PER_WORKER if asked else BYTES_PER_WORKER
+    room = count_cores() if free is None else free // each
+    return max(1, min(asked or count_cores(), count_cores(), room, jobs))

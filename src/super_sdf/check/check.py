@@ -23,13 +23,12 @@ from ..files.output import check_free
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
-from ..threads import give_back, held_memory, in_words, memory_bound
-from ..threads import useful_threads
-from ..surface.mesh import Mesh
-from ..options import LENGTHS, MASK, ConvertOptions, check_distance, check_max_memory
-from ..refine.survey import Band, no_surface, survey
-from ..truth.mesh_files import merged, read_mesh
 from ..labels.volumes import volume_of_samples
+from ..options import LENGTHS, MASK, Options, check_distance, check_max_memory
+from ..refine.survey import Band, no_surface, survey
+from ..surface.mesh import Mesh
+from ..threads import give_back, held_memory, in_words, memory_bound, useful_threads
+from ..truth.mesh_files import merged, read_mesh
 from .samples import (
     NOTICEABLE,
     REACH,
@@ -49,7 +48,7 @@ BYTES_PER_SAMPLE = 150
 OFF_OF_MASKS = 0.5  # voxels by which the distances that are made of a mask may be off
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
-AS_GIVEN = ConvertOptions()
+AS_GIVEN = Options()
 FULL = 0.1  # voxels: residual at which a colour is saturated
 TOUCHING, PIERCED, NOT_TOUCHING, UNKNOWN = (
     (240, 240, 240),
@@ -200,7 +199,7 @@ def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> li
 def check_files(
     mesh: str | Path,
     grid: str | Path,
-    options: ConvertOptions = AS_GIVEN,
+    options: Options = AS_GIVEN,
     *,
     made: Any = None,
     intersections: bool = True,
@@ -215,7 +214,7 @@ def check_files(
 
 
 def read_for_check(
-    mesh: str | Path, grid: str | Path, options: ConvertOptions, made: Any = None
+    mesh: str | Path, grid: str | Path, options: Options, made: Any = None
 ) -> tuple[Mesh, SdfGrid]:
     """Return a mesh and its grid: those that were ``made``, else read from their files."""
     if made is not None:
@@ -228,7 +227,7 @@ def read_for_check(
 
 
 def check_mesh(
-    mesh: Mesh, grid: SdfGrid, options: ConvertOptions = AS_GIVEN, *, intersections: bool = True
+    mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN, *, intersections: bool = True
 ) -> Certificate:
     """Check a mesh against the grid that it was made from.
 
@@ -252,7 +251,7 @@ def check_mesh(
     return Certificate(mesh, lattice, surface, touching, strays, volume)
 
 
-def band_of(grid: SdfGrid, options: ConvertOptions = AS_GIVEN) -> Band:
+def band_of(grid: SdfGrid, options: Options = AS_GIVEN) -> Band:
     """Return the band of a grid on its cubic lattice; NoSurfaceError if it has none."""
     offset = check_distance(options.offset)
     band = survey(cubic_grid(grid, offset), offset, threads=useful_threads(0))

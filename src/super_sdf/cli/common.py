@@ -52,14 +52,6 @@ class Command(click.Command):
             raise click.ClickException(f"{named}{error.strerror or error}") from error
 
 
-class Stopped(Exception):
-    """A signal ended a command that says what it has ``kept``."""
-
-    def __init__(self, kept: str) -> None:
-        super().__init__(kept)
-        self.kept = kept
-
-
 class GroupedOption(click.Option):
     """An option with the heading under which help lists it."""
 
@@ -110,6 +102,7 @@ def table_options(*names: str, **helps: str) -> Decorator:
     return add
 
 
+# fmt: off
 SHARED = {
     "names": option("--names", type=FILE, metavar="TABLE", group=VALUES,
         help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP "
@@ -129,7 +122,8 @@ SHARED = {
     "force": option("--force", is_flag=True, help="Replace output files that exist."),
     "json": option("--json", "as_json", is_flag=True, help="Print results as JSON."),
     "quiet": option("-q", "--quiet", is_flag=True, help="Print errors only."),
-}  # fmt: skip
+}
+# fmt: on
 """Options of several commands that are not about a conversion."""
 
 
@@ -158,12 +152,6 @@ def chosen_options(given: dict[str, Any]) -> Options:
             raise OptionError(f"--jobs {given['jobs']} and --cluster {address}: leave --jobs out")
         check_modules("--cluster", "cluster")
     return chosen
-
-
-def check_names(table: Path | None, labels: Any) -> None:
-    """Raise OptionError if a table of names was given, but no labels."""
-    if table is not None and labels is None:
-        raise OptionError(f"--names {table} is for --labels: give that, too")
 
 
 def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:

@@ -18,7 +18,7 @@ from ..grid.placement import STRAIGHT
 from ..grid.planes import InputFile
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..threads import held_memory, memory_bound
-from ..options import AxisOrder, ReadOptions, Space, Values, check_path
+from ..options import AxisOrder, Options, Space, Values, check_path
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .numpy_files import NUMPY_READERS
 from .output import check_free, replacing
@@ -85,7 +85,7 @@ def read_grid(
         If the suffix, ``axes``, ``inside`` or ``field`` is unknown; if a direction is given, but
         files of the format state it; if a space is given, but the file states none.
     """
-    ReadOptions(space=space, **values)  # checks them
+    Options(space=space, **values)  # checks them
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arrays = read_array(path, given, axes, space, max_memory)
     notes, space = arrays.pop("notes"), arrays.pop("space")
@@ -218,7 +218,7 @@ def grid_from_image(
     OptionError
         If ``inside`` or ``field`` is unknown, or ``image`` is no image data (``OptionTypeError``).
     """
-    ReadOptions(**values)  # checks them
+    Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image
 
     volume = volume_of_image(image, scalars)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ..convert import describe_place
+
 from ..errors import MeshError, OptionError, seen
 from ..files.mesh_writers import World
 from ..files.meshes import (
@@ -22,7 +22,7 @@ from ..files.meshes import (
 from ..files.output import check_apart
 from ..files.regular import files_of
 from ..files.volume import PLACE
-from ..grid.sdf_grid import SdfGrid
+from ..grid.sdf_grid import SdfGrid, describe_place
 from ..network.decoder import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..progress import Progress, Stopwatch

@@ -19,7 +19,8 @@ from typing import Any
 from .. import __version__
 from ..check import check
 from ..check.check import Certificate
-from ..convert import ConvertOptions, convert
+from ..convert import convert
+from ..options import Options
 from ..files.formats import is_grid
 from ..files.output import replacing
 from ..network.decoder import Decoder
@@ -100,7 +101,7 @@ def is_page(path: Path) -> bool:
 
 def page_of_conversion(
     report: Mapping[str, Any],
-    options: ConvertOptions,
+    options: Options,
     made: Any = None,
     certificate: Certificate | None = None,
 ) -> str:
@@ -118,7 +119,7 @@ def page_of_conversion(
 
 
 def viewed_page(
-    sources: Sequence[str], load: Callable[[], Decoder], options: ConvertOptions
+    sources: Sequence[str], load: Callable[[], Decoder], options: Options
 ) -> str:
     """Return the page of some mesh files and grid files; all that it shows is within it.
 
@@ -149,7 +150,7 @@ def _whole_page(
     return make_page({**facts, "summary": summary}, meshes)
 
 
-def _viewed_grid(source: str, network: Decoder, options: ConvertOptions) -> tuple[Entry, Item]:
+def _viewed_grid(source: str, network: Decoder, options: Options) -> tuple[Entry, Item]:
     """Refine a grid; return what the page says and shows of it."""
     with TemporaryDirectory(prefix="super-sdf-") as folder:
         target = Path(folder, "mesh.ply")

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..check.check import Certificate, band_of, check_mesh, read_for_check
-from ..options import ConvertOptions
+from ..options import Options
 from ..errors import SuperSdfError
 from ..files.output import naming, replacing
 from ..grid.cubic import cubic_grid
@@ -76,7 +76,7 @@ class Item:
 def item_of_files(
     mesh: str | Path,
     grid: str | Path,
-    options: ConvertOptions,
+    options: Options,
     made: Any = None,
     certificate: Certificate | None = None,
 ) -> Item:
