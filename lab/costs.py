@@ -17,7 +17,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from super_sdf import Mesh, write_mesh
-from super_sdf.convert import ConvertOptions, convert
+from super_sdf.convert import convert
+from super_sdf.options import Options
 from super_sdf.errors import SuperSdfError
 from super_sdf.threads import forget_peak, held_memory
 from super_sdf.network.decoder import Decoder
@@ -56,7 +57,7 @@ def time_warm(grid: Path, network: Decoder, runs: int) -> Row:
     def once() -> tuple[float, float]:
         forget_peak()
         start = time.perf_counter()
-        options = ConvertOptions(inside="negative")
+        options = Options(inside="negative")
         convert(grid, grid.with_suffix(".ply"), network, options, force=True)
         return time.perf_counter() - start, (held_memory(peak=True) or 0) / 1e6
 

@@ -24,7 +24,8 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from super_sdf.convert import ConvertOptions, convert
+from super_sdf.convert import convert
+from super_sdf.options import Options
 from super_sdf.network.network import Network, find_model, load_network
 from super_sdf.options import DEFAULT_QUALITY
 from super_sdf.slabs import preparing
@@ -61,7 +62,7 @@ def write_meshes(
     path: Path, sizes: list[int], slabs: list[int], network: Network
 ) -> Iterator[tuple[str, Path]]:
     """Yield a name and the mesh file of a shape, for each size and number of slabs."""
-    shape, options = Shape.read(path), ConvertOptions(inside="negative")
+    shape, options = Shape.read(path), Options(inside="negative")
     for size in sizes:
         with tempfile.TemporaryDirectory() as name:
             source, target = write_grid(shape, size, Path(name)), Path(name) / "mesh.ply"

@@ -19,8 +19,8 @@ from scipy import ndimage
 from scipy.stats import spearmanr
 
 from super_sdf import make_grid, reconstruct
-from super_sdf.check.surface import count_components
-from super_sdf.convert import ConvertOptions, convert
+from super_sdf.convert import convert
+from super_sdf.options import Options
 from super_sdf.errors import GridError
 from super_sdf.surface.mesh import Mesh
 from super_sdf.network.decoder import Decoder
@@ -120,7 +120,7 @@ def measure_slices(path: Path, ratio: float, bench: Bench) -> Row:
         off = distance(shape.mesh, mesh, POINTS) / spacing[2]
         found[method] = {
             "distance": off,
-            "pieces": count_components(mesh.faces, len(mesh.vertices)),
+            "pieces": mesh.components()[0],
         }
     return {"methods": found}
 
@@ -188,7 +188,7 @@ def measure_check(path: Path, size: int, bench: Bench) -> Row:
     shape = Shape.read(path)
     with tempfile.TemporaryDirectory() as folder:
         grid = write_grid(shape, size, Path(folder))
-        network, options = network_of(bench.network, "auto", 0), ConvertOptions(inside="negative")
+        network, options = network_of(bench.network, "auto", 0), Options(inside="negative")
         convert(grid, grid.with_suffix(".ply"), network, options, force=True)
         found = check_files(grid.with_suffix(".ply"), grid, options, intersections=False)
     mesh, summary = found.mesh, found.touching.summary()

@@ -49,14 +49,14 @@ def test_a_line_a_check_and_the_exit_code_tells(command, models, monkeypatch):
 def test_wrong_values_fail(monkeypatch, wrong, models):
     run = network.Network.__call__
     monkeypatch.setattr(network.Network, "__call__", lambda *given, **more: run(*given) * 0 + wrong)
-    assert info.check_network("fast", "cpu").state == "failed"
+    assert info.check_network("fast", "cpu")[0] == "failed"
 
 
 def test_cuda_is_checked_where_it_is(monkeypatch, models):
     monkeypatch.setattr(device, "check_cuda", lambda: None)
     monkeypatch.setattr(device, "describe_gpu", lambda: "NVIDIA H200")
-    found = {finding.what: finding for finding in info.run_checks("auto")}
-    assert found["cuda"].says == "NVIDIA H200" and "network fast on cuda" in found
+    found = {what: says for _, what, says in info.run_checks("auto")}
+    assert found["cuda"] == "NVIDIA H200" and "network fast on cuda" in found
 
 
 MISSING = "super-sdf was installed without its networks: install it again"

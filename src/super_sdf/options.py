@@ -380,8 +380,6 @@ OPTIONS = {
 }
 BATCH_LISTS = tuple(name for name, row in OPTIONS.items() if "list" in row.shows)
 LABELS = tuple(name for name, row in OPTIONS.items() if "labels" in row.shows)
-ConvertOptions = Options
-ReadOptions = Options
 
 check_factor = OPTIONS["factor"].check
 check_distance = OPTIONS["offset"].check

@@ -11,7 +11,6 @@ import itertools
 from dataclasses import dataclass
 from typing import Any
 
-import igl.predicates
 import numpy as np
 from numpy.typing import NDArray
 
@@ -119,6 +118,8 @@ def search(mesh: Mesh, points: Points, reach: float, *, intersections: bool) -> 
     In a slab, points are looked up in the triangles within ``reach`` of it; those that are farther
     away than that in the whole mesh.
     """
+    import igl.predicates  # here, so that pages are made without it
+
     counts = intersections and hasattr(igl.predicates, "find_self_intersections")  # in new versions
     axis = int(np.ptp(mesh.vertices, axis=0).argmax())
     along = mesh.vertices[:, axis][mesh.faces]
@@ -157,6 +158,8 @@ def _count_intersections(mesh: Mesh, axis: int, first: float, last: float) -> in
     whole = (mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(1)  # with an area
     rows = np.flatnonzero(whole & (low < last) & (high >= first))
     faces = mesh.faces[rows].astype(np.int64)
+    import igl.predicates
+
     pairs = igl.predicates.find_self_intersections(mesh.vertices, faces)[1]
     begin = low[rows][pairs].max(1, initial=-np.inf)
     return int(np.count_nonzero((begin >= first) & (begin < last)))

@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import IntArray
 from ..surface.mesh import Mesh
-from ..surface.topology import (
-    Edges,
-    count_fans,
-    pair_edges,
-    vertex_components,
-    without_collapsed,
-)
+
+
+@dataclass(frozen=True)
+class Edges:
+    """Numbers of edges that are not shared by exactly two triangles of the same orientation."""
+
+    open_edges: int  # of an odd number of triangles
+    crowded_edges: int  # of more than two triangles: not manifold
+    flipped_edges: int  # of two triangles that pass them in the same direction
 
 
 @dataclass(frozen=True)
@@ -74,17 +75,16 @@ class Surface:
 
 def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surface:
     """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
-    faces, count = without_collapsed(mesh.faces), len(mesh.vertices)
-    opposite, edges = pair_edges(faces, count)
-    pinched = int(np.count_nonzero(count_fans(faces, opposite) > 1))
-    whole = Mesh(mesh.vertices, faces)
-    a, b, c = mesh.vertices[faces.T].astype(np.float64)
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-    components = count_components(faces, count)
-    size = components, self_intersections, whole.volume(), area
-    return Surface(count, len(faces), edges, pinched, *size)
-
-
-def count_components(faces: IntArray, count: int) -> int:
-    """Return the number of pieces of a mesh that share no vertex; unused vertices do not count."""
-    return len(np.unique(vertex_components(faces, count)[faces[:, 0]]))
+    a, b, c = mesh.faces.T
+    whole = Mesh(mesh.vertices, mesh.faces[(a != b) & (b != c) & (c != a)])
+    opposite, uses, flipped = whole.pair_edges()
+    return Surface(
+        len(whole.vertices),
+        len(whole.faces),
+        Edges(int((uses % 2).sum()), int((uses > 2).sum()), flipped),
+        int(np.count_nonzero(whole.count_fans(opposite) > 1)),
+        whole.components()[0],
+        self_intersections,
+        whole.volume(),
+        whole.area(),
+    )

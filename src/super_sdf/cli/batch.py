@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import SuperSdfError, WriteError, check_modules
+from ..errors import OptionError, SuperSdfError, WriteError, check_modules
 from ..files.formats import NAMED, list_formats
 from ..options import MESH_FORMATS, OPTIONS, WORK
 from . import common
@@ -77,7 +77,8 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     names = read_names(given["names"]) if given["names"] else None
     jobs, unread = find_jobs(sources, f".{given['kind']}", options, names)
     of_labels = [job.options for job in jobs if job.options.labels is not None]
-    common.check_names(given["names"], of_labels or None)
+    if names and not of_labels:
+        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
     for each in of_labels:
         check_options(each, [name for name in ("check", "report") if given[name]])
     if any(job.options.goals() for job in jobs):  # a list may say so
@@ -109,7 +110,7 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
             with suppress(SuperSdfError):
                 write_page(batch, page, "interrupted")
             done = f"{len(batch.done)} of {total} are done and kept"
-            raise common.Stopped(f"{done}; run it again to go on") from None
+            raise KeyboardInterrupt(f"{done}; run it again to go on") from None
     batch.seconds = time.perf_counter() - start
     report, failures = folder / "report.jsonl", batch.failures()
     if given["as_json"]:
@@ -129,7 +130,6 @@ def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) 
 
     A page that super-sdf wrote may be replaced, so that a batch can be resumed.
     """
-    check_modules("--report", "report")
     from ..files.regular import files_of
     from ..pages.html import is_page
     from ..pages.items import items_folder
@@ -159,30 +159,24 @@ def write_page(batch: Batch, path: Path | None, interrupted: str = "") -> None:
 
 def print_plan(plan: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
-    done = [job for job, _ in plan.done_before]
     failed = [(result.row["retry"], _failure(result.row)) for result in plan.failed_before]
     report: dict[str, list[dict[str, Any]]] = {
         "to_do": [_paths(job) for job in plan.waiting],
-        "done_before": [_paths(job) for job in done],
+        "done_before": [_paths(job) for job, _ in plan.done_before],
         "failed_before": [row for retry, row in failed if not retry],
         "refused": [row for retry, row in failed if retry],
         "unread": [{"in": path, "reason": reason} for path, reason in plan.unread],
     }
     if as_json:
         print_stdout(json.dumps({**report, "made_again": plan.made_again()}, indent=2))
-    lines = [
-        f"{kind.replace('_', ' ')}: {os.path.relpath(row['in'])}"
-        + (f": {row['reason']}" if "reason" in row else f" -> {plan.settings.folder / row['out']}")
-        for kind, rows in report.items()
-        for row in rows
-    ]
-    for line in () if as_json else lines:
-        print_stdout("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
-    counts = [
-        f"{len(rows)} {kind.replace('_', ' ')}"
-        for kind, rows in report.items()
-        if rows or kind != "unread"
-    ]
+    counts = []
+    for kind, rows in report.items():
+        words = kind.replace("_", " ")
+        counts += [f"{len(rows)} {words}"] if rows or kind != "unread" else []
+        for row in () if as_json else rows:
+            end = row.get("reason") or f"-> {plan.settings.folder / row['out']}"
+            line = f"{words}: {os.path.relpath(row['in'])} {end}"
+            print_stdout("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
     for line in (*made_again_lines(plan), ", ".join(counts)):
         print_stderr(line)
 
@@ -199,49 +193,39 @@ def _paths(job: Job) -> dict[str, Any]:
 
 
 def _failure(row: dict[str, Any]) -> dict[str, Any]:
-    return {"in": row["in"], "out": row["out"], "reason": row["reason"]}
+    return {name: row[name] for name in ("in", "out", "reason")}
 
 
 def remarks(batch: Batch, report: Path) -> list[str]:
-    """Return notes, and how many new meshes have which notes and warnings in the report."""
+    """Return notes, and how many of the new meshes have notes and warnings in the report."""
     rows = [result.row for result in batch.done]
-    few = [row["simplified"] for row in rows if "simplified" in row]
+    noted = sum(bool(row["inferred"] or row.get("missing")) for row in rows)
+    warned = sum(bool(row["warnings"] or row.get("beside")) for row in rows)
     checks = [row["check"] for row in rows if "check" in row]
-    residuals = [check["residual"]["mean"] for check in checks if check.get("residual")]
-    values = [
-        row
-        for row in rows  # with warnings otherwise than of an open mesh, or of its simplification
-        if len(row["warnings"]) > (not row["closed"]) + len(row.get("simplified", {}).get("warnings", ()))
-    ]  # fmt: skip
+    means = [check["residual"]["mean"] for check in checks if check.get("residual")]
     counts = {
-        "Note: {} have notes on how they were read": [row for row in rows if row["inferred"]],
-        "Note: {} lack labels that were asked for": [row for row in rows if row.get("missing")],
-        "Warning: {} have files of labels from other runs": [r for r in rows if r.get("beside")],
-        "Warning: {} are from noisy or contradictory values": values,
-        "Warning: {} were not simplified as asked": [each for each in few if each["warnings"]],
-        "Warning: {} without a residual": checks[len(residuals) :],
+        "Note: {} have notes": noted,
+        "Warning: {} have warnings": warned,
+        "Warning: {} have no residual": len(checks) - len(means),
+        f"Check: mean residual {max(means, default=0):.4f} voxels at most, of {{}}": len(means),
     }
-    lines = [f"Note: {note}" for note in batch.notes]
-    lines += [f"{text.format(len(some))}: see {report}" for text, some in counts.items() if some]
-    if few:
-        before, after = (sum(each[key] for each in few) for key in ("triangles_before", "triangles"))
-        lines.append(f"Simplified: from {before:,} to {after:,} triangles; see the report")
-    if residuals:
-        lines.append(f"Check: mean residual {max(residuals):.4f} voxels at most; see the report")
-    return lines
+    lines = [f"{text.format(count)}: see {report}" for text, count in counts.items() if count]
+    return [*(f"Note: {note}" for note in batch.notes), *lines]
 
 
 def sentence(batch: Batch) -> str:
     """Return in one line what was done."""
     facts, seconds = summary(batch), round(batch.seconds)
-    words, more = f"{facts['done']} done, {facts['failed']} failed", ["done_before", "not_begun"]
-    if not (batch.done or batch.failed or batch.waiting):
-        words, more = "nothing to do", ["done_before", "failed_before", "refused"]
-    counts = [f"{facts[kind]} {kind.replace('_', ' ')}" for kind in more if facts[kind]]
-    said = ", ".join([words, *counts])
-    retry = " (--retry tries again)" if "failed before" in said else ""
+    if batch.done or batch.failed or batch.waiting:
+        counts = [f"{facts['done']} done, {facts['failed']} failed"]
+        more = {"done before": facts["done_before"], "not begun": facts["not_begun"]}
+    else:
+        counts, retry = [f"nothing to do: {facts['done_before']} done before"], "--retry tries again"
+        more = {f"failed before ({retry})": facts["failed_before"], "refused": facts["refused"]}
+    counts += [f"{count} {kind}" for kind, count in more.items() if count]
     time_ = f"{batch.seconds:.1f} s" if seconds < 60 else f"{seconds // 60} min {seconds % 60} s"
-    return f"{said}{retry}; {facts['closed']} meshes closed, {facts['open']} open; {time_}"
+    closed = f"{facts['closed']} meshes closed, {facts['open']} open"
+    return f"{', '.join(counts)}; {closed}; {time_}"
 
 
 def summary(batch: Batch) -> dict[str, Any]:

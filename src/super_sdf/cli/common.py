@@ -52,14 +52,6 @@ class Command(click.Command):
             raise click.ClickException(f"{named}{error.strerror or error}") from error
 
 
-class Stopped(Exception):
-    """A signal ended a command that says what it has ``kept``."""
-
-    def __init__(self, kept: str) -> None:
-        super().__init__(kept)
-        self.kept = kept
-
-
 class GroupedOption(click.Option):
     """An option with the heading under which help lists it."""
 
@@ -110,6 +102,7 @@ def table_options(*names: str, **helps: str) -> Decorator:
     return add
 
 
+# fmt: off
 SHARED = {
     "names": option("--names", type=FILE, metavar="TABLE", group=VALUES,
         help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP "
@@ -125,11 +118,12 @@ SHARED = {
         help="Check each mesh against its samples, as check does. Needs the extra report."),
     "report": option("--report", type=FILE, metavar="PAGE.html",
         help="Also write a page for the browser: figures, times, warnings, the check of each mesh, "
-        "and a 3-D view of it beside coarse marching cubes. Needs the extra report."),
+        "and a 3-D view of it beside coarse marching cubes. The check needs the extra report."),
     "force": option("--force", is_flag=True, help="Replace output files that exist."),
     "json": option("--json", "as_json", is_flag=True, help="Print results as JSON."),
     "quiet": option("-q", "--quiet", is_flag=True, help="Print errors only."),
-}  # fmt: skip
+}
+# fmt: on
 """Options of several commands that are not about a conversion."""
 
 
@@ -160,17 +154,10 @@ def chosen_options(given: dict[str, Any]) -> Options:
     return chosen
 
 
-def check_names(table: Path | None, labels: Any) -> None:
-    """Raise OptionError if a table of names was given, but no labels."""
-    if table is not None and labels is None:
-        raise OptionError(f"--names {table} is for --labels: give that, too")
-
-
 def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
     """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
     from ..files.output import check_apart, check_free
 
-    check_modules(word, "report")
     if page.suffix.lower() not in (".html", ".htm"):
         raise OptionError(f"{page} is not a page: give {word} a file .html or .htm")
     check_free(page, force=force)

@@ -6,7 +6,7 @@ import json
 import platform
 import sys
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 
@@ -47,23 +47,22 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
         raise errors.OptionError(f"{source} and --check: give only one of them")
     if check:
         findings = []
-        for finding in run_checks(device):
-            findings.append(finding)
+        for state, what, says in run_checks(device):
+            findings.append({"state": state, "what": what, "says": says})
             if not as_json:
-                print_stdout(f"{finding.state:<8} {finding.what}: {finding.says}")
-        failed = sum(finding.state == FAILED for finding in findings)
+                print_stdout(f"{state:<8} {what}: {says}")
+        failed = sum(finding["state"] == FAILED for finding in findings)
         said = f"{failed} of {len(findings)} checks failed" if failed else "What is installed works."
-        facts: dict[str, Any] = {"works": not failed, "findings": [finding._asdict() for finding in findings]}
-        print_stdout(json.dumps(facts, indent=2) if as_json else said)
-    elif source is not None:
-        from ..files.grids import describe_grid_file
-
-        facts, failed = describe_grid_file(source), 0
-        print_stdout(json.dumps(facts, indent=2) if as_json else "\n".join(in_words(facts)))
+        facts: dict[str, Any] = {"works": not failed, "findings": findings}
     else:
-        facts = gather_facts()
-        print_stdout(json.dumps(facts, indent=2) if as_json else "\n".join(in_words(facts)))
-        failed = not facts["models"] or any("fault" in card for card in facts["models"].values())
+        if source is not None:
+            from ..files.grids import describe_grid_file
+
+        facts = gather_facts() if source is None else describe_grid_file(source)
+        cards = facts.get("models", {}).values()
+        failed = "fault" in facts or any("fault" in card for card in cards)
+        said = "\n".join(in_words(facts))
+    print_stdout(json.dumps(facts, indent=2) if as_json else said)
     if failed:
         sys.exit(1)
 
@@ -78,12 +77,15 @@ def in_words(facts: dict[str, Any]) -> Iterator[str]:
                 yield from (f"  {line}" for line in in_words(inner))
         elif isinstance(value, (list, tuple)) and value and isinstance(value[0], dict):
             for inner in value:  # the grids of a file of OpenVDB
-                words = (f"{x:,}" if isinstance(x, int) else str(x) for x in inner.values() if x)
+                said = [x for x in inner.values() if x]
+                words = (f"{x:,} active voxels" if isinstance(x, int) else str(x) for x in said)
                 yield f"{name.removesuffix('s')}: {', '.join(words)}"
-        elif isinstance(value, (list, tuple)):
+        elif key == "notes":
+            yield from (f"note: {note}" for note in value)
+        elif isinstance(value, (list, tuple)) and value:
             words = (f"{x:.10g}" if isinstance(x, (int, float)) else str(x) for x in value)
             yield f"{name}: {', '.join(words)}"
-        else:
+        elif value not in ([], ()):
             text = f"{value:,}" if isinstance(value, int) else str(value)
             yield f"{name}: {'not stated' if value is None else text}"
 
@@ -111,32 +113,24 @@ def gather_facts() -> dict[str, Any]:
     }
 
 
-class Finding(NamedTuple):
-    """The result of a check: "ok", "missing" (an optional part is not installed) or "failed"."""
-
-    state: str
-    what: str
-    says: str
-
-
-def run_checks(device: Device) -> Iterator[Finding]:
-    """Yield what works here: CUDA ("auto": if onnxruntime is built for it), networks, extras."""
+def run_checks(device: Device) -> Iterator[tuple[str, str, str]]:
+    """Yield state, name and words of each check; CUDA is needed if onnxruntime is built for it."""
     from ..network.device import available_devices, check_cuda, describe_gpu, onnxruntime_version
     from ..network.network import NO_NETWORKS, shipped_models
 
     versions = f"super-sdf {__version__}, Python {platform.python_version()}"
-    yield Finding(OK, "versions", f"{versions}, {onnxruntime_version()}")
+    yield (OK, "versions", f"{versions}, {onnxruntime_version()}")
     devices: list[Device] = ["cpu"]
     if device != "cpu":
         try:
             check_cuda()
             devices.append("cuda")
-            yield Finding(OK, "cuda", describe_gpu() or "its libraries are there")
+            yield (OK, "cuda", describe_gpu() or "its libraries are there")
         except errors.DeviceError as error:
             needed = device == "cuda" or "cuda" in available_devices()
-            yield Finding(FAILED if needed else MISSING, "cuda", str(error))
+            yield (FAILED if needed else MISSING, "cuda", str(error))
     if not shipped_models():
-        yield Finding(FAILED, "networks", NO_NETWORKS)
+        yield (FAILED, "networks", NO_NETWORKS)
     for name in shipped_models():
         for each in devices[:1] if name.endswith("-int8") else devices:
             yield check_network(name, each)
@@ -144,10 +138,10 @@ def run_checks(device: Device) -> Iterator[Finding]:
         lacking, says = errors.missing_modules(modules), ", ".join(modules)
         if lacking:
             says = f"no {', '.join(lacking)}: {errors.how_to_install(name)}"
-        yield Finding(MISSING if lacking else OK, f"extra {name}", says)
+        yield (MISSING if lacking else OK, f"extra {name}", says)
 
 
-def check_network(name: str, device: Device) -> Finding:
+def check_network(name: str, device: Device) -> tuple[str, str, str]:
     """Refine a ball with a shipped network on a device."""
     import numpy as np
 
@@ -163,8 +157,8 @@ def check_network(name: str, device: Device) -> Finding:
         network = load_network(name, device=device, precision=FLOAT32)  # its own file
         found = reconstruct(grid, network, mesher=MARCHING).vertices
     except errors.SuperSdfError as error:
-        return Finding(FAILED, what, str(error))
+        return (FAILED, what, str(error))
     off = float(np.abs(np.linalg.norm(found - CENTRE, axis=1) - RADIUS).max())
     works = off <= most  # False for NaN
     says = f"off by {off:.3f} voxels at most on a ball" + f"; allowed are {most}" * (not works)
-    return Finding(OK if works else FAILED, what, says)
+    return (OK if works else FAILED, what, says)

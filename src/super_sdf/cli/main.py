@@ -14,7 +14,7 @@ from types import FrameType
 import click
 
 from .. import __version__
-from .common import CONTEXT, Stopped, print_stderr, print_stdout
+from .common import CONTEXT, print_stderr, print_stdout
 
 COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
@@ -68,7 +68,12 @@ def run() -> int:
     for number in SIGNALS:
         if before[number] not in (signal.SIG_IGN, None):
             signal.signal(number, hear)
-    open_missing_streams()
+    for number in range(3):  # a standard stream that is closed; else the next file gets its text
+        with suppress(OSError):
+            os.fstat(number)
+            continue
+        os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+    sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(os.devnull, "w")
     try:
         code = cli.main(standalone_mode=False)  # a number if a command ended early
         return code if isinstance(code, int) else 0
@@ -78,25 +83,14 @@ def run() -> int:
         if heard:  # also what a library has made of the interrupt
             name = signal.Signals(heard[0]).name
             said = "interrupted" if name == "SIGINT" else f"ended by {name}"
-            kept = f": {error.kept}" if isinstance(error, Stopped) else ""
-            return end(said + kept, 128 + heard[0])
+            kept = getattr(error.__cause__, "args", ())  # of a command that says what it has kept
+            return end(f"{said}: {kept[0]}" if kept else said, 128 + heard[0])
         if isinstance(error, click.ClickException):
             return end(error.format_message(), error.exit_code)
         raise
     finally:
         for number in SIGNALS:
             signal.signal(number, before[number])
-
-
-def open_missing_streams() -> None:
-    """Open null devices for closed standard streams; else the next file would get their text."""
-    for number in range(3):
-        try:
-            os.fstat(number)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
-    sys.stdout = sys.stdout or open(1, "w", closefd=False)
-    sys.stderr = sys.stderr or open(2, "w", closefd=False)
 
 
 def end(line: str, code: int) -> int:

@@ -42,21 +42,34 @@ NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 @common.shared("names", "cluster", "jobs", "check")
 @option("--save-field", metavar="FIELD",
     help="Also write the refined field: .npz for the values near the surface, .vdb for a level set "
-    "of OpenVDB, .npy or .vti for the whole fine lattice.")
+    "of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti.")
 @common.shared("report", "force", "json", "quiet")
 @option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
 # fmt: on
 def command(source: str, target: str, **given: Any) -> None:
-    """Convert one grid to a mesh."""
+    """Convert one grid to a mesh, or the labels of an image to meshes."""
     options, watch = common.chosen_options(given), Stopwatch()
-    common.check_names(given["names"], options.labels)
-    if options.labels is None:
-        check_outputs(source, target, options, given)
+    check_outputs(source, target, options, given)
     from ..network.network import digest_of_model, load_network
 
     network = load_network(**options.network())
     watch.lap("load network")
-    model = options.network()["model"]
+    done: Any
+    force = given["force"]
+    with common.progress_bar("upsampling", given["quiet"]) as progress:
+        where = source, target, network, options
+        if options.labels is None:
+            from ..convert import convert
+
+            done = convert(*where, progress=progress, save_field=given["save_field"], force=force)
+        else:
+            from ..labels.files import convert_labels
+            from ..labels.names import read_names
+
+            names = read_names(given["names"]) if given["names"] else None
+            done = convert_labels(*where, progress=progress, names=names, force=force)
+    watch.take(done.seconds)
+    model, notes = options.network()["model"], [*done.remarks(), *network.notes]
     report = {
         "input": source,
         "output": target,
@@ -67,54 +80,9 @@ def command(source: str, target: str, **given: Any) -> None:
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),
+        **done.report(),
     }
-    work = upsample_grid if options.labels is None else upsample_labels
-    lines = work(source, target, network, options, given, report, watch)
-    report["seconds"] = watch.rounded()
-    if given["as_json"]:
-        print_stdout(json.dumps(report, indent=2), f"{target} is written")
-    for line in () if given["quiet"] else lines:
-        print_stderr(line)
-
-
-def check_outputs(source: str, target: str, options: Options, given: dict[str, Any]) -> None:
-    """Raise an error for what can be seen to fail before the work."""
-    from ..files.meshes import check_target
-    from ..files.regular import files_of
-
-    force, field = given["force"], given["save_field"]
-    check_target(target, force=force, unit=options.unit)
-    if field is not None:
-        from ..files.fields import check_field_target
-
-        check_field_target(field, force=force)
-    if given["report"]:
-        outputs = (target, field) if field else (target,)
-        common.check_page("--report", given["report"], [*files_of(source), *outputs], force=force)
-    if given["cluster"] is not None:
-        raise OptionError("--cluster is for batch: leave it out")
-    elif given["jobs"]:
-        raise OptionError(f"--jobs {given['jobs']} is for --cluster local: give that, or no --jobs")
-
-
-def upsample_grid(
-    source: str,
-    target: str,
-    network: Any,
-    options: Options,
-    given: dict[str, Any],
-    report: dict[str, Any],
-    watch: Stopwatch,
-) -> list[str]:
-    """Convert a grid, check its mesh and write its page if asked for; return what to print."""
-    force, page, certificate = given["force"], given["report"], None
-    with common.progress_bar("upsampling", given["quiet"]) as progress:
-        told = {"force": force, "progress": progress}
-        from ..convert import convert
-
-        done = convert(source, target, network, options, save_field=given["save_field"], **told)
-    watch.take(done.seconds)
-    report |= done.report()
+    certificate = None
     if given["check"]:
         from ..check.check import check_files
 
@@ -124,75 +92,94 @@ def upsample_grid(
             raise type(error)(f"{error}; {target} is written, but not checked") from error
         report["check"] = certificate.report()
         watch.lap("check")
-    if page:
+    if given["report"]:
         from ..pages.html import page_of_conversion, write_page
 
-        said = {"seconds": watch.rounded(), "notes": [*done.remarks(), *network.notes]}
-        text = page_of_conversion({**report, **said}, options, done, certificate)
-        write_page(text, page, force=force)
+        said = {**report, "seconds": watch.rounded(), "notes": notes}
+        text = page_of_conversion(said, options, done, certificate)
+        write_page(text, given["report"], force=force)
         watch.lap("page")
-    lines = [f"Note: {note}" for note in (*done.notes, *done.remarks(), *network.notes)]
+    report["seconds"] = watch.rounded()
+    if given["as_json"]:
+        print_stdout(json.dumps(report, indent=2), f"{target} is written")
+    if given["quiet"]:
+        return
+    lines = [f"Note: {note}" for note in (*done.notes, *notes)]
     lines += [f"Warning: {warning}" for warning in done.warnings]
     if given["verbose"]:
         keys = ("shape", "spacing", "origin", "device", "band_voxels", "nodes")
-        lines += [f"{key.replace('_', ' ')}: {report[key]}" for key in keys]
+        lines += [f"{key.replace('_', ' ')}: {report[key]}" for key in keys if key in report]
         lines += [f"{stage}: {seconds:.3f} s" for stage, seconds in watch.seconds.items()]
-    counts, few = done.counts, done.simplified
-    low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in done.bounds)
+    describe = describe_mesh if options.labels is None else describe_labels
+    lines += describe(report, f"{sum(watch.seconds.values()):.1f} s")
+    lines += [f"Check: {certificate.summary()}"] if certificate else []
+    lines += [f"Report: {given['report']}"] * bool(given["report"])
+    for line in lines:
+        print_stderr(line)
+
+
+def check_outputs(source: str, target: str, options: Options, given: dict[str, Any]) -> None:
+    """Raise an error for what can be seen to fail before the work."""
+    from ..files.regular import files_of
+
+    force, field = given["force"], given["save_field"]
+    if given["names"] and options.labels is None:
+        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
+    if options.labels is not None:
+        from ..labels.files import check_options
+
+        check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
+    else:
+        from ..files.meshes import check_target
+
+        check_target(target, force=force, unit=options.unit)
+    if field is not None:
+        from ..files.fields import check_field_target
+
+        check_field_target(field, force=force)
+    if given["report"]:
+        outputs = (target, field) if field else (target,)
+        common.check_page("--report", given["report"], [*files_of(source), *outputs], force=force)
+    if given["cluster"] is not None:
+        raise OptionError("--cluster is for batch: leave it out")
+    if given["jobs"]:
+        raise OptionError(f"--jobs {given['jobs']} is for --cluster local: give that, or no --jobs")
+
+
+def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:
+    """Return lines on a mesh, its field and how it was simplified."""
+    few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
+    low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in report["bounds"])
     hint = "; far fewer triangles within 0.02 voxels of these: --simplify 0.02"
-    lines.append(
-        f"{target}: {counts['vertices']:,} vertices, {counts['triangles']:,} triangles, "
-        f"{'closed' if done.closed else 'open'}, from {low} to {high}, "
-        f"{sum(watch.seconds.values()):.1f} s" + hint * (not few and counts["triangles"] > MANY)
-    )
-    if field := done.saved_field:
+    lines = [
+        f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "
+        f"{'closed' if report['closed'] else 'open'}, from {low} to {high}, {seconds}"
+        + hint * (not few and triangles > MANY)
+    ]
+    if field:
         shape = " x ".join(map(str, field["shape"]))
         place = [", ".join(f"{x:.12g}" for x in field[key]) for key in ("spacing", "origin")]
-        said_of = f"lattice {shape}, spacing {place[0]}, origin {place[1]}"
-        lines.append(f"{given['save_field']}: the refined field, {said_of}")
+        said = f"lattice {shape}, spacing {place[0]}, origin {place[1]}"
+        lines.append(f"{field['path']}: the refined field, {said}")
     if few:
-        off = few["deviation"]
+        off, unit = few["deviation"], report["asked"]["unit"] or "in world units"
         largest = max(off["largest"], off["largest_back"]) * few["voxel_size"]
         lines.append(
             f"Simplified: from {few['triangles_before']:,} to {few['triangles']:,} triangles; "
             f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
             f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}; "
-            f"at most {largest:.4g} {options.unit or 'in world units'}"
+            f"at most {largest:.4g} {unit}"
         )
-    lines += [f"Check: {certificate.summary()}"] if certificate else []
-    return lines + [f"Report: {page}"] * bool(page)
+    return lines
 
 
-def upsample_labels(
-    source: str,
-    target: str,
-    network: Any,
-    options: Options,
-    given: dict[str, Any],
-    report: dict[str, Any],
-    watch: Stopwatch,
-) -> list[str]:
-    """Convert the labels of an image to meshes; return what to print."""
-    from ..labels.files import check_options, convert_labels
-    from ..labels.names import read_names
-
-    check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
-    names = read_names(given["names"]) if given["names"] else None
-    with common.progress_bar("upsampling", given["quiet"]) as progress:
-        made = convert_labels(
-            source, target, network, options, names=names, force=given["force"], progress=progress
-        )
-    watch.take(made.seconds)
-    report |= made.report()
-    notes = (*made.grid.notes, *made.notes, *made.remarks(), *network.notes)
-    return [
-        *(f"Note: {note}" for note in notes),
-        *(
-            f"{row['output']}: {row['name']}, {row['vertices']:,} vertices, "
-            f"{row['triangles']:,} triangles, "
-            f"{row['components']:,} closed component{'s' * (row['components'] != 1)}, "
-            f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
-            for row in made.labels
-        ),
-        f"{len(made.labels)} labels, {sum(watch.seconds.values()):.1f} s",
+def describe_labels(report: dict[str, Any], seconds: str) -> list[str]:
+    """Return a line on the mesh of each label."""
+    lines = [
+        f"{row['output']}: {row['name']}, {row['vertices']:,} vertices, "
+        f"{row['triangles']:,} triangles, "
+        f"{row['components']:,} closed component{'s' * (row['components'] != 1)}, "
+        f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
+        for row in report["labels"]
     ]
+    return [*lines, f"{len(lines)} labels, {seconds}"]

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import ArrayLike
 
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
 from ..options import check_path
@@ -40,8 +39,8 @@ def write_vti(field: FineField, path: Path) -> None:
     for first, planes in lattice_planes(field):
         values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
     extent = " ".join(f"0 {nodes - 1}" for nodes in grid.shape)
-    place = zip(("Origin", "Spacing", "Direction"), (grid.origin, grid.spacing, grid.direction))
-    placed = " ".join(f'{name}="{_listed(numbers)}"' for name, numbers in place)
+    place = {"Origin": grid.origin, "Spacing": grid.spacing, "Direction": np.ravel(grid.direction)}
+    placed = " ".join(f'{n}="{" ".join(map(repr, map(float, at)))}"' for n, at in place.items())
     head = (
         '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
         f'<ImageData WholeExtent="{extent}" {placed}>\n<Piece Extent="{extent}">\n'
@@ -53,10 +52,6 @@ def write_vti(field: FineField, path: Path) -> None:
         file.write(head.encode("ascii") + struct.pack("<Q", values.nbytes))
         file.write(values.data)
         file.write(b"\n</AppendedData>\n</VTKFile>\n")
-
-
-def _listed(numbers: ArrayLike) -> str:
-    return " ".join(map(repr, np.ravel(numbers).tolist()))
 
 
 FIELD_TABLE: dict[str, Callable[[FineField, Path], None]] = {

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import BoolArray, Triple
 from ..errors import GridError, OptionTypeError, seen
-from ..options import AUTO, FieldKind, Inside, ReadOptions
+from ..options import AUTO, FieldKind, Inside, Options
 from .census import Census, Extremes, not_finite
 from .distances import check_negative_inside, choose_spacing
 from .field import Field
@@ -270,7 +270,7 @@ def make_grid(
     OptionError
         If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
-    wanted = ReadOptions(inside=inside, field=field, label=label, level=level, scale=scale)
+    wanted = Options(inside=inside, field=field, label=label, level=level, scale=scale)
     given = placed(values, spacing, origin)
     taken, notes = interpret(as_samples(given.values), wanted, given.spacing)
     origin = given.origin
@@ -341,3 +341,26 @@ def negated(values: NDArray[Any]) -> NDArray[Any]:
     floats: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
     np.negative(floats, out=floats)
     return floats
+
+
+def describe_place(grid: SdfGrid) -> dict[str, Any]:
+    """Return where the samples of a grid lie, for JSON."""
+    return {
+        "shape": list(grid.shape),
+        "spacing": list(grid.spacing),
+        "origin": list(grid.origin),
+        "direction": [list(row) for row in grid.direction],
+        "space": grid.space,
+    }
+
+
+def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
+    """Return the volume of the samples inside, each of which counts as a box."""
+    planes = (grid.planes(nth, nth + 1) for nth in range(grid.shape[0]))
+    inside = sum(int(np.count_nonzero(plane <= offset)) for plane in planes)
+    return inside * float(np.prod(grid.spacing))
+
+
+def mean_spacing(grid: SdfGrid) -> float:
+    """Return the edge of a cube with the volume of a box round a sample."""
+    return float(np.prod(grid.spacing) ** (1 / 3))
