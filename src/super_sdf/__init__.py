@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from .refine.field import FineField as FineField
     from .refine.field import fine_grid as fine_grid
     from .simplify.simplify import simplify_mesh as simplify_mesh
-    from .surface.mesh import Mesh as Mesh
     from .surface.extract import extract_mesh as extract_mesh
+    from .surface.mesh import Mesh as Mesh
 
 MODULES = {
     "errors": "SuperSdfError",
