@@ -16,7 +16,6 @@ from skimage.measure import marching_cubes
 from super_sdf import Mesh, load_network, make_grid, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
 from super_sdf.labels import reconstruct as whole_run
-from super_sdf.labels.files import MOST_FILES, label_paths
 from super_sdf.labels.image import find_image
 from super_sdf.labels.reconstruct import reconstruct_labels
 from super_sdf.threads import held_memory
@@ -259,13 +258,6 @@ def test_one_file_holds_all_labels_as_parts(image, suffix, command):
     assert len(one & other) > 25  # the vertices of the wall
 
 
-def test_all_files_are_written_or_none(image, command):
-    Path("organ-12.ply").write_text("mine")
-    code, _, err = command("upsample", image, "organ.ply", "--labels", "all", *PLAIN)
-    assert (code, err) == (1, "Error: organ-12.ply exists: remove it or use --force\n")
-    assert sorted(path.name for path in Path().iterdir()) == ["organ-12.ply", image]
-
-
 @pytest.mark.parametrize(
     ("words", "name"),
     [
@@ -283,10 +275,3 @@ def test_options_that_would_tear_the_walls_are_refused(words, name, image, comma
         "one label (--label)",
     )
     assert not Path("a-1.ply").exists()
-
-
-def test_too_many_files_are_refused_and_parts_are_not():
-    many = list(range(MOST_FILES + 1))
-    with pytest.raises(OptionError, match=r"^a.ply would be 501 files, one for each label: give "):
-        label_paths("a.ply", many)
-    assert set(label_paths("a.glb", many)) == {Path("a.glb")}
