@@ -134,7 +134,7 @@ def convert(
 
         check_apart(save_field, files)
         shape = lattice_shape(grid.shape, options.factor)
-        check_field_fits(Path(save_field), shape, options.max_memory)
+        check_field_fits(Path(save_field), shape)
         saving = saving_field(save_field, force=force)
     watch.lap("read")
     shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress

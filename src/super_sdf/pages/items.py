@@ -88,10 +88,9 @@ def item_of_files(
         item.certificate = {"error": str(error)}
     item.show(RESULT, shown, certificate)
     lattice = cubic_grid(samples, options.offset)
-    hidden = lattice.field.unseen is not None
-    if lattice.field.unseen is None and len(
-        (coarse := coarse_surface(lattice, options.offset)).faces
-    ):
+    known = lattice.field.unseen is None  # beside what is unknown, a coarse surface is made up
+    coarse = coarse_surface(lattice, options.offset) if known else None
+    if coarse and len(coarse.faces):
         if certificate:
             checked = check_mesh(coarse, samples, options, intersections=False)
         title = COARSE + (", made equally spaced" if lattice.shape != samples.shape else "")
