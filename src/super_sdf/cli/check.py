@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from ..errors import check_modules
-from ..options import OPTIONS, Options
+from ..options import READ, Options
 from .common import CONTEXT, FILE, Command, option, print_stderr, print_stdout, shared, table_options
 
 EXAMPLES = """\b
@@ -18,7 +18,6 @@ Examples:
   super-sdf check part.ply part.npz
   super-sdf check part.ply part.npz --out coloured.ply --max-mean 0.01 --no-faults
 """
-READ = tuple(name for name, row in OPTIONS.items() if "read" in row.shows)
 
 
 # fmt: off
