@@ -57,6 +57,7 @@ QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
 GOALS = ("simplify", "tolerance", "triangles")
 """Of these at most one may be given."""
 
+
 class Kind(NamedTuple):
     """What the values of an option are."""
 
@@ -86,10 +87,10 @@ def number(
         if not isinstance(value, of) or isinstance(value, bool):
             raise OptionTypeError(f"{name} is {seen(value)}: give {kind}")
         with suppress(OverflowError):  # a whole number beyond 1.8e308
-            value = make(value)
-            if isfinite(value) and above < value <= most and not (step and value % step):
-                return value
-        raise OptionError(f"{name} is {seen(value)}: give {give}")
+            found = make(value)
+            if isfinite(found) and above < found <= most and not (step and found % step):
+                return found
+        raise OptionError(f"{name} is {seen(int(value) if step else value)}: give {give}")
 
     def parse(given: str) -> Any:
         with suppress(ValueError):
@@ -223,7 +224,6 @@ class Values(TypedDict, total=False):
     scale: float | None
 
 
-# fmt: off  # a row an option
 @dataclass(frozen=True)
 class Options:
     """What a conversion may be told; see ``read_grid``, ``reconstruct``, ``load_network``.
@@ -232,6 +232,7 @@ class Options:
     of a batch and what the mesh depends on, "labels" for what goes with ``labels``.
     """
 
+    # fmt: off
     factor: int = _option(4, MESH, "list labels", FACTOR,
         "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.", metavar="K")
     _: KW_ONLY
