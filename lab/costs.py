@@ -3,32 +3,142 @@
 from __future__ import annotations
 
 import json
+import os
+import platform
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
+from importlib.metadata import version
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from super_sdf import Mesh, write_mesh
 from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import SuperSdfError
 from super_sdf.machine.memory import forget_peak, held_memory
+from super_sdf.machine.system import described, processor_name
 from super_sdf.network.decoder import Decoder
+from super_sdf.threads import count_cores
+from super_sdf.truth.sampling import sample_solid, unit_layout
 
+from .forms import torus
 from .measuring import network_of
-from .processes import median_of, run_python, timed, upsample_words, write_grid, write_torus
 from .rows import Row
 from .shapes import Shape, spread
 
 if TYPE_CHECKING:
     from .figures import Bench
+
+MAJOR, MINOR = 0.28, 0.11  # radii of the torus of ``write_torus``
+FLAGS = ("avx", "avx2", "avx512f", "avx512_vnni", "avx_vnni", "amx_int8")
+# Runs Python with its arguments; prints exit code, seconds, and the peak of memory in bytes. That
+# peak includes what the parent held when it started the process, so the parent has to be small.
+LAUNCHER = """
+import os, sys, time
+sys.path[:] = filter(None, sys.path)  # nothing from the current folder
+start = time.perf_counter()
+child = os.spawnv(os.P_NOWAIT, sys.executable, [sys.executable, *sys.argv[1:]])
+_, status, usage = os.wait4(child, 0)
+seconds, code = time.perf_counter() - start, os.waitstatus_to_exitcode(status)
+print()
+print(code, seconds, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024))
+"""
+
+
+class Taken(NamedTuple):
+    """What a process took, and what it printed."""
+
+    seconds: float
+    peak: int
+    code: int
+    printed: str
+    errors: str
+
+    @property
+    def peak_mb(self) -> float:
+        """The peak of memory in MB."""
+        return self.peak / 1e6
+
+
+def describe_machine() -> str:
+    """Return the processor and the versions that times depend on, in one line."""
+    about = machine()
+    return (
+        f"{about['processor']}, {about['cores']} cores, {about['system']}, Python "
+        f"{about['python']}, NumPy {about['numpy']}, onnxruntime {about['onnxruntime']}"
+    )
+
+
+def machine() -> dict[str, Any]:
+    """Return the processor, its instructions, and the versions that times depend on."""
+    flags = described().get("flags", "").split()
+    return {
+        "processor": processor_name(),
+        "cores": count_cores(),
+        "instructions": [flag for flag in FLAGS if flag in flags],
+        "system": platform.system(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "onnxruntime": version("onnxruntime"),
+    }
+
+
+def run_python(words: Sequence[str], *, failing: bool = False) -> Taken:
+    """Run Python once with these arguments."""
+    # an installed package is compiled: a fifth of a second more is not what its users wait for
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    command = [sys.executable, "-c", LAUNCHER, *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    printed, _, last = done.stdout.rstrip("\n").rpartition("\n")
+    code, seconds, peak = last.split()
+    if int(code) and not failing:
+        last_line = done.stderr.strip().rpartition("\n")[2]
+        raise SuperSdfError(f"python {' '.join(words)} ended with {code}: {last_line}")
+    return Taken(float(seconds), int(peak), int(code), printed.rstrip("\n"), done.stderr.strip())
+
+
+def upsample_words(grid: Path, *options: str, target: Path | None = None) -> list[str]:
+    """Return Python's arguments that convert a grid to a mesh beside it."""
+    mesh = target or grid.with_suffix(".ply")
+    return ["-m", "super_sdf", "upsample", str(grid), str(mesh), "--force", "--quiet", *options]
+
+
+def median_of(measure: Callable[[], tuple[float, float]], runs: int) -> dict[str, float]:
+    """Return the median of the seconds and the largest peak in MB of runs after a warm-up."""
+    measure()  # reads the files into the cache
+    seconds, peaks = zip(*(measure() for _ in range(runs)))
+    return {"seconds": statistics.median(seconds), "peak_mb": max(peaks)}
+
+
+def timed(words: Sequence[str], runs: int) -> dict[str, float]:
+    """Return the median of the seconds and the largest peak in MB of a process."""
+    return median_of(lambda: ((taken := run_python(words)).seconds, taken.peak_mb), runs)
+
+
+def write_grid(shape: Shape, size: int, folder: Path) -> Path:
+    """Write the exact samples of a shape, box diagonal 1 in the unit cube, as ``.npz``."""
+    grid = sample_solid(shape.solid, unit_layout(size), band=np.inf)
+    path = folder / f"{size}.npz"
+    np.savez(path, values=grid.values, spacing=grid.spacing, origin=grid.origin)
+    return path
+
+
+def write_torus(path: Path, n: int) -> Path:
+    """Write the distances to a torus of area 1.2 at the voxel centres of the unit cube, .npy."""
+    centres = ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32)
+    field = np.lib.format.open_memmap(path, "w+", np.float32, (n, n, n))
+    for plane, x in zip(field, centres):
+        plane[:] = torus(x, centres[:, None], centres, MAJOR, MINOR)
+    field.flush()
+    return path
+
 
 TIMED = 4  # shapes
 LARGE, LIMITS = 512, ("4G", "1500M", "900M")
@@ -41,8 +151,6 @@ OPTIONS: dict[str, tuple[str, ...]] = {
 }
 ORDERS = {"scipy": 3, "trilinear": 1}  # of SciPy's zoom
 MODELS = ("fast", "noisy", "mask", "base")
-MEMORY_FIELDS = ("ball", "gyroid", "wall")
-FACTORS = {2: 1, 4: 1, 8: 2, 16: 4}  # and by how much the grids are smaller
 
 
 def time_command(grid: Path, options: Sequence[str], runs: int) -> Row:
@@ -179,42 +287,7 @@ def large_row(grid: Path, limit: str, n: int, bench: Bench) -> Row:
     except SuperSdfError as refusal:
         return {"refused": str(refusal).partition("Error: ")[2]}
     costs = {"seconds": report["wall"], "peak_mb": report["peak"] / 1e6}
-    costs["planned_mb"] = report["planned_bytes"] / 1e6
-    return {**{key: report[key] for key in ("slabs", "band_voxels", "triangles")}, **costs}
-
-
-def memory_rows(bench: Bench) -> list[Row]:
-    """Fit the peak of processes by bytes per voxel that the network sees, and per decoded one."""
-    rows = []
-    with tempfile.TemporaryDirectory() as folder:
-        for factor, share in FACTORS.items():  # fewer samples for a larger factor
-            largest, found = bench.sizes[-1] * 2 // share, []
-            for field, size in product(MEMORY_FIELDS, (max(largest // 2, 12), max(largest, 16))):
-                key = {"memory": field, "size": size, "factor": factor}
-                measure = partial(memory_row, field, size, factor, Path(folder), bench)
-                found.append(bench.timed(key, measure))
-            rows.append({"factor": factor, **fitted(found)})
-    return rows
-
-
-def memory_row(field: str, size: int, factor: int, folder: Path, bench: Bench) -> Row:
-    """Return the voxels of a field, and the peak of the process that converts it."""
-    from .bounds import write_field
-
-    grid = write_field(field, size, folder / "grid.npy")
-    options = ["--spacing", "1", "--factor", str(factor), *model_of(bench, "")]
-    report = report_of(grid, "--max-memory", "16G", *options)
-    return {key: report[key] for key in ("band_voxels", "decoded_voxels", "peak", "planned_bytes")}
-
-
-def fitted(rows: Sequence[Row]) -> Row:
-    """Return bytes per seen voxel, per decoded voxel and the rest, by least squares."""
-    voxels = np.array([[r["band_voxels"], r["decoded_voxels"], 1e6] for r in rows], float)
-    peaks = np.array([row["peak"] for row in rows], float)
-    (seen, decoded, rest), _ = nnls(voxels / peaks[:, None], np.ones(len(rows)))
-    off = np.abs(voxels @ [seen, decoded, rest] / peaks - 1).max()
-    planned = max(row["peak"] / row["planned_bytes"] for row in rows)
-    return {"seen": seen, "decoded": decoded, "fixed_mb": rest, "off": off, "of_plan": planned}
+    return {**{key: report[key] for key in ("tiles", "band_voxels", "triangles")}, **costs}
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Quality against reference meshes, the baselines and the upper bound: tables, plots, pictures.
+"""Quality against reference meshes, the baselines and the upper bound.
 
     python -m lab evaluate meshes/ --out report/
     python -m lab evaluate a.ply b.ply --sizes 32 --methods mc ours --model new.onnx --out report/
@@ -11,7 +11,6 @@ again:
     OUT/report.md      the tables
     OUT/shapes.md      every figure of every shape
     OUT/results.jsonl  the rows they are made from, a line for each shape, size and method
-    OUT/plots, OUT/pictures
 """
 
 from __future__ import annotations
@@ -23,20 +22,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from super_sdf.errors import FileError, OptionError, SuperSdfError, seen
+from super_sdf.errors import FileError, OptionError, seen
 from super_sdf.files.output import replacing
 from super_sdf.threads import count_cores
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY, PRECISIONS
 
 from . import parser_of
 from .measuring import NO_SETTING, Task, network_of
-from .methods import BY_NAME, FLOOR, METHODS, OURS, make_surface
+from .methods import BY_NAME, FLOOR, METHODS, OURS
 from .ndc import add_ndc
-from .plots import draw_plots
-from .processes import describe_machine
-from .rows import Row, Rows
-from .runner import LeftOut, OnTask, complete
-from .shapes import HALVES, Case, Setting, Shape, draw_halves, find_meshes, spread
+from .costs import describe_machine
+from .rows import LeftOut, OnTask, Row, Rows, complete
+from .shapes import HALVES, Setting, draw_halves, find_meshes, spread
 from .tables import (
     BY_KEY,
     COST,
@@ -58,8 +55,6 @@ Halves = Mapping[str, Sequence[str]]
 ByMethod = Mapping[str, Sequence[Row]]
 
 ROWS = "results.jsonl"
-EXTREMES = 5  # number of best shapes shown, and of worst
-ERROR_TOP = 0.25  # upper end of the colour bar in the pictures, in voxels
 COST_LINES = """\
 From the samples in memory to the mesh in memory, several at a time on one machine: to compare
 methods, not to quote. The peak is what the process held beyond what it held before."""
@@ -161,11 +156,8 @@ def check_folder(out: Path) -> None:
         raise FileError(f"{out} cannot be made: {error.strerror}") from error
 
 
-def write_report(results: Results, like: Task, halves: Halves, out: Path, up: str | None) -> Path:
-    """Write report.md, shapes.md, plots and pictures; return the path of report.md.
-
-    ``up`` is the axis that points up in the pictures; None: none are drawn.
-    """
+def write_report(results: Results, like: Task, halves: Halves, out: Path) -> Path:
+    """Write report.md and shapes.md; return the path of report.md."""
     settings = dict.fromkeys(t.setting for t in results.tasks if t.setting != NO_SETTING)
     by_setting = {s: results.by_method(s, (*like.methods, FLOOR)) for s in settings}
     means = {setting: [{"method": method, **summary(rows)} for method, rows in found.items()]
@@ -183,10 +175,6 @@ def write_report(results: Results, like: Task, halves: Halves, out: Path, up: st
     ):
         parts += [f"## {title}", text]
         parts += [f"**{setting}**\n\n{listed(rows, columns)}" for setting, rows in means.items()]
-    plots = draw_plots({s.size: found for s, found in by_setting.items()}, out / "plots")
-    parts += ["## Plots", *(f"![{text}](plots/{name})" for name, text in plots.items())]
-    if up and OURS in like.methods:
-        parts += picture_lines(results, like, next(iter(settings)), out, up)
     notes = {name: "; ".join(row["notes"]) for name, row in results.floors.items()}
     lines = [f"- {name}: {said}." for name, said in notes.items() if said]
     parts += ["## Notes on the shapes", "\n".join(lines)] if lines else []
@@ -247,45 +235,6 @@ def write_page(path: Path, parts: Sequence[str]) -> Path:
     return path
 
 
-def picture_lines(results: Results, like: Task, setting: Setting, out: Path, up: str) -> list[str]:
-    """Draw the shapes on which ours is best and worst; return the lines that show them.
-
-    They are ranked by F1 over the floor's F1, which is low on large surfaces: there 100,000 points
-    are far apart.
-    """
-    floors, ranked = results.floors, results.of(setting, OURS)
-    ranked.sort(key=lambda row: row["f1"] / floors[row["shape"]]["f1"], reverse=True)
-    shown = ranked if len(ranked) < 2 * EXTREMES else [*ranked[:EXTREMES], *ranked[-EXTREMES:]]
-    paths, folder = {task.path.stem: task.path for task in results.tasks}, out / "pictures"
-    folder.mkdir(exist_ok=True)
-    lines = [f"## {len(shown)} of {len(ranked)} shapes at {setting.size}^3, best and worst F1 over "
-             "the floor's"]  # fmt: skip
-    for row in shown:
-        name, floor = row["shape"], floors[row["shape"]]["f1"]
-        lines.append(f"**{name}**, F1 {row['f1']:.3f} (floor {floor:.3f}), NC {row['nc']:.3f}")
-        try:
-            draw_shape(replace(like, path=paths[name], setting=setting), folder, up)
-            lines.append(f"![{name}](pictures/{name}.png)")
-        except SuperSdfError as problem:  # the tables matter more than a picture
-            lines.append(f"Not drawn: {problem}.")
-    return lines
-
-
-def draw_shape(task: Task, folder: Path, up: str) -> None:
-    """Draw a picture of coarse marching cubes, ours, the reference, and the error of ours."""
-    from .drawing import Panel, render_panels, vertex_errors
-
-    shape = Shape.read(task.path, task.turned)
-    case, network = Case(shape, task.setting), network_of(*task.network(OURS), task.threads)
-    coarse, ours = (make_surface(name, case, network).mesh for name in ("mc", OURS))
-    titles = {f"marching cubes of {task.setting.size}^3": coarse, "super-sdf": ours}
-    panels = [Panel(m, f"{t}: no surface" * (not len(m.faces)) or t) for t, m in titles.items()]
-    panels += [Panel(shape.mesh, "reference")]
-    panels += [Panel(ours, "error of super-sdf", vertex_errors(ours, shape.solid))]
-    target, top = folder / f"{shape.name}.png", ERROR_TOP * case.spacing
-    render_panels(panels, target, colour="error", up=up, top=top, unit="box diagonal 1")
-
-
 def progress_lines() -> OnTask:
     """Return a function that prints one line per task, with the time that was spent."""
     start = time.monotonic()
@@ -319,8 +268,6 @@ def main() -> int:
     parser.add_argument("--turned", type=int, metavar="SEED", help="turn meshes at random first")
     parser.add_argument("--model", default=DEFAULT_QUALITY, help="shipped network or ONNX file")
     parser.add_argument("--precision", choices=PRECISIONS, default=AUTO_PRECISION)
-    parser.add_argument("--up", choices=("x", "y", "z"), default="z", help="upward in pictures")
-    parser.add_argument("--no-pictures", action="store_true")
     parser.add_argument("--quiet", action="store_true", help="print errors only")
     add_jobs(parser)
     add_ndc(parser)
@@ -344,8 +291,7 @@ def main() -> int:
     results = results_of(tasks, rows, words.jobs, None if words.quiet else progress_lines())
     if not results.floors:
         raise FileError("no shape could be measured")
-    up = None if words.no_pictures else words.up
-    path = write_report(results, like, halves, words.out, up)
+    path = write_report(results, like, halves, words.out)
     if not words.quiet:
         print(path.read_text(encoding="utf-8"))
     return int(bool(results.left_out))

@@ -37,7 +37,7 @@ from .kinds import KINDS
 from .measuring import Task, digest_of_ours
 from .methods import FLOOR, ON
 from .ndc import add_ndc
-from .processes import describe_machine, machine
+from .costs import describe_machine, machine
 from .rows import Row, Rows
 from .shapes import Setting, draw_halves, find_meshes, spread
 from .tables import GAPS, gap_closed, mean_of, summary, win_line
@@ -272,9 +272,7 @@ FIGURES: dict[str, tuple[Callable[[Bench], list[Row]], tuple[str, ...]]] = {
     "scale": (scale, ("base",)),
     "factors": (factors, ("base",)),
     "simplify": (simplify, ("base",)),
-    "check": (others.check_rows, ("base",)),
     "speed": (costs.speed_rows, ("fast", "base", "best", "mask", "noisy")),
-    "memory": (costs.memory_rows, ("base",)),
     "peers": (peers, ("base",)),
 }
 RARE = ("peers",)  # takes long for what few ask for

@@ -1,4 +1,4 @@
-"""Figures that no shape and method of ``measuring`` gives: formulas, thick slices, and residuals.
+"""Figures that no shape and method of ``measuring`` gives: formulas and thick slices.
 
 The truth of a formula is marching cubes of itself on a fine grid. Distances are means of both
 directions between points on the surfaces, in voxels of the grid, of slices in those of the slices.
@@ -6,7 +6,6 @@ directions between points on the surfaces, in voxels of the grid, of slices in t
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import product
@@ -16,23 +15,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
-from scipy.stats import spearmanr
 
 from super_sdf import make_grid, reconstruct
 from super_sdf.check.surface import count_components
-from super_sdf.convert import ConvertOptions, convert
 from super_sdf.errors import GridError
 from super_sdf.surface.mesh import Mesh
 from super_sdf.network.decoder import Decoder
-from super_sdf.truth.solid import Solid
 
 from .forms import FORMS, sample, true_surface
 from .kinds import sample_box
 from .measuring import network_of
-from .metrics import compare_distances, distance, distance_or_dot, sample_surface
-from .processes import write_grid
+from .metrics import distance
 from .rows import Row
-from .shapes import RESULT_POINTS, Shape, spread
+from .shapes import Shape, spread
 from .surfaces import EMPTY, closed_isosurface, interpolate_spline
 
 if TYPE_CHECKING:
@@ -152,55 +147,3 @@ def resliced(values: Values, ratio: float, order: int) -> Values:
     z = (np.arange(round(values.shape[2] * ratio)) + 0.5) / ratio - 0.5
     at = np.stack(np.meshgrid(*(np.arange(n) for n in values.shape[:2]), z, indexing="ij"))
     return ndimage.map_coordinates(values, at, order=order, mode="nearest")
-
-
-def check_rows(bench: Bench) -> list[Row]:
-    """Measure how well the residuals of ``super-sdf check`` predict the true error of a mesh.
-
-    By Spearman's rank correlation: over ``shapes``, of the mean residual with the mean error both
-    ways; of the ``largest`` of each; over the ``vertices`` of a shape, the median over shapes.
-    """
-    rows = []
-    for size in bench.sizes[:2]:
-        found = []
-        for path in bench.shapes:
-            words = {"check": path.stem, "size": size}
-            found.append(bench.kept(words, partial(measure_check, path, size, bench)))
-        columns = {key: [row[key] for row in found] for key in found[0]}
-        ranks = {
-            "shapes": rank(columns["mean"], columns["both_ways"]),
-            "largest": rank(columns["largest"], columns["max_error"]),
-            "vertices": float(np.median(columns["vertices"])),
-        }
-        rows.append({"size": size, "grids": len(found), **ranks})
-    return rows
-
-
-def rank(one: Sequence[float], other: Sequence[float]) -> float:
-    """Return Spearman's rank correlation; NaN of fewer than two."""
-    return float(spearmanr(one, other).statistic) if len(one) > 1 else float("nan")
-
-
-def measure_check(path: Path, size: int, bench: Bench) -> Row:
-    """Return residuals and true errors of a shape's mesh, in voxels."""
-    from super_sdf.check.check import check_files
-
-    shape = Shape.read(path)
-    with tempfile.TemporaryDirectory() as folder:
-        grid = write_grid(shape, size, Path(folder))
-        network, options = network_of(bench.network, "auto", 0), ConvertOptions(inside="negative")
-        convert(grid, grid.with_suffix(".ply"), network, options, force=True)
-        found = check_files(grid.with_suffix(".ply"), grid, options, intersections=False)
-    mesh, summary = found.mesh, found.touching.summary()
-    true = shape.solid.distance(mesh.vertices.astype(np.float64))
-    said = np.abs(found.residuals_at(mesh.vertices))
-    known = np.isfinite(said)
-    drawn = sample_surface(mesh, shape.seed(RESULT_POINTS)).points
-    there = distance_or_dot(Solid(mesh), shape.drawn.points)
-    surfaces = compare_distances(there, distance_or_dot(shape.solid, drawn))
-    return {
-        **{name: float(summary[name]) for name in ("mean", "largest")},
-        "both_ways": surfaces["p2s"] * size,
-        "max_error": surfaces["max"] * size,
-        "vertices": rank(said[known], true[known]),
-    }

@@ -47,13 +47,8 @@ EDGE_COLUMNS = (F1, NC, THERE, BACK, *EDGES[:-1])
 PEER_COLUMNS = (*EDGE_COLUMNS, Column("mean s", "seconds", 1, 1))
 DENSE = (SECONDS, PEAK, Column("time over ours", "over_seconds", 1, 1),
          Column("memory over ours", "over_peak_mb", 1, 1))  # fmt: skip
-LARGE = (Column("slabs", "slabs", 1, 0), Column("band voxels", "band_voxels", 1, 0),
-         Column("triangles", "triangles", 1, 0), SECONDS, PEAK,
-         Column("planned MB", "planned_mb", 1, 0))  # fmt: skip
-MEMORY = (Column("bytes per seen voxel", "seen", 1, 0),
-          Column("per decoded voxel", "decoded", 1, 0), Column("fixed MB", "fixed_mb", 1, 0),
-          Column("fit off by, %", "off", 100, 0),
-          Column("peak over plan", "of_plan", 1, 2))  # fmt: skip
+LARGE = (Column("tiles", "tiles", 1, 0), Column("band voxels", "band_voxels", 1, 0),
+         Column("triangles", "triangles", 1, 0), SECONDS, PEAK)  # fmt: skip
 COLUMNS = {**BY_KEY, "seconds": SECONDS, "peak_mb": PEAK}  # of numbers in sentences
 SUMMARY_LABELS = {
     "mc": "marching cubes",
@@ -90,12 +85,6 @@ OPTION_LABELS = {
     "float32": "`--precision float32`",
     "marching": "`--mesher marching`",
 }
-CHECK_LABELS = {
-    "shapes": "mean residual and mean error, both ways",
-    "largest": "largest residual and largest error",
-    "vertices": "vertices of a shape: median",
-}
-
 
 def pick(rows: Iterable[Row], **words: Any) -> list[Row]:
     """Return the rows that have some words."""
@@ -230,7 +219,7 @@ def dense_table(rows: Sequence[Row]) -> str:
 
 def large_table(rows: Sequence[Row]) -> str:
     """Return a large torus within several limits."""
-    chosen = ({"slabs": "refused", **row} for row in rows if "limit" in row)
+    chosen = ({"tiles": "refused", **row} for row in rows if "limit" in row)
     heads = ["grid", "`--max-memory`"]
     return listed(chosen, LARGE, lambda row: [f"{row['size']}^3", row["limit"]], heads)
 
@@ -296,15 +285,6 @@ def simplify_table(rows: Sequence[Row]) -> str:
     return markdown(heads, [line])
 
 
-def check_table(rows: Sequence[Row]) -> str:
-    """Return how well residuals predict the true error, as rank correlations."""
-    body = [
-        [label, *(Column("", key, 1, 2).cell(row[key]) for row in rows)]
-        for key, label in CHECK_LABELS.items()
-    ]
-    return markdown(["", *(f"{row['size']}^3, {row['grids']} shapes" for row in rows)], body)
-
-
 def peer_table(rows: Sequence[Row]) -> str:
     """Return dual contouring of distances, and ours with as many triangles."""
     return listed([row for row in rows if "size" not in row], PEER_COLUMNS, heads=[""])
@@ -349,8 +329,6 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
     "scale.table": lambda rows: setting_table(rows, "scale", published.SCALED),
     "factors.table": lambda rows: setting_table(rows, "factor", {}),
     "simplify.table": simplify_table,
-    "check.table": check_table,
-    "memory.table": lambda rows: listed(rows, MEMORY, lambda r: [str(r["factor"])], ["factor"]),
 }
 
 

@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from processes import wait_for_lines
 from solids import cube, saved, sphere, torus
 
-from lab import evaluate, measuring, processes, runner, tables
+from lab import costs, evaluate, tables
 from lab.__main__ import main as lab
 from lab.evaluate import Results
 from lab.measuring import Task
-from lab.rows import Rows
-from lab.runner import LeftOut, complete, worker
-from lab.shapes import Setting, find_meshes, spread
+from lab.rows import LeftOut, Rows
+from lab.shapes import Setting, find_meshes
 from super_sdf import Mesh, SuperSdfError
-from super_sdf.errors import FileError
-from super_sdf.network.network import KIND_MODELS, shipped_models
 
 ROOT = Path(__file__).parents[2]
 TIMES = ("seconds", "peak_mb")
@@ -72,7 +65,7 @@ def quality_of(out: Path) -> dict[str, dict]:
 def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path, command):
     (meshes / "ring.ply").unlink()
     words = ["evaluate", meshes, "--sizes", 8, "--methods", "mc", "--jobs", 1]
-    words += ["--no-pictures", "--out"]
+    words += ["--out"]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert command(*words, whole)[0] == 0
     child = subprocess.Popen(
@@ -91,7 +84,6 @@ def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path,
     assert quality_of(cut) == quality_of(whole)
     texts = [(out / "report.md").read_text().split("## Time")[0] for out in (cut, whole)]
     assert texts[0] == texts[1]
-    assert (cut / "plots" / "resolution.png").stat().st_size > 5000
     code, _, err = command(*words, cut)
     assert (code, err) == (0, "")  # nothing is left to measure
 
@@ -100,7 +92,7 @@ def test_a_bad_shape_is_named_and_the_others_are_measured(meshes, tmp_path, comm
     saved(Mesh(cube().vertices, cube().faces[1:]), meshes / "lidless.ply")
     (meshes / "junk.stl").write_text("junk")
     out = tmp_path / "out"
-    words = (*FAST, "--no-pictures", "--turned", 5, "--out", out)
+    words = (*FAST, "--turned", 5, "--out", out)
     code, _, err = command("evaluate", meshes, "--sizes", 8, *words)
     assert code == 1
     assert "Left out: lidless: " in err and "is open: 3 edges" in err and "out: junk: " in err
@@ -110,132 +102,12 @@ def test_a_bad_shape_is_named_and_the_others_are_measured(meshes, tmp_path, comm
     assert "turned at random, by seed 5" in text
 
 
-@pytest.mark.graphics
-def test_pictures_of_the_best_and_worst(meshes, tmp_path, command):
-    out = tmp_path / "out"
-    assert command("evaluate", meshes, "--sizes", 8, *FAST, "--out", out)[0] == 0
-    lines = (out / "report.md").read_text().splitlines()
-    shown = [line for line in lines if "](pictures/" in line]
-    assert len(shown) == 3 and "## 3 of 3 shapes at 8^3, best and worst" in "\n".join(lines)
-    assert all((out / line.split("(")[1][:-1]).exists() for line in shown)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--sizes", 3), "size is 3: give at least 4 samples along an axis"),
-        (("--turned", -1), "turned is -1: give a seed of 0 or more"),
-        (("--factor", 3), "factor is 3"),
-    ],
-)
-def test_options_out_of_range_are_refused_in_a_line(meshes, tmp_path, command, words, said):
-    code, _, err = command("evaluate", meshes, "--out", tmp_path / "out", *words)
-    assert code == 2 and err.startswith(f"Error: {said}") and err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_that_no_evaluation_made_is_refused(meshes, tmp_path, command):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "mine.md").write_text("mine")
-    code, _, err = command("evaluate", meshes, "--out", out)
-    assert code == 1 and err.count("\n") == 1
-    assert err.startswith(f"Error: {out} holds 'mine.md' and no results.jsonl, so no evaluation ")
-    assert command("nothing")[0] == 2 and "Usage" in command("--help")[1]
-
-
-def test_shapes_are_found_by_name(meshes, tmp_path):
-    paths = find_meshes([meshes])
-    assert [path.stem for path in paths] == ["ball", "box", "ring"]
-    assert [path.stem for path in spread(paths, 2)] == ["ball", "box"]
-    with pytest.raises(FileError, match="two meshes are named 'box'"):
-        find_meshes([meshes, meshes / "box.ply"])
-    with pytest.raises(FileError, match="holds no mesh: give"):
-        find_meshes([tmp_path])
-    os.mkfifo(meshes / "pipe.ply")
-    with pytest.raises(FileError, match="is a named pipe: give a file"):
-        find_meshes([meshes])
-
-
-def test_a_row_of_another_mesh_network_or_setting_is_another_row(meshes, tmp_path):
-    task, rows = task_of(meshes / "box.ply"), Rows(tmp_path / "rows.jsonl")
-    rows.add(task.key("ours"), {"f1": 0.5, "error": None})
-    with (tmp_path / "rows.jsonl").open("a") as file:
-        file.write('{"key": {"sha')
-    rows = Rows(tmp_path / "rows.jsonl")
-    assert rows.get(task.key("ours"))["f1"] == 0.5 and rows.is_final(task.key("ours"))
-    for change in ({"path": meshes / "ball.ply"}, {"model": "fast"}, {"precision": "float32"},
-                   {"turned": 0}, {"setting": Setting(8, noise=0.5)}):  # fmt: skip
-        assert rows.get(replace(task, **change).key("ours")) is None
-    assert task.key("ours@fast")["digest"] == replace(task, model="fast").key("ours")["digest"]
-    assert task.key("mc") == replace(task, model="fast").key("mc")  # not made by our code
-    own = ("ours on mask", "spline-coarsest on spacing 1:1:5, x", "bound-sharp", "ours/4")
-    others = ("mc on mask", "mc-gaussian-0.5 on mask", "bspline on exact", "bound", "floor")
-    assert list(map(measuring.is_of_our_code, own + others)) == [True] * 4 + [False] * 5
-
-
-@pytest.mark.parametrize("name", KIND_MODELS)
-def test_rows_are_measured_again_with_another_network_for_a_kind(name, tmp_path, monkeypatch):
-    files, digest = shipped_models(), measuring.digest_of_ours.__wrapped__
-    before = digest("fast")
-    other = tmp_path / "other.onnx"
-    other.write_bytes(files[name].read_bytes() + b"0")
-    monkeypatch.setattr(measuring, "shipped_models", lambda: {**files, name: other})
-    assert digest("fast") != before
-
-
 def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
     rows, key = Rows(tmp_path / "rows.jsonl"), {"shape": "box"}
     rows.add(key, {"error": "OSError: disk"})
     assert not rows.is_final(key)
     rows.add(key, {"error": "over the limit of 10 s", "limit": 10.0})
     assert rows.is_final(key, 10.0) and not rows.is_final(key, 20.0)
-
-
-def dies_of(task: Task) -> dict:
-    """Stand in for ``measured``: the method ours kills its process, bound takes its time."""
-    if "ours" in task.methods:
-        os.kill(os.getpid(), signal.SIGKILL)
-    if "bound" in task.methods:
-        time.sleep(60)
-    return {method: {"error": None} for method in task.methods}
-
-
-def stand_in():
-    """Put ``dies_of`` in place, in a worker process."""
-    runner.measured = dies_of
-    return worker()
-
-
-def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(meshes, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "worker", stand_in)
-    several = ("mc", "ours", "bspline"), ("trilinear",)
-    tasks = [task_of(meshes / "box.ply", methods) for methods in several]
-    rows, seen = Rows(tmp_path / "rows.jsonl"), []
-    assert complete(tasks, rows, 1, lambda *step: seen.append(step)) == []
-    errors = {m: rows.get(task.key(m))["error"] for task in tasks for m in task.methods}
-    killed = "its process was killed by SIGKILL (most likely out of memory)"
-    assert errors == {"mc": None, "ours": killed, "bspline": None, "trilinear": None}
-    assert seen == [(number, 4, "box") for number in range(1, 5)]
-
-
-def test_as_many_triangles_as_a_method_that_was_measured_before(meshes, tmp_path):
-    rows, methods = Rows(tmp_path / "rows.jsonl"), ("mc", "ours/mc")
-    for some in (methods[:1], methods):
-        task = task_of(meshes / "box.ply", some)
-        assert complete([task], rows, 0) == []
-    measured = [rows.get(task.key(method)) for method in methods]
-    assert measured[1]["error"] is None and measured[1]["faces"] <= measured[0]["faces"]
-
-
-def test_a_process_over_its_limit_is_ended(meshes, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "worker", stand_in)
-    task, rows = task_of(meshes / "box.ply", ("bound", "mc"), limit=0.5), Rows(tmp_path / "rows")
-    assert complete([task], rows, 1) == []
-    for method in task.methods:
-        row = rows.get(task.key(method))
-        assert row["error"] == "over the limit of 0.5 s" and row["limit"] == 0.5
-        assert "f1" not in row  # a failure is no score
 
 
 def row(shape: str, f1: float, **more) -> dict:
@@ -285,9 +157,9 @@ def test_tables_show_means_gaps_and_what_has_no_surface():
 
 
 def test_a_process_is_timed(tmp_path):
-    grid = processes.write_torus(tmp_path / "torus.npy", 12)
-    taken = processes.run_python(processes.upsample_words(grid, "--spacing", "0.0833"))
+    grid = costs.write_torus(tmp_path / "torus.npy", 12)
+    taken = costs.run_python(costs.upsample_words(grid, "--spacing", "0.0833"))
     assert taken.seconds > 0.05 and 20 < taken.peak_mb < 2000 and not taken.code
     with pytest.raises(SuperSdfError, match=r"upsample none\.npz .* ended with 1: Error: none"):
-        processes.run_python(processes.upsample_words(Path("none.npz")))
-    assert processes.run_python(["-c", "print('hi')"]).printed == "hi"
+        costs.run_python(costs.upsample_words(Path("none.npz")))
+    assert costs.run_python(["-c", "print('hi')"]).printed == "hi"

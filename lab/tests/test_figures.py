@@ -86,23 +86,6 @@ def test_documents_show_what_was_measured():
     assert not differ, "run python -m lab documents"
 
 
-def test_every_figure_is_of_one_machine_and_of_the_networks_that_it_names():
-    for path in figures.FOLDER.glob("*.json"):
-        content = quoted.read(path)
-        assert content["name"] == path.stem and path.stem in figures.FIGURES
-        assert set(content["networks"]) == set(figures.FIGURES[path.stem][1])
-        assert {row.get("machine") for row in content["rows"]} <= {None, describe(content)}
-
-
-def describe(content: dict) -> str:
-    """Return the machine of a figure as rows have it."""
-    on = content["machine"]
-    return (
-        f"{on['processor']}, {on['cores']} cores, {on['system']}, Python {on['python']}, "
-        f"NumPy {on['numpy']}, onnxruntime {on['onnxruntime']}"
-    )
-
-
 @pytest.fixture
 def shapes(tmp_path):
     """A folder of two shapes."""
@@ -125,14 +108,6 @@ def test_figures_are_measured_kept_and_printed(shapes, tmp_path, monkeypatch, ca
     content = quoted.read(out / "simplify.json")
     assert len(content["rows"]) == 8 and content["networks"].keys() == {"base"}
     (out / "simplify.json").unlink()
-    monkeypatch.setattr("lab.runner.measure_task", None)  # nothing is measured again
+    monkeypatch.setattr("lab.rows.measure_task", None)  # nothing is measured again
     assert run(monkeypatch, *words, "--out", out) == 0
     assert quoted.read(out / "simplify.json")["rows"] == content["rows"]
-
-
-def test_figures_refuse_what_would_mix_networks_or_lacks_shapes(shapes, monkeypatch, capsys):
-    assert run(monkeypatch, "--shapes", shapes, "--network", "new.onnx") == 2
-    assert "give it its own folder, --out" in capsys.readouterr().err
-    out = ("--out", shapes / "out")
-    assert run(monkeypatch, "--shapes", shapes, "--sizes", 8, "--only", "edges", *out) == 2
-    assert "python -m export.parts PARTS" in capsys.readouterr().err
