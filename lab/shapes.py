@@ -40,8 +40,6 @@ REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIE
 
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
 SUFFIXES = (*MESH_SUFFIXES, ".gltf")
-HALVES = ("choose", "final")
-HALVES_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -234,17 +232,3 @@ def spread(items: Sequence[Any], count: int) -> tuple[Any, ...]:
     """Return ``count`` of the items, evenly spread over them."""
     count = min(count, len(items))
     return tuple(items[i * len(items) // count] for i in range(count))
-
-
-def draw_halves(names: Sequence[str], seed: int = HALVES_SEED) -> dict[str, list[str]]:
-    """Split names by a seed: networks are chosen on the first half, the second is for the end.
-
-    The split depends on the names only, not on their order; of an odd number the second gets one
-    more.
-    """
-    chosen = np.random.default_rng(seed).permutation(sorted(names))[: len(names) // 2]
-    first = set(chosen.tolist())
-    return {
-        "choose": [name for name in names if name in first],
-        "final": [name for name in names if name not in first],
-    }

@@ -156,14 +156,3 @@ def gap_closed(
 def percent(share: float | None, digits: int = 0) -> str:
     """Return a share as text in percent, "-" if it is unknown."""
     return "-" if share is None else f"{100 * share:.{digits}f} %"
-
-
-def win_line(ours: Sequence[Row], others: Sequence[Row]) -> str:
-    """Return a line on how many shapes ours has the better F1, with the others by name."""
-    lost = [
-        f"{mine['shape']} ({mine['f1']:.3f}, B-spline {other['f1']:.3f})"
-        for mine, other in zip(ours, others)
-        if mine["f1"] <= other["f1"]
-    ]
-    line = f"super-sdf beats B-spline in F1 on {len(ours) - len(lost)} of {len(ours)}."
-    return f"{line} Not on: {', '.join(lost)}." if lost else line

@@ -107,24 +107,6 @@ def test_the_sharp_edges_of_a_cube() -> None:
     assert edges.compare_edges(sharp, np.zeros((0, 3)))["ef1"] == 0
 
 
-def test_a_smooth_shape_has_no_edge_to_compare() -> None:
-    ball = sphere()
-    sharp = EdgeCurves.of(ball, SEED)
-    near = edges.edge_points(metrics.sample_surface(ball, SEED))
-    assert len(sharp.edges) == len(sharp.drawn) == len(near) == 0
-    assert edges.compare_edges(sharp, near) == {"ecd": None, "ef1": None}
-    assert in_voxels(ball, ball) == {"efv": None, "edge_distance": None}
-    assert angles_of(ball, ball) == (None, pytest.approx(0, abs=1e-5))
-
-
-def test_the_result_itself_scores_full_marks_on_any_grid() -> None:
-    """Unlike EF1, whose edge points lie beside the edges, EFv has no floor."""
-    figures = in_voxels(cube(), cube())
-    assert figures == {"efv": 1.0, "edge_distance": pytest.approx(0, abs=1e-12)}
-    near, beyond = angles_of(cube(), cube())
-    assert near == pytest.approx(0, abs=1e-5) and beyond == pytest.approx(0, abs=1e-5)
-
-
 @pytest.mark.parametrize(("share", "efv"), [(0.09, 1.0), (0.2, 1 / 3)])
 def test_a_shift_moves_the_edges_across_it(share: float, efv: float) -> None:
     """Those along the shift, a third, stay where they are, but for their ends."""
@@ -179,13 +161,3 @@ def test_the_smallest_angle_of_a_triangle(tip: list[float], angle: float) -> Non
     figures = metrics.compare_triangles(mesh)
     assert figures["min_angle"] == pytest.approx(angle) and figures["slivers"] == (angle < 5)
     assert metrics.compare_triangles(EMPTY) == {"min_angle": None, "slivers": None}
-
-
-@pytest.mark.parametrize("size", [1.0, 0.2, 0.027, 0.001])
-def test_edge_points_are_those_with_an_edge_among_their_nearest(size: float) -> None:
-    """By the definition, for all points. The smaller the box, the more have too many neighbours."""
-    drawn = metrics.sample_surface(Mesh(cube().vertices * size, CUBE_FACES), SEED, 5000)
-    index = np.arange(len(drawn.points))
-    among_all = edges.edge_among_nearest(drawn, index)
-    np.testing.assert_array_equal(edges.edge_points(drawn), drawn.points[among_all])
-    assert among_all.any()
