@@ -8,82 +8,79 @@ network gets the distances that the runtime makes of it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from export.dataset import Sample, fill_shard
-from super_sdf.grid.derived import mask_distances
-from super_sdf.network.neighbourhood import cube_symmetries, turn
-from super_sdf.refine.band import find_band, gather_patches, neighbour_table
+from super_sdf.grid import derived
+from super_sdf.network import contract, neighbourhood
+from super_sdf.refine import band
+
+DISTANCES = "distances"  # of which some were noisy: what a card without an entry says
+INPUTS = (DISTANCES, contract.MASKS)
+THIN = 0.05  # share of thin solids among those drawn for calibration, as in training
 
 
 @dataclass(frozen=True)
 class Shares:
     """The share of samples that each change is applied to, from 0 to 1."""
 
-    inverted: float = 0.0  # more is worse: solids are mostly convex, and networks learn that
     shifted: float = 1 / 6
     noisy: float = 1 / 4
     truncated: float = 1 / 6
 
 
 USUAL = Shares()
-CLEAN = Shares(0, 0, 0, 0)
+CLEAN = Shares(0, 0, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A sample as the network's inputs, with the targets."""
 
-    ijk: np.ndarray  # (V, 3) voxels in the window, turned with it
-    patches: np.ndarray  # (V, 27) float32
-    table: np.ndarray  # (V, 27) int32, -1 where absent
-    voxels: np.ndarray  # (D,) rows of the band that have targets
-    offsets: np.ndarray  # (Q, 3) float32
-    targets: np.ndarray  # (D, Q) float32
+    patches: Tensor  # (V, 27) float32
+    table: Tensor  # (V, 27) int64 rows of the band, -1 where absent
+    voxels: Tensor  # (D,) int64 rows of the band that have targets
+    offsets: Tensor  # (Q, 3) float32
+    targets: Tensor  # (D, Q) float32
 
-
-def augment(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepared:
-    return turned(rng, change(rng, sample, shares))
-
-
-def change(rng: np.random.Generator, sample: Sample, shares: Shares) -> Prepared:
-    changed = noisy(rng, shifted(rng, inverted(rng, sample, shares), shares), shares)
-    return truncated(rng, prepare(changed), shares)
-
-
-def augment_mask(rng: np.random.Generator, sample: Sample) -> Prepared:
-    return turned(rng, prepare(masked(rng, sample)))
-
-
-def prepare_mask(sample: Sample) -> Prepared:
-    """Make a mask of a sample, always the same one, and gather it."""
-    return prepare(masked(np.random.default_rng(len(sample.voxel_ijk)), sample))
+    def on(self, device: str) -> Prepared:
+        return Prepared(*(tensor.to(device) for tensor in vars(self).values()))
 
 
 def prepare(sample: Sample) -> Prepared:
     """Gather a sample with the functions of the runtime; targets outside the band are dropped."""
-    band = find_band(sample.window)
-    strides = np.array([sample.window.shape[1] * sample.window.shape[2], sample.window.shape[2], 1])
-    keys, wanted = band @ strides, sample.voxel_ijk.astype(np.int64) @ strides
-    rows = np.minimum(np.searchsorted(keys, wanted), max(len(keys) - 1, 0))
-    in_band = keys[rows] == wanted if len(keys) else np.zeros(len(wanted), bool)
-    return Prepared(
-        band,
-        gather_patches(sample.window, band),
-        neighbour_table(band, sample.window.shape),
-        rows[in_band],
+    ijk, shape = band.find_band(sample.window), sample.window.shape
+    rows = np.full(shape, -1)
+    rows[tuple(ijk.T)] = np.arange(len(ijk))
+    voxels = rows[tuple(sample.voxel_ijk.T)]
+    arrays = (
+        band.gather_patches(sample.window, ijk),
+        band.neighbour_table(ijk, shape).astype(np.int64),
+        voxels[voxels >= 0],
         sample.offsets,
-        sample.targets[in_band].astype(np.float32),
+        sample.targets[voxels >= 0].astype(np.float32),
     )
+    return Prepared(*map(torch.from_numpy, arrays))
 
 
-def inverted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
-    if rng.random() >= shares.inverted:
-        return sample
-    return replace(sample, window=-sample.window, targets=-sample.targets)
+def turned(sample: Prepared, number: int) -> Prepared:
+    """Turn and mirror a sample by one of the 48 symmetries of the cube."""
+    symmetry = neighbourhood.cube_symmetries()[number]
+    places = torch.from_numpy(neighbourhood.turned_places(symmetry)).to(sample.table)
+    offsets = sample.offsets @ torch.from_numpy(symmetry.T).to(sample.offsets)
+    patches, table = sample.patches[:, places], sample.table[:, places]
+    return replace(sample, patches=patches, table=table, offsets=offsets)
+
+
+def change(rng: np.random.Generator, sample: Sample, inputs: str, shares: Shares) -> Prepared:
+    """Make a mask of a sample, or shift, roughen and truncate some, and gather it."""
+    if inputs == contract.MASKS:
+        return prepare(masked(rng, sample))
+    return truncated(rng, prepare(noisy(rng, shifted(rng, sample, shares), shares)), shares)
 
 
 def shifted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
@@ -102,9 +99,9 @@ def masked(rng: np.random.Generator, sample: Sample) -> Sample:
     band.
     """
     level = np.float32(rng.uniform(-1, 1))
-    inside = sample.window < level
     targets = sample.targets.astype(np.float32) - level
-    return replace(sample, window=2 * mask_distances(inside), targets=targets)
+    window = 2 * derived.mask_distances(sample.window < level)
+    return replace(sample, window=window, targets=targets)
 
 
 def noisy(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
@@ -120,32 +117,12 @@ def truncated(rng: np.random.Generator, sample: Prepared, shares: Shares) -> Pre
     if rng.random() >= shares.truncated:
         return sample
     limit = rng.uniform(3, 6)
-    return replace(sample, patches=np.clip(sample.patches, -limit, limit))
+    return replace(sample, patches=sample.patches.clamp(-limit, limit))
 
 
-def batch_table(tables: Sequence[np.ndarray]) -> np.ndarray:
-    """Concatenate neighbour tables; the index of an absent neighbour becomes the number of rows."""
-    starts = np.cumsum([0] + [len(table) for table in tables])
-    moved = [np.where(t < 0, starts[-1], t + at) for t, at in zip(tables, starts[:-1])]
-    return np.concatenate(moved).astype(np.int32)
-
-
-def turned(rng: np.random.Generator, sample: Prepared) -> Prepared:
-    """Turn and mirror a sample by one of the 48 symmetries of the cube."""
-    symmetry = rng.choice(cube_symmetries())
-    patches, table, offsets = turn(symmetry, sample.patches, sample.table, sample.offsets)
-    ijk = sample.ijk @ symmetry.T
-    return replace(sample, ijk=ijk, patches=patches, table=table, offsets=offsets)
-
-
-THIN = 0.05  # share of thin solids, as in training
-
-
-def draw_samples(count: int = 200, seed: int = 0, *, masks: bool = False) -> list[Prepared]:
+def draw_samples(count: int = 200, inputs: str = DISTANCES) -> list[Prepared]:
     """Return samples of procedural shapes, some noisy, some truncated; or masks of them."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     samples = fill_shard(rng, [], 1.0, THIN, count)
-    if masks:
-        shown = [augment_mask(rng, sample) for sample in samples]
-        return [sample for sample in shown if len(sample.voxels)]  # thin ones may vanish
-    return [augment(rng, sample, USUAL) for sample in samples]
+    shown = [change(rng, sample, inputs, USUAL) for sample in samples]
+    return [sample for sample in shown if len(sample.voxels)]  # thin ones may vanish in masks

@@ -2,6 +2,7 @@
 
     python -m export.dataset --meshes DIR --procedural 0.3 --out training/store --count 5000
     python -m export.dataset --families sculpture creature --out training/store --seed 9
+    python -m export.dataset --smooth --slices 6 --out training/store --seed 20 --count 2000
 
 A sample is one shape in one pose at one resolution. It holds a window of the coarse grid and, for
 each voxel that can hold the surface, the exact distance at a set of query offsets that is drawn
@@ -15,7 +16,8 @@ Samples are stored in shards, ``shard-<seed>-<number>.npz``, as concatenated fla
 ``targets`` (D, Q) float16 with ``voxel_count``. Without ``--meshes`` all shapes are procedural.
 With it, each mesh is used once before any is repeated, except that simple prisms are limited to a
 sixth, and ``--procedural`` is the share of procedural shapes among them. A share ``--thin`` of the
-samples are of solids so thin that hardly any sample lies inside.
+samples are of solids so thin that hardly any sample lies inside. With ``--smooth`` all are of
+smooth bodies, in shards ``smooth-<seed>-<number>.npz``.
 """
 
 from __future__ import annotations
@@ -24,30 +26,32 @@ import argparse
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import igl
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from export.arguments import Parser, at_least, share
-from export.shapes.draws import draw_sway
+from export.arguments import Parser, at_least, positive, share
+from export.shapes.draws import draw_sway, log_uniform
+from export.shapes.smooth import RADII, Field, draw_smooth, foot_points, length, settle
 from export.shapes.solid import FAMILIES, random_solid
-from super_sdf import Mesh, SdfGrid
+from super_sdf import Mesh
 from super_sdf.errors import FileError
-from super_sdf.files.regular import check_regular_file
-from super_sdf.refine.band import DECODE_LIMIT, find_band, rescale
-from super_sdf.refine.nodes import block_offsets
-from super_sdf.truth.mesh_files import read_mesh
-from super_sdf.truth.sampling import sample_grid
-from super_sdf.truth.solid import Solid
+from super_sdf.refine import band, nodes
+from super_sdf.truth import mesh_files, sampling, solid
 
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 per corner, 28 in all
 SIZES = 7.0, 100.0  # voxels along a shape's diagonal
 SWAYED = 0.3  # share of the meshes that are bent
 THIN = -0.2, 0.6  # range of the lowest sample of a thin solid, in spacings
+SLICED = 0.4  # share of samples in thick slices, if any are
 WINDOW = 32  # samples along each axis: a whole shape at 32^3, a piece of it at 64^3
+EDGE = 4  # samples from the border of a window of a smooth body within which none has targets
+SETTLED_WITHIN = 2.5  # voxels from a smooth surface within which distances are exact ...
+UNSETTLED = 0.003  # ... to so much; a window with worse ones is drawn again, as is one with ...
+FEWEST = 50  # ... fewer voxels with targets
 SHARD = 50  # samples per file
 
 
@@ -61,11 +65,18 @@ class Sample:
     targets: np.ndarray
 
 
-def draw_pose(rng: np.random.Generator, mesh: Mesh, sizes: tuple[float, float] = SIZES) -> Mesh:
-    """Place a shape in index space, its diagonal within ``sizes`` voxels; half of them turned."""
+def draw_pose(
+    rng: np.random.Generator, mesh: Mesh, sizes: tuple[float, float] = SIZES, slices: float = 1.0
+) -> Mesh:
+    """Place a shape in index space, its diagonal within ``sizes`` voxels; half of them turned.
+
+    Some are in slices that are up to ``slices`` times as thick as a sample is wide.
+    """
     turn = Rotation.random(rng=rng).as_matrix() if rng.random() < 0.5 else np.eye(3)
     size = np.exp(rng.uniform(*np.log(sizes)))
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
+    if slices > 1 and rng.random() < SLICED:
+        turn = np.diag(rng.permutation([1, 1, 1 / log_uniform(rng, 1, slices)])) @ turn
     posed = mesh.transformed(turn * size / diagonal, np.zeros(3))
     low = posed.vertices.min(0)
     return posed.transformed(np.eye(3), rng.uniform(2, 3, 3) - low)
@@ -85,7 +96,7 @@ def draw_offsets(rng: np.random.Generator) -> np.ndarray:
     corners = rng.integers(0, 4, (CORNERS, 3)) / 2 - 1
     steps = np.concatenate([np.zeros((1, 3)), np.eye(3)]) / 2
     quadruples = (corners[:, None] + steps).reshape(-1, 3)
-    fine = rng.permutation(block_offsets(16))[:FINE_NODES]
+    fine = rng.permutation(nodes.block_offsets(16))[:FINE_NODES]
     anywhere = rng.uniform(-1, 1, (ANYWHERE, 3))
     return np.concatenate([quadruples, fine, anywhere]).astype(np.float32)
 
@@ -95,30 +106,67 @@ def make_sample(
     mesh: Mesh,
     lowest: tuple[float, float] = (-np.inf, np.inf),
     sizes: tuple[float, float] = SIZES,
+    slices: float = 1.0,
 ) -> Sample | None:
     """Sample a shape; return None if no sample is near the surface, or all are inside.
 
     Also None if the lowest sample is not between the bounds ``lowest`` (in spacings). A shape so
     thin that no sample lies inside is kept: its distances reveal it.
     """
-    posed = draw_pose(rng, mesh, sizes)
+    posed = draw_pose(rng, mesh, sizes, slices)
     shape, first = draw_window(rng, posed)
-    solid = Solid(posed)
-    values = sample_grid(solid, (shape, 1.0, first))
-    if not lowest[0] < values.min() < lowest[1]:
-        return None
-    window = rescale(SdfGrid.trusted(values, (1.0, 1.0, 1.0)))
-    band = find_band(window)
-    voxel_ijk = band[np.abs(window[tuple(band.T)]) <= DECODE_LIMIT]
-    if not len(voxel_ijk) or (values < 0).all():
+    truth = solid.Solid(posed)
+    values = sampling.sample_grid(truth, (shape, 1.0, first))
+    window = 2 * values
+    voxel_ijk = np.argwhere(np.abs(window) <= band.DECODE_LIMIT)
+    if not lowest[0] < values.min() < lowest[1] or not len(voxel_ijk) or (values < 0).all():
         return None
     offsets = draw_offsets(rng)
     points = (voxel_ijk[:, None] + first + offsets / 2).reshape(-1, 3)
-    targets = 2 * signed_distance(rng, solid, points).reshape(len(voxel_ijk), -1)
+    targets = 2 * signed_distance(rng, truth, points).reshape(len(voxel_ijk), -1)
     return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets.astype(np.float16))
 
 
-def signed_distance(rng: np.random.Generator, solid: Solid, points: np.ndarray) -> np.ndarray:
+def make_smooth_sample(rng: np.random.Generator, slices: float) -> Sample:
+    """Sample a smooth body, half of them inverted, round a point of its surface."""
+    sample = None
+    while sample is None:
+        field = draw_smooth(rng, slices)
+        middle = foot_points(field, rng.normal(size=(1, 3)) * log_uniform(rng, *RADII))
+        sample = sample_field(rng, field, middle - WINDOW * rng.uniform(0.3, 0.7, (1, 3)), WINDOW)
+    if rng.random() < 0.5:
+        return replace(sample, window=-sample.window, targets=-sample.targets)
+    return sample
+
+
+def sample_field(
+    rng: np.random.Generator, field: Field, low: np.ndarray, size: int
+) -> Sample | None:
+    """Sample the exact distance to the zero of a field in a cube from ``low`` on.
+
+    Samples near the border have no targets: a mask is not known beyond it. None if foot points are
+    not certain, or hardly any sample is near the surface.
+    """
+    first = np.floor(low)
+    points = np.indices((size,) * 3).reshape(3, -1).T + first
+    values, gradients = field(points)
+    values /= np.maximum(length(gradients), 1e-6)
+    near = np.abs(values) < SETTLED_WITHIN
+    values[near], off = settle(field, points[near])
+    window = 2 * values.reshape((size,) * 3).astype(np.float32)
+    voxel_ijk = np.argwhere(np.abs(window) <= band.DECODE_LIMIT)
+    voxel_ijk = voxel_ijk[(np.abs(voxel_ijk - (size - 1) / 2) < size / 2 - EDGE).all(1)]
+    if len(voxel_ijk) < FEWEST or off.max() > UNSETTLED:
+        return None
+    offsets = draw_offsets(rng)
+    targets, off = settle(field, (voxel_ijk[:, None] + first + offsets / 2).reshape(-1, 3))
+    if off.max() > UNSETTLED:
+        return None
+    targets = 2 * targets.reshape(len(voxel_ijk), -1).astype(np.float16)
+    return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets)
+
+
+def signed_distance(rng: np.random.Generator, truth: solid.Solid, points: np.ndarray) -> np.ndarray:
     """Return the signed distance, (n,), of points (n, 3).
 
     The nearest triangle gives the sign quickly, but wrongly on meshes that intersect themselves.
@@ -126,13 +174,13 @@ def signed_distance(rng: np.random.Generator, solid: Solid, points: np.ndarray) 
     for all points.
     """
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
-    distances = igl.signed_distance(points, solid.mesh.vertices, solid.mesh.faces, kind)[0]
+    distances = igl.signed_distance(points, truth.mesh.vertices, truth.mesh.faces, kind)[0]
     some = rng.integers(len(points), size=min(len(points), 2000))
     clear = np.abs(distances[some]) > 1e-4  # on the surface either sign is correct
-    inside = solid.is_inside(points[some])
+    inside = truth.is_inside(points[some])
     if (inside == (distances[some] < 0))[clear].all():
         return distances
-    return np.where(solid.is_inside(points), -np.abs(distances), np.abs(distances))
+    return np.where(truth.is_inside(points), -np.abs(distances), np.abs(distances))
 
 
 def write_shard(path: Path, samples: list[Sample]) -> None:
@@ -154,7 +202,7 @@ def write_shard(path: Path, samples: list[Sample]) -> None:
 def read_shard(path: Path) -> Iterator[Sample]:
     """Yield the samples of a shard; FileError if it is damaged or not a shard."""
     try:
-        with np.load(check_regular_file(path)) as file:
+        with np.load(path) as file:
             shard = dict(file)
     except (ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise FileError(f"{path} is not a shard: {error}; remove it and make it again") from error
@@ -173,7 +221,7 @@ def find_meshes(folder: Path | None) -> tuple[list[Path], list[Path]]:
         return [], []
     if not folder.is_dir():
         raise FileError(f"--meshes {folder} is not a folder: give one with closed .ply meshes")
-    files = [check_regular_file(file) for file in sorted(folder.glob("*.ply"))]
+    files = [file for file in sorted(folder.glob("*.ply")) if file.is_file()]
     if not files:
         raise FileError(f"--meshes {folder} has no .ply file: other formats are not read here")
     prisms = [file for file in files if file.stat().st_size < 3000]
@@ -196,7 +244,7 @@ def mesh_order(seed: int, prisms: list[Path], others: list[Path], count: int) ->
 
 def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
     """Read a mesh; some are bent by smooth waves, so that few faces stay flat or parallel."""
-    mesh = read_mesh(path)
+    mesh = mesh_files.read_mesh(path)
     if rng.random() >= SWAYED:
         return mesh
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))
@@ -207,8 +255,8 @@ def make_thin_sample(rng: np.random.Generator, families: Sequence[str] = ()) -> 
     """Squeeze random procedural shapes along their axes until one is thin in its window."""
     sample = None
     while sample is None:
-        solid = random_solid(rng, families)
-        squeezed = solid.transformed(np.diag(np.exp(rng.normal(0, 1, 3))), np.zeros(3))
+        drawn = random_solid(rng, families)
+        squeezed = drawn.transformed(np.diag(np.exp(rng.normal(0, 1, 3))), np.zeros(3))
         sample = make_sample(rng, squeezed, THIN)
     return sample
 
@@ -220,6 +268,8 @@ def fill_shard(
     thin: float,
     count: int = SHARD,
     families: Sequence[str] = (),
+    sizes: tuple[float, float] = SIZES,
+    slices: float = 1.0,
 ) -> list[Sample]:
     """Make the samples of a shard; a procedural shape replaces a mesh without a usable sample."""
     samples: list[Sample] = []
@@ -228,16 +278,15 @@ def fill_shard(
             samples.append(make_thin_sample(rng, families))
             continue
         drawn = not files or rng.random() < procedural
-        sample = make_sample(
-            rng, random_solid(rng, families) if drawn else draw_mesh(rng, files[number])
-        )
+        mesh = random_solid(rng, families) if drawn else draw_mesh(rng, files[number])
+        sample = make_sample(rng, mesh, sizes=sizes, slices=slices)
         while sample is None:
-            sample = make_sample(rng, random_solid(rng, families))
+            sample = make_sample(rng, random_solid(rng, families), sizes=sizes, slices=slices)
         samples.append(sample)
     return samples
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     """Fill a store; existing shards are kept."""
     parser = Parser(description=__doc__.split("\n")[0])
     add = parser.add_argument
@@ -247,10 +296,14 @@ def main() -> None:
     named += f"(default: all, which are {', '.join(FAMILIES)})"
     add("--families", nargs="+", choices=FAMILIES, metavar="NAME", default=(), help=named)
     add("--thin", type=share, default=0.05, help="share of thin solids")
+    add("--sizes", type=positive, nargs=2, default=SIZES, help="voxels along a diagonal, from, to")
+    thick = f"thickest slices, over the other spacings, of {SLICED:g} of the samples"
+    add("--slices", type=positive, default=1.0, help=thick)
+    add("--smooth", action="store_true", help="smooth bodies, in shards of their own")
     add("--out", type=Path, required=True, help="folder for the shards")
     add("--count", type=at_least(1), default=5000, help="samples to make")
     add("--seed", type=at_least(0), default=0)
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     with parser.one_line_errors():
         fill_store(options)
 
@@ -258,15 +311,23 @@ def main() -> None:
 def fill_store(options: argparse.Namespace) -> None:
     files = mesh_order(options.seed, *find_meshes(options.meshes), options.count + SHARD)
     options.out.mkdir(parents=True, exist_ok=True)
+    shares, sizes = (options.procedural, options.thin), tuple(options.sizes)
+    kind = "smooth" if options.smooth else "shard"
     for number in range(-(-options.count // SHARD)):
-        path = options.out / f"shard-{options.seed}-{number:04d}.npz"
-        if not path.exists():
-            rng = np.random.default_rng([options.seed, number])
-            drawn = files[number * SHARD : (number + 1) * SHARD]
-            shares = options.procedural, options.thin
-            samples = fill_shard(rng, drawn, *shares, families=options.families)
-            write_shard(path, samples)
-            print(f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels", flush=True)
+        path = options.out / f"{kind}-{options.seed}-{number:04d}.npz"
+        if path.exists():
+            continue
+        rng = np.random.default_rng([options.seed, number])
+        drawn = files[number * SHARD : (number + 1) * SHARD]
+        count = min(SHARD, options.count - number * SHARD)
+        if options.smooth:
+            samples = [make_smooth_sample(rng, options.slices) for _ in range(count)]
+        else:
+            samples = fill_shard(
+                rng, drawn, *shares, count, options.families, sizes, options.slices
+            )
+        write_shard(path, samples)
+        print(f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,16 +1,18 @@
-"""Fit the rule that tells edges from rounded ground: see ``super_sdf.steps.sharp.features``.
+"""Fit the rule that tells edges from rounded ground: see ``super_sdf.surface.sharp.features``.
 
     python -m export.edges --meshes FOLDER_OF_PLY --procedural 0.4 --count 200 --out edges.npz
 
 Shapes for training are sampled on a grid and refined by the shipped network. For every candidate
 of the mesher the surfaces there are compared with the true one, with vertices that go some shares
 of the way to the edge. The rule is the linear one of the evidence that loses least in the mean. The
-rows are kept in ``--out``; with ``--fit`` alone they are fitted again.
+rows are kept in ``--out``; with ``--fit`` alone they are fitted again. ``--write`` puts the rule
+into the package.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +26,11 @@ from super_sdf.errors import SuperSdfError
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.network import Network, load_network
 from super_sdf.pipeline import upsample
-from super_sdf.surface.cap import close_at_border
 from super_sdf.refine.field import FineField
-from super_sdf.surface.marching import find_crossings, to_world
-from super_sdf.surface.sharp.features import Rule, find_candidates, placed_by
+from super_sdf.surface.cap import close
+from super_sdf.surface.extract import to_world
+from super_sdf.surface.marching import find_crossings
+from super_sdf.surface.sharp.features import RULE, Rule, find_candidates, place
 from super_sdf.surface.sharp.patches import Placed, Triangles, find_patches, triangles_of
 from super_sdf.surface.sharp.planes import planes_at_crossings
 from super_sdf.truth.solid import Solid
@@ -65,16 +68,17 @@ def draw_case(rng: np.random.Generator, paths: list[Path], procedural: float, nu
 
 def rows_of(case: Case, network: Network) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence (f, e) and the losses (f, s) of all candidates of a case."""
-    field = close_at_border(upsample(case.grid, network, FACTOR))
+    field = close(upsample(case.grid, network, FACTOR), cap=True)
     every = np.ones(len(field.voxel_ijk), bool)
-    crossings = find_crossings(field, slice(0, len(every)))
+    crossings = find_crossings(field)
+    border = np.array([(0, 0, 0), field.shape])
     patches, used = find_patches(field, crossings, every)
-    own = planes_at_crossings(field, crossings, used)
+    own = planes_at_crossings(field, crossings, used, border)
     candidates = find_candidates(patches, own, every, field)
     losses = []
     for way in SHARES:
-        placed = placed_by(patches, own, candidates, np.full(len(candidates.patch), way))
-        made = triangles_of(patches, placed)
+        placed = place(patches, own, candidates, np.full(len(candidates.patch), way))
+        made = triangles_of(patches, placed, np.ones(len(patches.row), bool))
         errors = errors_of(case.shape.solid, made, placed, field, case.grid)
         losses.append((errors[candidates.patch] / (DISTANCE, TURN)).sum(1))
     return candidates.evidence, np.stack(losses, 1)
@@ -93,7 +97,7 @@ def errors_of(
     area = np.linalg.norm(normal, axis=1)
     normal /= np.maximum(area, 1e-12)[:, None]
     points = np.einsum("pk,tkd->ptd", AT, corners).reshape(-1, 3)
-    world = to_world(points.T, field, grid).astype(np.float64)
+    world = to_world(points.T, field.factor, grid)
     distance = solid.distance(world).reshape(len(AT), -1).mean(0) / grid.spacing[0]
     true = face_vectors(solid.mesh)[solid.nearest_face(world)]
     true /= np.maximum(np.linalg.norm(true, axis=1), 1e-15)[:, None]
@@ -141,6 +145,13 @@ def fit_rule(rows: Rows) -> Rule:
     return Rule(float(bias - low) / (high - low), tuple((weights / (high - low)).tolist()))
 
 
+def write_rule(rule: Rule) -> None:
+    """Write the rule into the package; the evidence keeps its names."""
+    names = json.loads(RULE.read_text())["weights"]
+    weights = {name: round(weight, 4) for name, weight in zip(names, rule.weights)}
+    RULE.write_text(json.dumps({"bias": round(rule.bias, 4), "weights": weights}, indent=2) + "\n")
+
+
 def weights_of(rows: Rows) -> np.ndarray:
     """Return what candidates count for, (n,): less where their shape has many more than others."""
     weight = np.minimum(1, MOST_OF_SHAPE / np.bincount(rows["shape"])[rows["shape"]])
@@ -171,19 +182,21 @@ def report(rows: Rows, rule: Rule) -> str:
 
 
 def main() -> None:
-    """Gather rows, or read those of a file, and print the rule."""
+    """Gather rows, or read those of a file, and fit the rule."""
     parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("--meshes", type=Path, help="folder of closed .ply meshes")
     parser.add_argument("--procedural", type=share, default=0.4, help="share of procedural shapes")
     parser.add_argument("--count", type=at_least(1), default=200, help="shapes to draw")
     parser.add_argument("--out", type=Path, required=True, help="file of the rows, .npz")
     parser.add_argument("--fit", action="store_true", help="fit the rows in --out again")
+    parser.add_argument("--write", action="store_true", help="write the rule into the package")
     parser.add_argument("--seed", type=at_least(0), default=0)
     options = parser.parse_args()
     rows = dict(np.load(options.out)) if options.fit else gather(options)
     rule = fit_rule(rows)
     print(report(rows, rule))
-    print(f"Rule({rule.bias:.4f}, ({', '.join(f'{weight:.4f}' for weight in rule.weights)}))")
+    if options.write:
+        write_rule(rule)
 
 
 if __name__ == "__main__":

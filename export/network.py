@@ -26,8 +26,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor, nn
 
-from super_sdf.network.neighbourhood import CENTRE
-from super_sdf.refine.band import DECODE_LIMIT, MAX_DIFFERENCE
+from super_sdf.network import neighbourhood
+from super_sdf.refine import band
+
+CENTRE = neighbourhood.CENTRE
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ CHUNK = 1024  # voxels gathered at a time on a CPU, so that their columns stay i
 
 
 class GatherMatMul(torch.autograd.Function):
-    """``columns_of(pad(features), table) @ weight``, differentiated without a scatter.
+    """The columns of features times a weight, differentiated without a scatter.
 
     If u is v's neighbour at place k, then v is u's neighbour at place 26 - k. So the gradient is a
     convolution, too, with the places reversed, and no scatter-add is needed. The columns are
@@ -81,11 +83,15 @@ class GatherMatMul(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
         """Map the gradient (V, C_out) to the gradients of features and weight."""
         features, weight, table, around = ctx.saved_tensors
-        places, channels_out = table.shape[1], weight.shape[1]
-        reversed_weight = weight.view(places, -1, channels_out).flip(0).transpose(1, 2)
-        rows = reversed_weight.reshape(places * channels_out, -1)
-        of_weight = weight_gradient(torch.cat([features, around]), grad, table)
-        return convolve(grad, rows, table.clamp(max=len(grad))), of_weight, None, None
+        reversed_weight = weight.view(27, -1, weight.shape[1]).flip(0).transpose(1, 2)
+        of_features = convolve(
+            grad, reversed_weight.reshape(-1, features.shape[1]), table.clamp(max=len(grad))
+        )
+        dtype = torch.promote_types(grad.dtype, torch.float32)
+        of_weight = torch.zeros(weight.shape[1], len(weight), dtype=dtype, device=grad.device)
+        for part, columns in gathered(torch.cat([features, around]), table):
+            of_weight += grad[part].T @ columns  # a third faster than columns.T @ grad[part]
+        return of_features, of_weight.T.to(grad.dtype), None, None
 
 
 def convolve(features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
@@ -96,45 +102,31 @@ def convolve(features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
     return out
 
 
-def weight_gradient(features: Tensor, grad: Tensor, table: Tensor) -> Tensor:
-    """Return the gradient (27 C, C_out) of the weight, summed in float32 at least."""
-    dtype = torch.promote_types(grad.dtype, torch.float32)
-    shape = grad.shape[1], table.shape[1] * features.shape[1]
-    total = torch.zeros(shape, dtype=dtype, device=grad.device)
-    for part, columns in gathered(features, table):
-        total += grad[part].T @ columns  # a third faster than columns.T @ grad[part]
-    return total.T.to(grad.dtype)
-
-
 def gathered(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Yield the columns of some voxels after others, and which voxels they are; on a GPU of all."""
-    padded = pad(features)
+    """Yield the rows that a table (V, 27) names side by side, (n, 27 C), and which voxels they are.
+
+    A row of zeros stands for an absent voxel. On a GPU they come all at once.
+    """
+    padded = torch.cat([features, features.new_zeros(1, features.shape[1])])
     rows = CHUNK if features.device.type == "cpu" else max(len(table), 1)
     for start in range(0, len(table), rows):
         part = slice(start, start + rows)
-        yield part, columns_of(padded, table[part])
+        indices = table[part].reshape(-1)
+        if padded.is_cuda:
+            from export.gpu_gather import gather_rows  # only CUDA builds of PyTorch have Triton
 
-
-def pad(features: Tensor) -> Tensor:
-    """Append the row of zeros that stands for an absent voxel, index V."""
-    return torch.cat([features, features.new_zeros(1, features.shape[1])])
-
-
-def columns_of(padded: Tensor, table: Tensor) -> Tensor:
-    """Return the rows that a table (V, 27) names side by side, (V, 27 C)."""
-    if padded.is_cuda:
-        from export.gpu_gather import gather_rows  # only CUDA builds of PyTorch have Triton
-
-        return gather_rows(padded, table.reshape(-1)).view(len(table), -1)
-    return padded.index_select(0, table.reshape(-1)).view(len(table), -1)
+            columns = gather_rows(padded, indices)
+        else:
+            columns = padded.index_select(0, indices)
+        yield part, columns.view(-1, table.shape[1] * features.shape[1])
 
 
 class NeighbourConv(nn.Module):
-    """A sparse 3x3x3 convolution over the band, or one over fewer of the 27 places."""
+    """A sparse 3x3x3 convolution over the band."""
 
-    def __init__(self, channels: int, places: int = 27) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        rows = places * channels
+        rows = 27 * channels
         self.weight = nn.Parameter(torch.randn(rows, channels) / rows**0.5)
         self.bias = nn.Parameter(torch.zeros(channels))
 
@@ -213,7 +205,7 @@ class Gate(nn.Module):
         With ``share`` that share of the voxels exceeds the threshold, and the kept threshold moves
         a little to that which ``USUAL_SHARE`` exceeds.
         """
-        near = patches[:, CENTRE].abs() <= DECODE_LIMIT
+        near = patches[:, CENTRE].abs() <= band.DECODE_LIMIT
         threshold = self.threshold
         if share is not None:
             shares = doubts.new_tensor([1 - share, 1 - USUAL_SHARE])
@@ -244,9 +236,9 @@ def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
     """Return 1 for voxels whose own or a neighbour's patch cannot be distances, else 0, (V, 1).
 
     In such a patch two samples differ by more than their distance, as in
-    ``steps.band.is_lipschitz``.
+    ``refine.band.is_lipschitz``.
     """
-    excess = (patches - patches[:, CENTRE, None]).abs() - patches.new_tensor(MAX_DIFFERENCE)
+    excess = (patches - patches[:, CENTRE, None]).abs() - patches.new_tensor(band.MAX_DIFFERENCE)
     most = torch.cat([excess.amax(1), patches.new_zeros(1)])
     return (most[table].amax(1, keepdim=True) > 0).float()
 
@@ -310,17 +302,12 @@ class SuperSdfNet(nn.Module):
         deep = self.deepen(encoded.first, table, rows)
         return replace(encoded, features=encoded.early.index_copy(0, rows, deep))
 
-    def train_only_gate(self) -> None:
-        """Keep all values but those of the gate and of the block before it."""
-        self.requires_grad_(requires_grad=False)
-        for part in (self.early, self.gate):
-            part.requires_grad_(requires_grad=True)
+    @property
+    def device(self) -> torch.device:
+        return self.correction.weight.device
 
     def all_blocks(self) -> nn.ModuleList:
         return nn.ModuleList([*self.blocks, *([self.early] if self.config.gated else [])])
-
-    def trained(self) -> list[nn.Parameter]:
-        return [p for p in self.parameters() if p.requires_grad]
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of voxels at offsets (Q, 3)."""

@@ -24,10 +24,11 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from export.network import SuperSdfNet
-from super_sdf.network.neighbourhood import CENTRE
-from super_sdf.network.onnx import CHUNK_INPUT
-from super_sdf.refine.band import DECODE_LIMIT, MAX_DIFFERENCE
+from super_sdf.network import neighbourhood
+from super_sdf.network import onnx as sessions
+from super_sdf.refine import band
 
+CENTRE, CHUNK_INPUT = neighbourhood.CENTRE, sessions.CHUNK_INPUT
 CHUNK = 512  # voxels at a time; the runtime chooses its own, see ``cpu_chunk``
 EARLY = "_early"  # the block for voxels that go no deeper
 THRESHOLD = "gate.threshold"  # an input with a default, like the chunk
@@ -181,7 +182,7 @@ def scan_stem(graph: Graph, numbers: str, there: str) -> tuple[str, str]:
     features = body.op("Mul", made, "there")
     centre = body.op("Gather", patch, body.wholes(CENTRE), axis=1)
     apart = body.op("Abs", body.op("Sub", patch, centre))
-    beyond = body.op("Sub", apart, body.constant(MAX_DIFFERENCE))
+    beyond = body.op("Sub", apart, body.constant(band.MAX_DIFFERENCE))
     most = body.op("ReduceMax", beyond, body.wholes(1), keepdims=1)
     excess = body.op("Mul", most, "there")
     given = {
@@ -252,7 +253,7 @@ def gate(graph: Graph, features: str, rows: str) -> str:
     doubts = graph.op("Slice", doubts, graph.wholes(0), rows)
     above = graph.op("Greater", doubts, graph.parameter(graph.net.gate.threshold))
     sample = graph.op("Gather", "patches", graph.whole(CENTRE), axis=1)
-    near = graph.op("LessOrEqual", graph.op("Abs", sample), graph.real(DECODE_LIMIT))
+    near = graph.op("LessOrEqual", graph.op("Abs", sample), graph.real(band.DECODE_LIMIT))
     both = graph.op("NonZero", graph.op("And", above, near))
     return graph.op("Squeeze", both, graph.wholes(0))
 

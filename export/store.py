@@ -1,7 +1,8 @@
 """The windows of a store that a run is trained on, and which of them is shown next.
 
 On a CPU a step of training takes longer than to change, turn and gather its samples. On a GPU it is
-the other way round, so there ``ResidentStore`` keeps them on the device: see ``resident``.
+the other way round: there other processes change and gather each sample once, it stays on the
+device, and is turned anew each time it is shown.
 """
 
 from __future__ import annotations
@@ -15,18 +16,13 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from export.augment import Prepared, Shares, augment, augment_mask, change, prepare, prepare_mask
-from export.batches import Batch, batch_of
+from export.augment import DISTANCES, USUAL, Prepared, Shares, change, turned
 from export.dataset import Sample, read_shard
-from export.recipe import Recipe
-from export.resident import Residents, gather_samples
-from export.to_onnx import DISTANCES
+from export.losses import Batch, Recipe, batch_of
 from super_sdf.errors import FileError
-from super_sdf.network.contract import MASKS
 
-HELD_OUT = 2  # shards, the first by name, whose errors are logged
+HELD_OUT = 2  # shards, the first by name, whose errors are logged, and one of smooth bodies
 READERS = 4  # processes that gather samples for a GPU
-INPUTS = (DISTANCES, MASKS)
 
 
 class Sampler:
@@ -47,15 +43,12 @@ class Sampler:
         """Return the index of the next window; for ``spread`` see ``chances``."""
         if not self._order:
             new, count = np.flatnonzero(np.isnan(self.losses)), len(self.losses)
-            if len(new) or spread == 1:
-                order = rng.permutation(new if len(new) else count)
+            if len(new):
+                order = rng.permutation(new)
             else:
                 order = rng.choice(count, count, p=chances(self.losses, spread))
             self._order = order.tolist()
         return self._order.pop()
-
-    def record(self, drawn: Sequence[int], losses: Sequence[float]) -> None:
-        self.losses[list(drawn)] = losses
 
 
 def chances(losses: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
@@ -69,11 +62,15 @@ def chances(losses: NDArray[np.float64], spread: float) -> NDArray[np.float64]:
     return bounded / bounded.sum()
 
 
-def check_store(folder: Path, held_out: int) -> None:
+def shards_of(folder: Path, kind: str = "shard") -> list[Path]:
+    return sorted(folder.glob(f"{kind}-*.npz"))
+
+
+def check_store(folder: Path, held_out: int = HELD_OUT) -> None:
     """Raise FileError if a folder has no more shards than are held out."""
     if not folder.is_dir():
         raise FileError(f"--store {folder} is not a folder: fill one with export.dataset")
-    count = len(list(folder.glob("shard-*.npz")))
+    count = len(shards_of(folder))
     if count <= held_out:
         raise FileError(
             f"--store {folder} has {count} of at least {held_out + 1} shards, since the first "
@@ -81,122 +78,89 @@ def check_store(folder: Path, held_out: int) -> None:
         )
 
 
+def held_out(folder: Path, inputs: str, count: int, kind: str = "shard") -> list[Prepared]:
+    """Return the samples of the first shards, masks or unchanged; masks are always the same."""
+    samples = [s for path in shards_of(folder, kind)[:count] for s in read_shard(path)]
+    rngs = (np.random.default_rng(len(sample.voxel_ijk)) for sample in samples)
+    kept = [change(rng, sample, inputs, Shares(0, 0, 0)) for rng, sample in zip(rngs, samples)]
+    return [sample for sample in kept if len(sample.voxels)]
+
+
+def read_changed(path: Path, inputs: str, shares: Shares) -> list[Prepared]:
+    """Return the samples of a shard, changed at random, always in the same way."""
+    rng = np.random.default_rng(crc32(path.name.encode()))
+    return [change(rng, sample, inputs, shares) for sample in read_shard(path)]
+
+
 class Store:
     """The samples of the shards in a folder, read anew with ``refresh``; the first are held out.
 
-    FileError if no shard is left for training, or one is damaged.
+    Those of smooth bodies are drawn alike: by their loss they would hardly be drawn. FileError if
+    no shard is left for training, or one is damaged.
     """
 
     def __init__(
         self,
         folder: Path,
-        held_out: int = HELD_OUT,
-        most: int | None = None,
+        first: int = HELD_OUT,
         inputs: str = DISTANCES,
+        shares: Shares = USUAL,
         device: str = "cpu",
     ) -> None:
-        check_store(folder, held_out)
-        self.folder, self.most, self.inputs, self.device = folder, most, inputs, device
-        self.seen = sorted(folder.glob("shard-*.npz"))[:held_out]
-        gathered = prepare_mask if inputs == MASKS else prepare
-        held = [gathered(s) for path in self.seen for s in read_shard(path)]
-        self.held_out = [sample for sample in held if len(sample.voxels)]
-        self.samples: list[Sample] = []
+        check_store(folder, first)
+        self.folder, self.inputs, self.shares, self.device = folder, inputs, shares, device
+        self.seen = {*shards_of(folder)[:first], *shards_of(folder, "smooth")[:1]}
+        self.held_out = held_out(folder, inputs, first)
+        self.held_out_smooth = held_out(folder, inputs, 1, "smooth")
+        self.samples: dict[str, list[Sample | Prepared]] = {"shard": [], "smooth": []}
         self.sampler = Sampler()
-        self.refresh()
+        self.pool = ProcessPoolExecutor(READERS, get_context("spawn")) if device != "cpu" else None
+        self.reading: list[tuple[str, Future[list[Prepared]]]] = []
+        self.refresh(wait=True)
 
-    def unseen(self) -> list[Path]:
-        return sorted(set(self.folder.glob("shard-*.npz")) - set(self.seen))
-
-    def refresh(self) -> None:
-        """Read new shards, at most ``most`` of them."""
-        for path in self.unseen()[: self.most]:
-            self.seen.append(path)
-            self.samples += list(read_shard(path))
-        self.sampler.add(len(self.samples) - len(self.sampler.losses))
-
-    def __len__(self) -> int:
-        return len(self.samples)
-
-    def draw_batch(
-        self, rng: np.random.Generator, recipe: Recipe, parts: int
-    ) -> tuple[list[int], list[Batch]]:
-        """Return windows with about ``batch_voxels`` voxels together, and which they are.
-
-        They come in as many batches as there are threads, so that each can work on one.
-        """
-        drawn: list[int] = []
-        shown: list[Prepared] = []
-        while sum(len(sample.patches) for sample in shown) < recipe.batch_voxels:
-            index = self.sampler.draw(rng, recipe.spread)
-            if self.inputs == MASKS:
-                sample = augment_mask(rng, self.samples[index])
-            else:
-                sample = augment(rng, self.samples[index], recipe.shares)
-            if len(sample.voxels):
-                drawn, shown = [*drawn, index], [*shown, sample]
-            else:
-                self.sampler.record([index], [0.0])
-        groups = divide([len(sample.patches) for sample in shown], parts)
-        batches = [batch_of([shown[row] for row in rows], self.device) for rows in groups]
-        return [drawn[row] for rows in groups for row in rows], batches
-
-
-def divide(sizes: Sequence[int], parts: int) -> list[list[int]]:
-    """Return which windows of a batch each of at most ``parts`` threads works on.
-
-    The largest windows are given out first, each to the part with the fewest voxels so far.
-    """
-    rows: list[list[int]] = [[] for _ in range(parts)]
-    for row in sorted(range(len(sizes)), key=lambda row: -sizes[row]):
-        min(rows, key=lambda part: sum(sizes[other] for other in part)).append(row)
-    return [part for part in rows if part]
-
-
-class ResidentStore(Store):
-    """The samples of the shards in a folder on a GPU, each changed once and for all.
-
-    Other processes read and gather them, so that the GPU never waits for new ones.
-    """
-
-    def __init__(self, folder: Path, held_out: int, shares: Shares, device: str) -> None:
-        self.shares, self.residents = shares, Residents(device)
-        self.readers = ProcessPoolExecutor(READERS, get_context("spawn"))
-        self.reading: list[Future[dict[str, np.ndarray]]] = []
-        super().__init__(folder, held_out)
-        while not len(self):
-            self._take_in(self.reading.pop(0))
-
-    def refresh(self) -> None:
-        """Have new shards read, and take in those that were."""
-        for path in self.unseen():
-            self.seen.append(path)
-            self.reading.append(self.readers.submit(read_changed, path, self.shares))
-        done = [future for future in self.reading if future.done()]
-        self.reading = [future for future in self.reading if future not in done]
-        for future in done:
-            self._take_in(future)
-
-    def _take_in(self, future: Future[dict[str, np.ndarray]]) -> None:
-        self.residents.add(future.result())
+    def refresh(self, *, wait: bool = False) -> None:
+        """Take in new shards; of those that other processes read, the ones that are there."""
+        for kind, samples in self.samples.items():
+            for path in (path for path in shards_of(self.folder, kind) if path not in self.seen):
+                self.seen.add(path)
+                if self.pool:
+                    read = self.pool.submit(read_changed, path, self.inputs, self.shares)
+                    self.reading.append((kind, read))
+                else:
+                    samples += read_shard(path)
+        while self.reading and (wait or self.reading[0][1].done()):
+            kind, read = self.reading.pop(0)
+            self.samples[kind] += [s.on(self.device) for s in read.result() if len(s.voxels)]
         self.sampler.add(len(self) - len(self.sampler.losses))
 
     def __len__(self) -> int:
-        return len(self.residents)
+        return len(self.samples["shard"])
 
-    def draw_batch(
-        self, rng: np.random.Generator, recipe: Recipe, parts: int
-    ) -> tuple[list[int], list[Batch]]:
-        """Return windows with about ``batch_voxels`` voxels in one batch, and which they are."""
+    def show(self, rng: np.random.Generator, sample: Sample | Prepared) -> Prepared:
+        """Return a sample changed, unless it was before, and turned."""
+        if isinstance(sample, Sample):
+            sample = change(rng, sample, self.inputs, self.shares)
+        return turned(sample, int(rng.integers(48)))
+
+    def draw_batch(self, rng: np.random.Generator, recipe: Recipe) -> tuple[list[int], Batch]:
+        """Return windows with about ``batch_voxels`` voxels, and which they are, -1 if smooth."""
         drawn: list[int] = []
-        while sum(self.residents.band_counts[index] for index in drawn) < recipe.batch_voxels:
-            drawn.append(self.sampler.draw(rng, recipe.spread))
-        turns = rng.integers(48, size=len(drawn)).tolist()
-        return drawn, [self.residents.batch(drawn, turns)]
+        shown: list[Prepared] = []
+        smooth = self.samples["smooth"]
+        while sum(len(sample.patches) for sample in shown) < recipe.batch_voxels:
+            if smooth and rng.random() < recipe.smooth:
+                index, sample = -1, self.show(rng, smooth[rng.integers(len(smooth))])
+            else:
+                index = self.sampler.draw(rng, recipe.spread)
+                sample = self.show(rng, self.samples["shard"][index])
+            if len(sample.voxels):
+                drawn, shown = [*drawn, index], [*shown, sample]
+            elif index >= 0:
+                self.sampler.losses[index] = 0.0
+        return drawn, batch_of(shown)
 
-
-def read_changed(path: Path, shares: Shares) -> dict[str, np.ndarray]:
-    """Return the samples of a shard, changed at random, always in the same way."""
-    rng = np.random.default_rng(crc32(path.name.encode()))
-    changed = [change(rng, sample, shares) for sample in read_shard(path)]
-    return gather_samples([sample for sample in changed if len(sample.voxels)])
+    def record(self, drawn: Sequence[int], losses: Sequence[float]) -> None:
+        """Keep the losses of windows that were shown, for the chances of their next turn."""
+        for index, loss in zip(drawn, losses):
+            if index >= 0:
+                self.sampler.losses[index] = loss

@@ -22,22 +22,17 @@ import onnx
 import torch
 from onnx import helper, numpy_helper
 
-from export.augment import draw_samples
-from export.batches import singly
-from export.dormant import dormant_share
+from export.augment import DISTANCES
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
+from super_sdf import load_network
 from super_sdf.errors import ModelError
-from super_sdf.network.contract import EXACT_DISTANCES, FORMAT_VERSION, MASKS
-from super_sdf.network.network import load_network
-from super_sdf.refine.band import find_band, gather_patches, neighbour_table
-from super_sdf.refine.nodes import block_offsets
+from super_sdf.network import contract
+from super_sdf.refine import band, nodes
 
 OPSET = 18
 PARITY = 2e-4  # half voxels: 1e-4 of a voxel
 ROUNDING = 2e-6  # half voxels, of values of some half voxels in float32
-DISTANCES = "distances"  # of which some were noisy: what a card without an entry says
-DORMANT = 0.01  # largest accepted share of dormant units
 
 
 def read_weights(path: Path) -> dict[str, torch.Tensor]:
@@ -70,10 +65,10 @@ def noisy_ball(seed: int = 0) -> tuple[np.ndarray, ...]:
     ijk = np.indices((24, 20, 22))
     radius = np.linalg.norm(ijk - np.array([11, 9, 10])[:, None, None, None], axis=0)
     rescaled = (2 * (radius - 7) + rng.normal(0, 0.3, radius.shape)).astype(np.float32)
-    band = find_band(rescaled)
-    patches, table = gather_patches(rescaled, band), neighbour_table(band, rescaled.shape)
-    voxels = np.flatnonzero(rng.random(len(band)) < 0.7).astype(np.int32)
-    return patches, table, voxels, block_offsets(4)
+    ijk = band.find_band(rescaled)
+    patches, table = band.gather_patches(rescaled, ijk), band.neighbour_table(ijk, rescaled.shape)
+    voxels = np.flatnonzero(rng.random(len(ijk)) < 0.7).astype(np.int32)
+    return patches, table, voxels, nodes.block_offsets(4)
 
 
 def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
@@ -120,7 +115,7 @@ def read_network(path: Path) -> SuperSdfNet:
         functions=channels + len(weights["branch.bias"]),
         trunk=trunk,
         frequencies=(inputs - 3) // 6,
-        keeps_samples=read_inputs(path) != MASKS,
+        keeps_samples=read_inputs(path) != contract.MASKS,
         gated=int(read_card(path).get("gated", 0)),
     )
     net = SuperSdfNet(config)
@@ -136,27 +131,16 @@ def read_card(path: Path) -> dict[str, str]:
     return {prop.key: prop.value for prop in onnx.load(path).metadata_props}
 
 
-def check_awake(net: SuperSdfNet) -> None:
-    """Exit if many units react to no voxel of procedural shapes: a smaller network would do."""
-    samples = draw_samples(masks=not net.config.keeps_samples)
-    share = dormant_share(net, singly(net, [sample for sample in samples if len(sample.voxels)]))
-    if share > DORMANT:
-        raise SystemExit(
-            f"{100 * share:.1f} % of the rectified units react to nothing, "
-            f"{100 * DORMANT:g} % may: train on, with --start and --rate; nothing was written"
-        )
-
-
 def make_card(
     net: SuperSdfNet, name: str, data: str, accuracy: str, inputs: str = DISTANCES
 ) -> dict[str, Any]:
     """Return the metadata of the file, which the runtime shows."""
-    inputs = inputs if net.config.keeps_samples else MASKS
+    inputs = inputs if net.config.keeps_samples else contract.MASKS
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
     ).stdout.strip()
     return {
-        "format_version": FORMAT_VERSION,
+        "format_version": contract.FORMAT_VERSION,
         "name": name,
         "band": "abs(value) < 1.5 h",
         "receptive_field": net.config.receptive_field,
@@ -184,7 +168,7 @@ def main() -> None:
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
     exact = "it was trained on hardly any noisy samples: noisy grids are for another network"
     parser.add_argument("--exact", action="store_true", help=exact)
-    gate = "of the gate, if not that of the run: see export.gates"
+    gate = "of the gate, the logarithm of a loss, if not that of the run"
     parser.add_argument("--threshold", type=float, help=gate)
     options = parser.parse_args()
     if options.source:
@@ -193,8 +177,7 @@ def main() -> None:
     net = load_run(options.run)
     if options.threshold is not None:
         net.gate.threshold.fill_(options.threshold)
-    check_awake(net)
-    inputs = EXACT_DISTANCES if options.exact else DISTANCES
+    inputs = contract.EXACT_DISTANCES if options.exact else DISTANCES
     card = make_card(net, options.out.stem, options.data, options.accuracy, inputs)
     write_model(net, options.out, card)
     difference = parity(net, options.out)

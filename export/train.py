@@ -4,57 +4,49 @@
     python -m export.train --store training/store --run training/run --minutes 90     # resumes
     python -m export.train --store training/store --run training/run --device cuda --by-clock
     python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
-    python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 12  # more blocks
-    python -m export.train ... --start src/super_sdf/models/noisy.onnx --size base # more units
-    python -m export.train ... --inputs masks      # the network for masks
-    OMP_NUM_THREADS=1 python -m export.train ... --threads 2   # each works on a part of a batch
+    python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 14  # more blocks
+    python -m export.train ... --size mask --inputs masks   # the network for masks
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
-``log.csv`` and ``loss.png``. Dormant units are restarted (``dormant``). The learning rate depends
-on the share of ``--minutes`` that is spent, so a run always ends annealed, however fast the
-machine. Windows on which much is lost are shown more often, and new shards in the store are picked
-up as they appear (``store``).
+``log.csv`` and ``loss.png``, all written every five minutes. The learning rate depends on the share
+of ``--minutes`` that is spent, so a run always ends annealed, however fast the machine. Windows on
+which much is lost are shown more often, and new shards are picked up as they appear (``store``).
 """
 
 from __future__ import annotations
 
 import argparse
 import copy
+import csv
 import time
-from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from export.arguments import Parser, at_least, positive, share
-from export.augment import USUAL
-from export.batches import Batch, singly
-from export.dormant import dormant_share, revive
-from export.grow import grow_from, without_blocks
-from export.network import SIZES, SuperSdfNet
-from export.recipe import (
+from export.augment import DISTANCES, INPUTS, USUAL
+from export.losses import (
     RECIPE,
+    Batch,
     Recipe,
-    make_optimisers,
     measure,
-    rate_factor,
     relative_weights,
     window_losses,
 )
-from export.run_log import append_line, plot_run, read_log
-from export.store import HELD_OUT, INPUTS, ResidentStore, Store, check_store
-from export.to_onnx import DISTANCES, read_weights
-from super_sdf.files.regular import check_regular_file
+from export.network import SIZES, SuperSdfNet
+from export.store import HELD_OUT, Store, check_store
+from export.to_onnx import read_weights
+from super_sdf.errors import OptionError
 
-CHECKPOINT_SECONDS = 180
+SAVE_SECONDS = 300  # between checkpoints, each with a line in the log
 LONGEST_STEP = 30.0  # seconds: the rest of a longer one is taken as a pause (SIGSTOP)
-LOG_STEPS = 100
-WATCHED = 4  # last batches: a unit that reacted to none of them is dormant
+MEASURED = 3  # every third of the windows held out is measured for the log
+COLUMNS = ("step", "seconds", "samples", "loss", "everywhere", "near", "normal", "smooth", "bias")
 WITH_BFLOAT16 = ("avx512_bf16", "amx_bf16")
 
 
@@ -72,21 +64,14 @@ class Run:
     """The state of a run: weights, their running average, optimisers, steps, seconds spent."""
 
     def __init__(
-        self,
-        folder: Path,
-        net: SuperSdfNet,
-        recipe: Recipe = RECIPE,
-        device: str = "cpu",
-        threads: int = 1,
+        self, folder: Path, net: SuperSdfNet, recipe: Recipe = RECIPE, device: str = "cpu"
     ) -> None:
-        self.path = folder / "checkpoint.pt"
-        self.recipe, self.device, self.threads = recipe, device, threads
+        self.path, self.recipe, self.device = folder / "checkpoint.pt", recipe, device
         self.net = net.to(device)
         self.average = copy.deepcopy(self.net)
         self.optimisers = make_optimisers(self.net, recipe)
         self.peaks = [optimiser.param_groups[0]["lr"] for optimiser in self.optimisers]
         self.step, self.seconds = 0, 0.0
-        self.recent: deque[list[Batch]] = deque(maxlen=WATCHED)
 
     def save(self) -> None:
         """Write the checkpoint, completely or not at all."""
@@ -112,45 +97,33 @@ class Run:
             self.step, self.seconds = state["step"], state["seconds"]
 
     def start_from(self, weights: dict[str, Tensor]) -> None:
-        grow_from(self.net, weights)
+        """Take the weights of a network of this width; blocks that it lacks change nothing yet."""
+        fresh = {name: array.clone() for name, array in self.net.state_dict().items()}
+        for name, array in fresh.items():
+            if name not in weights and ".reduce." in name:
+                array.zero_()
+        try:
+            self.net.load_state_dict({**fresh, **weights})
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:200]
+            raise OptionError(f"--start has a network of another size: {reason}") from error
         self.average.load_state_dict(self.net.state_dict())
 
-    def advance(self, batches: list[Batch], spent: float) -> tuple[float, list[float]]:
+    def advance(self, batch: Batch, spent: float) -> tuple[float, list[float]]:
         """Take one step at the rate for this share of the budget; return the loss, and each's."""
         for optimiser, peak in zip(self.optimisers, self.peaks):
             optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
-        weights = relative_weights([n for batch in batches for n in batch.counts], self.recipe)
-        losses = self.find_gradients(batches, weights)
+            optimiser.zero_grad()
+        with autocast(self.device):
+            losses = window_losses(self.net, batch, self.recipe)
+        total = (relative_weights(batch.counts, self.recipe).to(self.device) * losses).sum()
+        total.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
             optimiser.step()
         self.step += 1
         self.update_average()
-        self.recent.append(batches)
-        every, full = self.recipe.revive_steps, len(self.recent) == WATCHED
-        is_time = bool(every) and full and self.step % every == WATCHED
-        if is_time and spent < self.recipe.revive_until:
-            revive(self.net, self.optimisers, [each for some in self.recent for each in some])
-        return float(weights @ losses), losses.tolist()
-
-    def find_gradients(self, batches: list[Batch], weights: Tensor) -> Tensor:
-        """Set the gradients of the weighted sum of the windows' losses; return each loss, (B,).
-
-        Each batch has a thread of its own, since on a CPU one product is too small to be shared.
-        """
-        parts = weights.to(self.device).split([len(batch.counts) for batch in batches])
-        with ThreadPoolExecutor(len(batches)) as pool:
-            found = list(pool.map(self._gradients, batches, parts))
-        for parameter, *grads in zip(self.net.trained(), *(grads for _, grads in found)):
-            parameter.grad = sum(grads[1:], grads[0])
-        return torch.cat([losses.cpu() for losses, _ in found])
-
-    def _gradients(self, batch: Batch, weights: Tensor) -> tuple[Tensor, Sequence[Tensor]]:
-        with autocast(self.device):
-            losses = window_losses(self.net, batch, self.recipe)
-        total = (weights * losses).sum()
-        grads = torch.autograd.grad(total, self.net.trained(), materialize_grads=True)
-        return losses.detach(), grads
+        return float(total.detach()), losses.tolist()
 
     def update_average(self) -> None:
         """Move the averaged weights towards the current ones."""
@@ -160,6 +133,24 @@ class Run:
             torch._foreach_lerp_(average, now, 1 - decay)
         for kept, buffer in zip(self.average.buffers(), self.net.buffers()):
             kept.copy_(buffer)
+
+
+def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:
+    """Return AdamW, and Muon for the matrices of the blocks."""
+    blocks = {id(p) for p in net.all_blocks().parameters() if p.ndim == 2}
+    hidden = [p for p in net.parameters() if id(p) in blocks]
+    others = [p for p in net.parameters() if id(p) not in blocks]
+    rate = {"lr": recipe.hidden_rate, "adjust_lr_fn": "match_rms_adamw"}
+    return [
+        torch.optim.AdamW(others, lr=recipe.outer_rate, weight_decay=1e-3),
+        torch.optim.Muon(hidden, weight_decay=1e-3, **rate),
+    ]
+
+
+def rate_factor(spent: float, recipe: Recipe) -> float:
+    """Return the rate over its peak after this share of the budget: warm-up, then half a cosine."""
+    cosine = 0.5 * (1 + np.cos(np.pi * min(spent, 1.0)))
+    return float(min(spent / recipe.warm_up, cosine) + 1e-3)
 
 
 def train(run: Run, store: Store, minutes: float, seed: int, began: float | None = None) -> None:
@@ -172,43 +163,47 @@ def train(run: Run, store: Store, minutes: float, seed: int, began: float | None
     saved, losses = time.monotonic(), []
 
     def share_spent() -> float:
-        seconds = run.seconds if began is None else time.monotonic() - began
-        return seconds / (60 * minutes)
+        return (run.seconds if began is None else time.monotonic() - began) / (60 * minutes)
 
     while (spent := share_spent()) < 1:
         start = time.monotonic()
-        losses.append(take_step(run, store, rng, spent))
+        drawn, batch = store.draw_batch(rng, run.recipe)
+        loss, each = run.advance(batch, spent)
+        store.record(drawn, each)
+        losses.append(loss)
         run.seconds += min(time.monotonic() - start, LONGEST_STEP)
-        if run.step % LOG_STEPS == 0:
-            log(run, store, float(np.mean(losses)), measured=run.step % (10 * LOG_STEPS) == 0)
-            losses.clear()
-            store.refresh()
-        if time.monotonic() - saved > CHECKPOINT_SECONDS:
+        if time.monotonic() - saved > SAVE_SECONDS or share_spent() >= 1:
             run.save()
-            saved = time.monotonic()
-    run.save()
-    if losses:
-        log(run, store, float(np.mean(losses)), measured=True)
+            log(run, store, float(np.mean(losses)))
+            store.refresh()
+            saved, losses = time.monotonic(), []
 
 
-def take_step(run: Run, store: Store, rng: np.random.Generator, spent: float) -> float:
-    drawn, batches = store.draw_batch(rng, run.recipe, run.threads)
-    loss, losses = run.advance(batches, spent)
-    store.sampler.record(drawn, losses)
-    return loss
-
-
-def log(run: Run, store: Store, loss: float, *, measured: bool) -> None:
-    """Append a line to the log, with the errors on held-out windows if they are to be measured."""
+def log(run: Run, store: Store, loss: float) -> None:
+    """Append a line to the log, with the errors on held-out windows, and draw it anew."""
     line = [run.step, round(run.seconds), len(store), f"{loss:.5f}"]
+    line += measure(run.average, store.held_out[::MEASURED]).cells()
+    if store.held_out_smooth:
+        smooth = measure(run.average, store.held_out_smooth[::MEASURED])
+        line += [f"{smooth.near:.5f}", f"{smooth.bias:.5f}"]
     path = run.path.with_name("log.csv")
-    if measured:
-        errors = measure(run.average, store.held_out)
-        line += [f"{errors.everywhere:.5f}", f"{errors.near:.5f}", f"{errors.normal:.5f}"]
-        line += [f"{dormant_share(run.net, singly(run.net, store.held_out)):.4f}"]
-    append_line(path, line)
-    if measured:
-        plot_run(read_log(path), path.with_name("loss.png"))
+    with path.open("a", newline="") as file:
+        csv.writer(file).writerow(line)
+    print(" ".join(f"{name} {value}" for name, value in zip(COLUMNS, line)), flush=True)
+    plot(path, path.with_name("loss.png"))
+
+
+def plot(log_file: Path, picture: Path) -> None:
+    with log_file.open(newline="") as file:
+        rows = [row + ["nan"] * (len(COLUMNS) - len(row)) for row in csv.reader(file)]
+    columns = dict(zip(COLUMNS, np.array(rows, float).T))
+    figure = Figure(figsize=(12, 4), layout="constrained")
+    for ax, names in zip(figure.subplots(1, 3), (["loss"], COLUMNS[4:7], COLUMNS[7:])):
+        for name in names:
+            ax.plot(columns["seconds"] / 60, columns[name], label=name)
+        ax.set(xlabel="minutes", yscale="linear" if "bias" in names else "log")
+        ax.legend()
+    figure.savefig(picture, dpi=100)
 
 
 NUMBERS = (
@@ -217,16 +212,15 @@ NUMBERS = (
     ("noisy", share, USUAL.noisy, "share of noisy samples"),
     ("shifted", share, USUAL.shifted, "share with another zero level"),
     ("truncated", share, USUAL.truncated, "share of truncated samples"),
+    ("smooth", share, RECIPE.smooth, "share of windows of smooth bodies, if the store has any"),
     ("batch", at_least(1), RECIPE.batch_voxels, "voxels of a batch; its last window may be more"),
-    ("threads", at_least(1), 1, "that each work on a part of a batch; set OMP_NUM_THREADS=1 then"),
     ("blocks", at_least(1), None, "number of blocks, if not that of the size"),
     ("gated", at_least(0), None, "last blocks, run where much is lost, if not those of the size"),
-    ("revive-steps", at_least(0), RECIPE.revive_steps, "between restarts of dormant units; 0: no"),
     ("seed", at_least(0), 0, "of all that is drawn"),
 )
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     """Start or resume training."""
     parser = Parser(description=__doc__.split("\n")[0])
     add = parser.add_argument
@@ -234,17 +228,13 @@ def main() -> None:
     add("--run", type=Path, required=True, help="folder of the run")
     add("--size", choices=SIZES, default="base", help="size of the network")
     add("--inputs", choices=INPUTS, default=DISTANCES, help="what the network is trained on")
-    add("--start", type=Path, help="an .onnx file of that size, or smaller, to start from")
-    left_out = {"type": at_least(0), "nargs": "+", "default": (), "metavar": "BLOCK"}
-    add("--without", **left_out, help="blocks of --start to leave out, counted from 0")
-    only = "train the gate and the block before it; all else stays as in --start"
-    add("--only-gate", action="store_true", help=only)
+    add("--start", type=Path, help="an .onnx file of that width to start from")
     clock = "count the minutes from the start of this call, reading and pauses included"
     add("--by-clock", action="store_true", help=clock)
     add("--device", choices=["cpu", "cuda"], default="cpu")
     for name, kind, default, text in NUMBERS:
         add(f"--{name}", type=kind, default=default, help=text)
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     with parser.one_line_errors():
         run_training(options)
 
@@ -253,27 +243,7 @@ def run_training(options: argparse.Namespace) -> None:
     """Check the store before anything is written, then train."""
     began = time.monotonic() if options.by_clock else None
     check_store(options.store, HELD_OUT)
-    if options.start:
-        check_regular_file(options.start)
-    options.run.mkdir(parents=True, exist_ok=True)
-    torch.manual_seed(options.seed)
-    net, recipe = network_of(options), recipe_of(options)
-    run = Run(options.run, net, recipe, options.device, options.threads)
-    if options.start:
-        run.start_from(without_blocks(read_weights(options.start), options.without))
-    run.resume()
-    if options.device == "cuda":
-        import export.gpu_gather  # only CUDA builds of PyTorch have Triton
-
-        export.gpu_gather.check()
-    if options.device == "cuda" and options.inputs == DISTANCES:
-        store: Store = ResidentStore(options.store, HELD_OUT, recipe.shares, options.device)
-    else:
-        store = Store(options.store, inputs=options.inputs, device=options.device)
-    train(run, store, options.minutes, options.seed, began)
-
-
-def network_of(options: argparse.Namespace) -> SuperSdfNet:
+    weights = read_weights(options.start) if options.start else None
     size = SIZES[options.size]
     config = replace(
         size,
@@ -281,25 +251,27 @@ def network_of(options: argparse.Namespace) -> SuperSdfNet:
         keeps_samples=options.inputs == DISTANCES,
         gated=size.gated if options.gated is None else options.gated,
     )
-    net = SuperSdfNet(config)
-    if options.only_gate:
-        net.train_only_gate()
-    return net
-
-
-def recipe_of(options: argparse.Namespace) -> Recipe:
     drawn = {name: getattr(options, name) for name in ("shifted", "noisy", "truncated")}
     recipe = replace(
         RECIPE,
         hidden_rate=options.rate * RECIPE.hidden_rate,
         outer_rate=options.rate * RECIPE.outer_rate,
         shares=replace(USUAL, **drawn),
+        smooth=options.smooth,
         batch_voxels=options.batch,
-        revive_steps=options.revive_steps,
     )
-    if options.only_gate:
-        return replace(recipe, shares_gated=(0.0, 0.0), revive_steps=0, first_weight=1.0)
-    return recipe
+    store = Store(options.store, HELD_OUT, options.inputs, recipe.shares, options.device)
+    options.run.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(options.seed)
+    run = Run(options.run, SuperSdfNet(config), recipe, options.device)
+    if weights:
+        run.start_from(weights)
+    run.resume()
+    if options.device == "cuda":
+        import export.gpu_gather  # only CUDA builds of PyTorch have Triton
+
+        export.gpu_gather.check()
+    train(run, store, options.minutes, options.seed, began)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from super_sdf import Mesh, load_network, read_grid, reconstruct
 from super_sdf.errors import DeviceError, OptionError
-from super_sdf.files.meshes import read_mesh
+from super_sdf.truth.mesh_files import read_mesh
 from super_sdf.truth.solid import Solid
 
 from . import parser_of

@@ -48,12 +48,7 @@ EDGES = (
     *(Column("angle near", "angle_near", 1, 2), Column("angle beyond", "angle_beyond", 1, 2)),
     *(TRIANGLES, Column("slivers %", "slivers", 100, 2), Column("min angle", "min_angle", 1, 2)),
 )
-COST = (
-    Column("mean s", "seconds", 1, 2),
-    Column("slowest s", "seconds_max", 1, 2),
-    Column("mean peak MB", "peak_mb", 1, 0),
-    Column("highest peak MB", "peak_mb_max", 1, 0),
-)
+COST = (Column("mean s", "seconds", 1, 2),)
 GAPS = {  # the last is one-sided: lost thin parts do not count
     **{"f1": "F1", "nc": "NC", "p2s": "point to surface"},
     "p2s_back": "result to reference",

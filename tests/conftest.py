@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +15,6 @@ from hypothesis import HealthCheck, settings
 from super_sdf import SdfGrid
 from super_sdf.network.neighbourhood import NEIGHBOURHOOD
 from super_sdf.network.onnx import ort
-from super_sdf.slabs import cutting
-from super_sdf.refine import survey
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -81,18 +78,6 @@ def folder(tmp_path, monkeypatch):
 
 
 @pytest.fixture
-def in_process(monkeypatch):
-    """Read files in this process: to start others takes most of the time of many tests."""
-    from super_sdf.files import apart
-    from super_sdf.files.readers import READERS
-
-    monkeypatch.setenv("HDF5_EXTFILE_PREFIX", "")
-    monkeypatch.setattr(
-        apart, "volume_apart", lambda key, request: nullcontext(READERS[key](request))
-    )
-
-
-@pytest.fixture
 def command(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., tuple[int, str, str]]:
@@ -133,15 +118,6 @@ def run_batch(command):
         return code, said, re.sub(r"; [\d.]+ s\n$", "\n", err)
 
     return go
-
-
-@pytest.fixture
-def bare_plan(monkeypatch):
-    """Let the plan count what grows with the surface, over 100 MB, and nothing else."""
-    for name in ("THREAD_BYTES", "FIXED_BYTES", "NETWORK_FIXED"):
-        monkeypatch.setattr(cutting, name, 0)
-    for module in (cutting, survey):
-        monkeypatch.setattr(module, "held_memory", lambda: 10**8)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import super_sdf
 
 FIRST = ("abc", "copyreg", "io", "multiprocessing", "runpy", "struct", "tempfile", "threading")
 LATER = ("numpy", "pickle", "psutil", "selectors", "signal", "socket", "trimesh")
-COMMAND = "from super_sdf.cli.entry import main\n\nif __name__ == '__main__':\n    main()\n"
+COMMAND = "from super_sdf.cli.main import main\n\nif __name__ == '__main__':\n    main()\n"
 NOTE = "open({marker!r}, 'a').write(__name__ + ' ')\nraise ImportError('of the current folder')\n"
 
 

@@ -17,7 +17,7 @@ from conftest import ball
 # The command line where there are two cores, however few there are.
 COMMAND = """
 from super_sdf.batch import run
-from super_sdf.cli.entry import main
+from super_sdf.cli.main import main
 run.count_cores = lambda: 2
 main()
 """

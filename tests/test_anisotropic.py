@@ -9,7 +9,6 @@ import trimesh
 from conftest import trilinear
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_slabs import in_pieces
 
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.check.check import check_mesh
@@ -149,21 +148,6 @@ def test_offsets_grow_the_solid(offset, network):
     assert np.array_equal(mesh.vertices, other.vertices)
 
 
-@pytest.mark.parametrize("axis, mesher", [(0, "marching"), (1, "sharp"), (2, "marching")])
-def test_slabs_and_threads_make_the_same_mesh(axis, mesher, network, monkeypatch):
-    spacing = tuple(np.where(np.arange(3) == axis, 1.0, 0.5))
-    grid = make_grid(sampled(spacing), spacing=spacing)
-    whole = reconstruct(grid, network, mesher=mesher)
-    threaded = reconstruct(grid, load_network("fast", threads=2), mesher=mesher)
-    monkeypatch.setattr("super_sdf.steps.band.BLOCK_SAMPLES", 1)
-    pieces = in_pieces(grid, network, monkeypatch, 5, mesher=mesher)
-    assert len(pieces) > 2
-    joined = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
-    for other in (threaded, joined):
-        assert np.array_equal(whole.vertices, other.vertices)
-        assert np.array_equal(whole.faces, other.faces)
-
-
 def test_a_field_is_meshed_with_the_grid_that_it_was_made_from():
     grid = make_grid(sampled((0.4, 0.6, 0.4)), spacing=(0.4, 0.6, 0.4))
     field = upsample(grid, trilinear)
@@ -220,7 +204,6 @@ def test_the_command_says_what_it_resamples(folder, command):
     report = json.loads(out)
     assert "Note: the spacing differs between axes: the values are resampled along z" in err
     assert code == 0 and report["spacing"] == list(spacing) and report["shape"] == [25, 20, 19]
-    assert report["expected_triangles"] == pytest.approx(report["triangles"], rel=0.1)
     mesh = trimesh.load("a.ply")
     assert np.abs(pear(mesh.vertices - [1, 2, 3])).max() < 0.15 and mesh.is_watertight
     options = ("--quality", "fast", "--spacing", "0.4,0.4,0.6", "--origin", "1,2,3")

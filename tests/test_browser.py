@@ -19,7 +19,7 @@ from playwright.sync_api import Error, sync_playwright
 from super_sdf import load_network
 from super_sdf.batch import page as batch_page
 from super_sdf.cli.main import cli
-from super_sdf.convert import ConvertOptions
+from super_sdf.options import Options
 from super_sdf.pages.html import make_page, viewed_page, write_page
 from super_sdf.pages.items import entry_of
 
@@ -254,7 +254,7 @@ def test_many_files_are_searched_and_sorted(visit, tmp_path):
 def test_view_shows_meshes_and_refined_grids_from_one_file(visit, report, tmp_path):
     np.save(tmp_path / "a.npy", wedge())
     mesh = Path(report.removeprefix("file://")).with_suffix(".ply")
-    options = ConvertOptions(factor=2, spacing=(1.0,))
+    options = Options(factor=2, spacing=(1.0,))
     sources = [str(tmp_path / "a.npy"), str(mesh)]
     text = viewed_page(sources, lambda: load_network("fast", device="cpu"), options)
     write_page(text, tmp_path / "view.html")

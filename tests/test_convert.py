@@ -1,31 +1,15 @@
 """Conversion of one file: the mesh, the report, and no file after a failure."""
 
 import os
-import re
 
 import numpy as np
 import pytest
 import trimesh
 from conftest import ball, trilinear
-from test_slabs import in_pieces
 
-import super_sdf.convert
-from super_sdf import SdfGrid
-from super_sdf.convert import ConvertOptions, convert
-from super_sdf.errors import FileError, GridError, MeshError, WriteError
-from super_sdf.files import meshes
-from super_sdf.files.meshes import MESH_SUFFIXES
-from super_sdf.surface.mesh import Mesh
-
-
-class Close:
-    """Trilinear interpolation, which says how far it sees."""
-
-    receptive_field = 1
-    __call__ = staticmethod(trilinear)
-
-
-CLOSE = Close()
+from super_sdf.convert import convert
+from super_sdf.errors import FileError, GridError
+from super_sdf.options import Options
 
 
 @pytest.fixture(autouse=True)
@@ -36,9 +20,7 @@ def here(tmp_path, monkeypatch):
 
 def test_options_take_effect_and_the_result_is_reported():
     np.save("in.npy", -2 * ball(16, 4.0).values)
-    options = ConvertOptions(
-        2, spacing=(2.0,), origin=(1.0, 2.0, 3.0), inside="positive", offset=2.0
-    )
+    options = Options(2, spacing=2.0, origin=(1.0, 2.0, 3.0), inside="positive", offset=2.0)
     steps = []
     done = convert("in.npy", "out.ply", trilinear, options, progress=lambda *s: steps.append(s))
     grid, mesh = done.grid, trimesh.load("out.ply")
@@ -46,101 +28,42 @@ def test_options_take_effect_and_the_result_is_reported():
     assert done.notes == () and done.warnings == () and done.closed
     counts = len(mesh.vertices), len(mesh.faces)
     assert counts == (done.counts["vertices"], done.counts["triangles"])
+    assert counts == (len(done.mesh.vertices), len(done.mesh.faces))
     np.testing.assert_allclose(done.report()["bounds"], mesh.bounds)
     assert mesh.extents == pytest.approx([20] * 3, rel=0.02)
     assert mesh.bounds.mean(0) == pytest.approx(np.array([1, 2, 3]) + 2 * 7.63, abs=0.2)
     assert list(done.seconds) == ["read", "band", "network", "nodes", "isosurface", "write"]
-    assert steps == [(30, 1000), (480, 1000), (630, 1000), (1000, 1000)]
-
-
-def without_one(faces, first):
-    """Leave out a triangle that has one side on the plane between the last two slabs."""
-    return np.delete(faces, np.flatnonzero((faces < first).sum(1) == 2)[0], 0)
-
-
-def with_one_twice(faces, first):
-    """Repeat such a triangle."""
-    return np.append(faces, faces[(faces < first).sum(1) == 2][:1], 0)
-
-
-BETWEEN = (
-    "1 open edge at plane {1}, between planes {0} to {2} and planes {1} to {3}: run it again, "
-)
-
-
-@pytest.mark.parametrize(
-    "cap, end, spoil, want",
-    [
-        (True, 9, without_one, BETWEEN),
-        (False, 16, without_one, BETWEEN),
-        (False, 9, with_one_twice, BETWEEN),
-        (True, 16, lambda faces, _: faces[:-1], "3 open edges in planes "),
-    ],
-)
-def test_slabs_that_do_not_meet_and_holes_are_errors(monkeypatch, cap, end, spoil, want):
-    """Whether the surface ends within the grid, is capped or is left open."""
-    values = ball(16, 4.0).values[:, :end]
-    np.save("cut.npy", values)
-    slabs = in_pieces(SdfGrid(values, 1.0), CLOSE, monkeypatch, 3, factor=2, cap=cap)
-    before = sum(slab.counts["vertices"] for slab in slabs[:2])
-    mesh = slabs[2].meshes[0]
-    slabs[2].meshes[0] = Mesh(mesh.vertices, spoil(mesh.faces, before))
-    monkeypatch.setattr(super_sdf.convert, "reconstruct_slabs", lambda *_, **__: iter(slabs))
-    with pytest.raises(MeshError) as caught:
-        convert("cut.npy", "out.ply", trilinear, ConvertOptions(2, cap=cap))
-    assert not os.path.exists("out.ply")
-    (first, start), (_, stop) = slabs[1].planes, slabs[2].planes
-    said = want.format(first, start, start - 1, stop - 1)
-    assert str(caught.value).startswith(f"the mesh is torn, with {said}")
+    assert steps == sorted(steps) and steps[-1] == (1000, 1000)
 
 
 def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():
     np.save("flat.npy", np.ones((4, 4, 4)))
     with pytest.raises(GridError, match=r"^every value is 1: a constant field has no surface$"):
-        convert("flat.npy", "out.ply", trilinear, ConvertOptions())
+        convert("flat.npy", "out.ply", trilinear, Options())
     assert sorted(os.listdir()) == ["flat.npy", "in.npy"]
-    convert("in.npy", "out.ply", trilinear, ConvertOptions(2))
+    convert("in.npy", "out.ply", trilinear, Options(2))
     with pytest.raises(FileError, match=r"^out.ply exists: remove it or use --force$"):
-        convert("in.npy", "out.ply", trilinear, ConvertOptions(2))
-    convert("in.npy", "out.ply", trilinear, ConvertOptions(4), force=True)
+        convert("in.npy", "out.ply", trilinear, Options(2))
+    convert("in.npy", "out.ply", trilinear, Options(4), force=True)
 
 
-@pytest.mark.parametrize("suffix", MESH_SUFFIXES)
-def test_the_size_of_the_file_is_estimated(suffix):
-    cap = suffix in (".ply", ".stl")
-    x, y, z = np.indices((24,) * 3) * 0.5
-    gyroid = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
-    np.save("gyroid.npy", gyroid.astype(np.float32))
-    options = ConvertOptions(2, spacing=(1.0,), cap=cap)
-    report = convert("gyroid.npy", f"out{suffix}", trilinear, options).report()
-    near = pytest.approx(report["triangles"], rel=0.1 if cap else 0.08)
-    assert report["expected_triangles"] == near
-    size = os.path.getsize(f"out{suffix}")
-    assert report["expected_bytes"] == pytest.approx(size, rel=0.35)
+def test_mesh_and_field_appear_together_or_not_at_all():
+    def refuse(part):
+        assert part.exists()
+        raise GridError("no")
+
+    told = {"save_field": "out.npz"}
+    with pytest.raises(GridError):
+        convert("in.npy", "out.ply", trilinear, Options(2), before_rename=refuse, **told)
+    assert os.listdir() == ["in.npy"]
+    done = convert("in.npy", "out.ply", trilinear, Options(2), **told)
+    assert sorted(os.listdir()) == ["in.npy", "out.npz", "out.ply"]
+    assert done.saved_field["shape"] == [33, 33, 33]
 
 
-def test_a_large_file_is_announced_before_the_work(monkeypatch):
-    announced = []
-
-    def work(*_):
-        assert announced == ["new.ply will have about 2,500 triangles, 47,424 bytes"]
-        raise MemoryError
-
-    convert("in.npy", "out.ply", trilinear, ConvertOptions(2), announce=announced.append)
-    assert announced == []
-    monkeypatch.setattr(meshes, "LARGE", 40_000)
-    with pytest.raises(MemoryError):
-        convert("in.npy", "new.ply", work, ConvertOptions(2), announce=announced.append)
-
-
-def test_a_file_that_its_disk_cannot_hold_is_refused_before_the_work(monkeypatch):
-    monkeypatch.setattr(meshes, "free_space", lambda path: 2e6)
-    convert("in.npy", "out.ply", trilinear, ConvertOptions(4))
-    monkeypatch.setattr(meshes, "free_space", lambda path: 1000)
-    want = (
-        "big.ply cannot be written: about 10,000 triangles take 189,696 bytes, 1,000 bytes are "
-        "free there; use a smaller factor, or another folder"
-    )
-    with pytest.raises(WriteError, match=re.escape(want)):
-        convert("in.npy", "big.ply", None, ConvertOptions(4))
-    assert sorted(os.listdir()) == ["in.npy", "out.ply"]
+def test_a_surface_may_stay_open_and_is_then_warned_of():
+    np.save("cut.npy", ball(16, 4.0).values[:9])
+    done = convert("cut.npy", "open.ply", trilinear, Options(2, cap=False))
+    assert not done.closed and not done.capped and "is open there" in done.warnings[-1]
+    done = convert("cut.npy", "closed.ply", trilinear, Options(2))
+    assert done.closed and done.capped and "closed along the border" in done.remarks()[0]

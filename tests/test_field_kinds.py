@@ -9,7 +9,6 @@ import pytest
 from batches import rows
 from conftest import ball, refusal, trilinear
 from scipy import ndimage
-from test_slabs import in_pieces
 
 from lab.surfaces import isosurface
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
@@ -364,18 +363,6 @@ def test_the_network_adds_to_a_scaled_field_at_kinks_of_distances_only():
     assert not network_share(2 * box(48).astype(np.float32)).any()
 
 
-@pytest.mark.parametrize("name", ["truth", "a smooth union"])
-def test_any_number_of_slabs_and_threads_gives_the_same_mesh(name, monkeypatch):
-    grid, network = make_grid(KINDS[name][0], **PLACE), load_network("fast", device="cpu")
-    want = reconstruct(grid, network)
-    one = load_network("fast", device="cpu", threads=1)
-    pieces = in_pieces(grid, one, monkeypatch, 4)
-    mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
-    assert len(pieces) > 2
-    np.testing.assert_array_equal(mesh.vertices, want.vertices)
-    np.testing.assert_array_equal(mesh.faces, want.faces)
-
-
 def test_the_command_takes_labels_levels_and_scales(folder, command):
     np.save("labels.npy", np.where(MASK, 3, 0) + 2 * (box() < -9))
     np.save("grid.npy", 100 - 40 * ball(16, 5).values)
@@ -439,12 +426,6 @@ def test_the_spline_is_the_same_in_whatever_strips_it_is_made(monkeypatch):
     monkeypatch.setattr(spline, "STRIP_SAMPLES", 1)
     for found, expected in zip(spline_blocks(values, ijk, 4, 1.0), want):
         np.testing.assert_array_equal(found, expected)
-
-
-def test_making_distances_is_refused_with_the_figure():
-    samples = mask_planes(np.broadcast_to(np.False_, (64, 512, 512)), 1.0)
-    said = refusal(OutOfMemoryError, plan_reading, samples, 0, Resources(2, 1_000_000))
-    assert re.match(r"planes of 512 x 512 samples need at least \d+ MB", said)
 
 
 def torus_at(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:

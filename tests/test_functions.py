@@ -49,7 +49,7 @@ def test_vertices_lie_where_the_function_is_0():
     assert is_on(torus, mesh)
     assert mesh.is_closed()
     assert 2 * len(mesh.vertices) <= asked.evaluations < 20**3 + 2.3 * len(mesh.vertices)
-    nodes = 4**3 * upsample(asked.sample(BOX, H), trilinear).band_voxels
+    nodes = 4**3 * upsample(asked.sample(BOX, H), trilinear).counts["band_voxels"]
     assert asked.evaluations - 20**3 < 1.5 * nodes
 
 

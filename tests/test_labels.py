@@ -16,9 +16,11 @@ from skimage.measure import marching_cubes
 
 from super_sdf import Mesh, load_network, make_grid, reconstruct
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
+from super_sdf.labels import reconstruct as whole_run
 from super_sdf.labels.files import MOST_FILES, label_paths
-from super_sdf.labels.reconstruct import Work, reconstruct_labels
-from super_sdf.slabs.cutting import equal_parts
+from super_sdf.labels.image import find_image
+from super_sdf.labels.reconstruct import reconstruct_labels
+from super_sdf.threads import held_memory
 
 
 @pytest.fixture(scope="module")
@@ -57,6 +59,7 @@ def nested():
     return labels
 
 
+PLACE = {"spacing": 1, "origin": 0, "direction": None}
 NOISE = np.random.default_rng(0)
 IMAGES = {
     "noise": NOISE.integers(0, 4, (6, 7, 5)),
@@ -103,16 +106,25 @@ def test_meshes_are_closed_and_share_their_walls(name, factor):
 
 
 @pytest.mark.parametrize("name", ["noise", "nested"])
-def test_slabs_make_the_same_meshes(name, network, monkeypatch):
+def test_ranges_of_planes_are_joined_to_the_same_meshes(name, network, monkeypatch):
     labels = IMAGES[name]
     meshes = reconstruct_labels(labels, network=network, spacing=1, factor=2)
-    before = np.arange(len(labels) + 1)
-    for slabs in (2, len(labels)):
-        monkeypatch.setattr(Work, "plan", lambda _, n=slabs: equal_parts(before, n))
+    for ranges in ([(0, 3), (3, len(labels))], [(n, n + 1) for n in range(len(labels))]):
+        monkeypatch.setattr(whole_run, "plan_ranges", lambda *_, found=ranges: found)
         cut = reconstruct_labels(labels, network=network, spacing=1, factor=2)
         for label, mesh in cut.items():
             assert mesh.vertices.tobytes() == meshes[label].vertices.tobytes()
-            assert mesh.faces.tobytes() == meshes[label].faces.tobytes()
+            assert corners_of(mesh) == corners_of(meshes[label])
+
+
+def test_less_memory_makes_more_ranges_and_too_little_is_an_error():
+    image = find_image(np.tile(IMAGES["no ground"], (9, 1, 1)), "all", PLACE, None, None)
+    held = held_memory()
+    bounds = [held + size for size in (10**9, 8 * 10**6)]
+    few, many = (whole_run.plan_ranges(image, 4, 1, bound) for bound in bounds)
+    assert len(few) == 1 < len(many)
+    with pytest.raises(OutOfMemoryError, match=r"^factor 4 on 1,890 voxels at the walls of 8 "):
+        whole_run.plan_ranges(image, 4, 1, held + 10**5)
 
 
 def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
@@ -217,19 +229,6 @@ def test_wrong_labels_and_values_that_are_none_are_one_line(message):
     with pytest.raises(OptionError if message.startswith("labels ") else GridError) as caught:
         reconstruct_labels(*UNFIT[message], trilinear)
     assert str(caught.value) == message
-
-
-def test_less_memory_makes_more_slabs_and_too_little_is_an_error(bare_plan, monkeypatch):
-    cuts = []
-    plan = Work.plan
-    monkeypatch.setattr(Work, "plan", lambda work: cuts.append(plan(work)) or cuts[-1])
-    monkeypatch.setattr("super_sdf.labels.held_memory", lambda: 10**8)
-    labels = IMAGES["no ground"]
-    for bound in (10**9, 112 * 10**6):
-        reconstruct_labels(labels, network=trilinear, spacing=1, max_memory=bound)
-    assert len(cuts[0]) == 1 < len(cuts[1])
-    with pytest.raises(OutOfMemoryError, match=r"^factor 4 on [\d,]+ voxels of 8 labels needs "):
-        reconstruct_labels(labels, network=trilinear, spacing=1, max_memory=105 * 10**6)
 
 
 @pytest.fixture

@@ -77,7 +77,7 @@ def test_integers_and_unequal_steps_are_coordinates():
 def test_arrays_of_dask_are_computed_if_they_fit(monkeypatch):
     array = sphere("zyx").chunk({"z": 5})
     assert np.array_equal(make_grid(array).values, sphere().values)
-    monkeypatch.setattr("super_sdf.machine.memory.free_memory", lambda: 1000)
+    monkeypatch.setattr("super_sdf.threads.free_memory", lambda: 1000)
     assert refusal(OutOfMemoryError, make_grid, array) == (
         "the array of Dask, whole, needs 0 MB of memory, 0 MB are free; "
         "save it as .npy and give its path"

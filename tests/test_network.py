@@ -311,12 +311,3 @@ def test_a_mean_maps_a_turned_field_to_the_turned_surface(symmetries, flipped):
     assert load_network("best").symmetries == 4
 
 
-@pytest.mark.parametrize("name", ["fast", "best", "mask"])
-def test_a_network_goes_to_other_processes(name):
-    network = load_network(name, threads=1)
-    other = pickle.loads(pickle.dumps(network))
-    inputs = small_ball()
-    np.testing.assert_array_equal(other(*inputs), network(*inputs))
-    assert vars(other).keys() == vars(network).keys()
-    for key in ("card", "device", "symmetries", "threads", "shipped", "path"):
-        assert getattr(other, key) == getattr(network, key), key

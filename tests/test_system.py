@@ -1,100 +1,21 @@
-"""What a system says of processor and control groups, and what follows, by files that stand in."""
+"""What control groups allow, by files that stand in, and a processor on which int8 is slow."""
 
-import hashlib
-import os
-import platform
-from pathlib import Path
-
-import numpy as np
 import pytest
 
-from super_sdf import load_network
-from super_sdf.cli.entry import main
-from super_sdf.machine import memory, system
-from super_sdf import threads as resources
-from super_sdf.machine.system import bound_of_cores, left_memory
-from super_sdf.network.network import Network, find_model, fingerprint_of, small_ball
-
-CORE_2 = "fpu sse sse2 pni ssse3 cx16"
-NEHALEM = f"{CORE_2} sse4_1 sse4_2 popcnt"
-SANDY_BRIDGE = f"{NEHALEM} avx"
-HASWELL = f"{SANDY_BRIDGE} avx2 fma"
+from super_sdf import threads
+from super_sdf.network import network
 
 
-@pytest.fixture
-def describe(monkeypatch, tmp_path):
-    """Let the system describe another processor."""
-
-    def go(text):
-        (tmp_path / "cpuinfo").write_text(text)
-        monkeypatch.setattr(system, "CPUINFO", str(tmp_path / "cpuinfo"))
-
-    return go
-
-
-def x86(flags, name="A (R) processor @ 2.60GHz"):
-    """Return the description of a machine of two cores."""
-    return f"processor\t: 0\nmodel name\t: {name}\nflags\t: {flags}\n\nflags\t: mmx\n"
-
-
-ARM = "processor\t: 0\nFeatures\t: fp asimd\nCPU part\t: 0xd0c\n\n"
-
-
-@pytest.mark.parametrize(
-    "text, want",
-    [
-        (x86(HASWELL), "base-int8"),
-        (x86(SANDY_BRIDGE), "base"),  # AVX without AVX2
-        (x86(NEHALEM), "base-int8"),
-        (ARM, "base-int8"),
-        ("", "base-int8"),
-    ],
-)
-def test_auto_is_float32_where_int8_is_slower(describe, text, want):
-    describe(text)
-    assert find_model("base")[0].stem == want
-    assert find_model("base", "int8")[0].stem == "base-int8"
-    assert find_model("base", "float32")[0].stem == "base"
-
-
-def test_a_processor_that_numpy_cannot_run_on_ends_in_a_line(describe, monkeypatch):
-    for text in (x86(NEHALEM), ARM, ""):
-        describe(text)
-        system.check_processor()
-    monkeypatch.setattr(os, "_exit", lambda code: pytest.fail("the command was run"))
-    describe(x86(CORE_2))
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == (
-        "Error: this processor has no SSE4.1, SSE4.2, POPCNT, and NumPy and onnxruntime need "
-        "x86-64-v2: use another machine; a virtual one needs the host's processor (-cpu host)"
-    )
-
-
-def test_the_name_of_the_processor(describe, monkeypatch):
-    describe(x86(HASWELL))
-    assert system.processor_name() == "A (R) processor @ 2.60GHz"
-    monkeypatch.setattr(system, "CPUINFO", "missing")
-    assert system.processor_name() == (platform.processor() or platform.machine())
-    assert system.described() == {} and not system.lacks_avx2()
-
-
-def test_the_fingerprint_is_that_of_the_chosen_network_and_of_nothing_else(monkeypatch):
-    found = fingerprint_of("fast", "auto", "cpu")
-    assert found == fingerprint_of("fast", "int8", "cpu")
-    network = load_network("fast", device="cpu", threads=2)
-    assert found.digest == hashlib.sha256(network(*small_ball()).tobytes()).hexdigest()
-    assert found[1:] == ("cpu", system.processor_name(), "int8")
-    others = {
-        fingerprint_of(*name, "cpu").digest for name in [("fast", "float32"), ("base", "auto")]
-    }
-    assert len(others | {found.digest}) == 3
-    exact = Network.__call__
-    monkeypatch.setattr(Network, "__call__", lambda *given: exact(*given) * np.float32(1 + 2**-20))
-    assert fingerprint_of("fast", "auto", "cpu").digest != found.digest
+def test_auto_is_float32_where_int8_is_slower(monkeypatch):
+    for flags, want in {"avx avx2": "base-int8", "avx": "base", "": "base-int8"}.items():
+        monkeypatch.setattr(network, "described_processor", lambda said=flags: {"flags": said})
+        assert network.find_model("base")[0].stem == want
+        assert network.find_model("base", "int8")[0].stem == "base-int8"
+        assert network.find_model("base", "float32")[0].stem == "base"
 
 
 MB = 10**6
+FREE = 1024 * MB  # as the system says
 
 
 @pytest.fixture
@@ -107,8 +28,10 @@ def groups(tmp_path, monkeypatch):
             path = tmp_path / "fs" / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(f"{text}\n")
-        monkeypatch.setattr(system, "GROUPS", tmp_path / "fs")
-        monkeypatch.setattr(system, "OWN", tmp_path / "own")
+        monkeypatch.setattr(threads, "GROUPS", tmp_path / "fs")
+        monkeypatch.setattr(threads, "OWN", tmp_path / "own")
+        (tmp_path / "meminfo").write_text(f"MemAvailable: {FREE // 1024} kB\n")
+        monkeypatch.setattr(threads, "SYSTEM", tmp_path / "meminfo")
 
     return write
 
@@ -143,14 +66,7 @@ def old_group(name, most, taken, kept):
 )
 def test_memory_that_is_left(groups, own, files, want):
     groups(own, files)
-    assert left_memory() == want
-
-
-def test_free_memory_is_what_the_group_leaves_and_without_one_not_bounded(groups, monkeypatch):
-    groups("0::/", group("", 80 * MB, 70 * MB, 65 * MB))
-    assert memory.free_memory() == 75 * MB
-    monkeypatch.setattr(system, "OWN", Path("none"))
-    assert left_memory() is None and bound_of_cores() == float("inf")
+    assert threads.free_memory() == (FREE if want is None else want)
 
 
 @pytest.mark.parametrize(
@@ -165,7 +81,7 @@ def test_free_memory_is_what_the_group_leaves_and_without_one_not_bounded(groups
 )
 def test_threads_are_cut_to_the_cores_that_are_left(groups, monkeypatch, own, files, want):
     groups(own, files)
-    monkeypatch.setattr(resources, "cores_of_system", lambda: 8)
-    assert resources.count_cores() == want
-    assert resources.useful_threads(200) == resources.useful_threads(0) == want
-    assert resources.useful_threads(1) == 1
+    monkeypatch.setattr(threads, "cores_of_system", lambda: 8)
+    assert threads.count_cores() == want
+    assert threads.useful_threads(200) == threads.useful_threads(0) == want
+    assert threads.useful_threads(1) == 1

@@ -10,7 +10,6 @@ from conftest import refusal, trilinear
 from scipy import ndimage
 from skimage.measure import marching_cubes
 from test_field_kinds import PLACE, box, thin_frame
-from test_slabs import in_pieces
 from trimesh import grouping
 
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
@@ -131,22 +130,6 @@ def test_the_surface_ends_where_that_of_marching_cubes_of_the_known_cells_does(m
     ]
     assert found.area == pytest.approx(want.area, rel=0.03)
     assert lengths[0] == pytest.approx(lengths[1], rel=0.04)
-
-
-@pytest.mark.parametrize("options", [{}, {"field": "scaled"}])
-def test_slabs_and_threads_change_nothing_where_a_surface_ends(options, monkeypatch):
-    network = load_network("fast", device="cpu", threads=1)
-    grid = make_grid(half_seen(), **PLACE, **options)
-    want = reconstruct(grid, load_network("fast", device="cpu", threads=2), cap=False)
-    field = upsample(grid, network)
-    pieces = in_pieces(grid, network, monkeypatch, 4, cap=False)
-    mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
-    assert len(pieces) > 2 and not want.is_closed()
-    np.testing.assert_array_equal(mesh.vertices, want.vertices)
-    np.testing.assert_array_equal(mesh.faces, want.faces)
-    np.testing.assert_array_equal(extract_mesh(field, cap=False).faces, want.faces)
-    with pytest.raises(GridError, match=r"so whether they are inside is unknown; end the surface"):
-        extract_mesh(field)
 
 
 def test_what_needs_the_whole_surface_is_refused(folder, command):

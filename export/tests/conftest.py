@@ -1,12 +1,17 @@
-"""Samples that several tests share."""
+"""Samples and networks that several tests share."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from export.augment import CLEAN, DISTANCES, change
 from export.dataset import make_sample
+from export.network import NetworkConfig, SuperSdfNet
 from export.shapes.solid import random_solid
-from export.tests.small_net import small_net
-from export.to_onnx import make_card, write_model
+
+SMALL = NetworkConfig(channels=16, blocks=4, hidden=32, functions=40, trunk=16, frequencies=2)
 
 
 @pytest.fixture(scope="session")
@@ -19,9 +24,17 @@ def samples():
     return found
 
 
-@pytest.fixture
-def small_file(tmp_path):
-    """The file of ``small_net``."""
-    net, path = small_net(), tmp_path / "small.onnx"
-    write_model(net, path, make_card(net, "small", "nothing", "none"))
-    return path
+@pytest.fixture(scope="session")
+def prepared(samples):
+    rng = np.random.default_rng(0)
+    return [change(rng, sample, DISTANCES, CLEAN) for sample in samples]
+
+
+@pytest.fixture(params=["plain", "gated"])
+def net(request):
+    """A network away from the start, where blocks do nothing; half of the voxels pass its gate."""
+    torch.manual_seed(0)
+    made = SuperSdfNet(replace(SMALL, gated=2 * (request.param == "gated")))
+    for parameter in made.parameters():
+        torch.nn.init.normal_(parameter, std=0.1)
+    return made.eval()

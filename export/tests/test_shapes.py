@@ -1,23 +1,24 @@
-"""Procedural solids: closed, outward, of the promised size, the same for the same seed."""
+"""Shapes: closed, outward, of the promised size, the same for the same seed; exact distances."""
 
 import numpy as np
 import pytest
-from manifold3d import Manifold
-from scipy.ndimage import label
+import trimesh
 
-from export.shapes import solid as shapes
-from export.shapes.draws import unit_sized
-from export.shapes.organic import STEP, bumps, grid, put_spikes, relief, skin_waves, wrinkles
-from export.shapes.solid import FAMILIES, MAX_FACES, draw_family, random_solid, without_crumbs
+from export import dataset, parts
+from export.shapes.smooth import draw_smooth, ellipsoid, foot_points, settle, torus
+from export.shapes.solid import FAMILIES, MAX_FACES, draw_family, random_solid
 from super_sdf import Mesh
+from super_sdf.truth import solid
+
+LOW = np.array([[-0.3, -0.2, -0.1], [-0.1, -0.1, -0.05]])
+HIGH = np.array([[0.4, 0.3, 0.2], [0.6, 0.2, 0.1]])
 
 
 def check_closed(mesh: Mesh) -> None:
     """Each directed edge occurs once, and so does its opposite; every vertex is used."""
     edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     there = {tuple(edge) for edge in edges.tolist()}
-    assert len(there) == len(edges)
-    assert there == {(b, a) for a, b in there}
+    assert len(there) == len(edges) and there == {(b, a) for a, b in there}
     assert np.array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
 
 
@@ -28,59 +29,70 @@ def check_size(mesh: Mesh) -> None:
     assert low == pytest.approx(-high, abs=1e-12)
 
 
-@pytest.mark.parametrize("names", [None, *([name] for name in FAMILIES)], ids=str)
-def test_random_solids_keep_every_promise_and_are_the_same_for_the_same_seed(names):
-    for seed in range(1 if names else 4):
-        mesh, again = (random_solid(np.random.default_rng(seed), names) for _ in range(2))
-        assert mesh.vertices.dtype == np.float64 and mesh.faces.dtype == np.int32
-        assert np.isfinite(mesh.vertices).all() and 4 <= len(mesh.faces) <= MAX_FACES
-        check_closed(mesh)
-        check_size(mesh)
-        assert mesh.volume() > 5e-5
-        assert np.array_equal(mesh.vertices, again.vertices)
-        assert np.array_equal(mesh.faces, again.faces)
-
-
 @pytest.mark.parametrize("name", FAMILIES)
-def test_a_family_seldom_draws_what_has_to_be_drawn_again(name):
-    solids = [unit_sized(FAMILIES[name](np.random.default_rng(seed))) for seed in range(3)]
-    assert sum(shapes.is_usable(solid) for solid in solids) >= 2
-
-
-def test_only_named_families_are_drawn_each_as_often_as_it_is_named(monkeypatch):
-    rng = np.random.default_rng(0)
-    drawn = [draw_family(rng, ["creature", "sculpture", "sculpture"]) for _ in range(300)]
-    assert {family.__name__ for family in drawn} == {"creature", "sculpture"}
-    assert drawn.count(FAMILIES["sculpture"]) == pytest.approx(200, abs=30)
-    monkeypatch.setattr(shapes, "draw_family", lambda rng, names: lambda rng: Manifold())
-    with pytest.raises(RuntimeError, match="none of 20"):  # the search is bounded
-        random_solid(np.random.default_rng(0))
-
-
-@pytest.mark.parametrize("draw", [bumps, skin_waves, wrinkles, relief])
-def test_reliefs_are_heights_at_every_point(draw):
-    """One height for each point, none beyond 1 but for the sums of waves, and not all the same."""
-    points = np.random.default_rng(0).uniform(-0.5, 0.5, (4000, 3)).astype(np.float32)
-    for seed in range(8):
-        heights = draw(np.random.default_rng(seed), points)
-        assert heights.shape == (4000,) and np.isfinite(heights).all()
-        assert np.abs(heights - 0.5).mean() < 1 and np.ptp(heights) > 0.1
-
-
-def test_spikes_stick_out_of_a_ball():
-    """Nothing is taken away, and what is added touches the ball."""
-    points = grid(0.58, STEP)
-    ball = np.linalg.norm(points, axis=-1) - np.float32(0.2)
-    spiked = ball.copy()
-    put_spikes(np.random.default_rng(3), points, spiked)
-    assert (spiked <= ball).all() and ((spiked < 0) & (ball > 0.02)).any()
-    assert label(spiked < STEP)[1] == 1  # thorns may be thinner than a step
-
-
-def test_crumbs_go_and_cavities_stay():
-    """A small loose piece goes; a cavity, a piece of its own to the faces, stays."""
-    box = Manifold.cube([1, 1, 1], True)
-    crumb = Manifold.cube([0.1, 0.1, 0.1]).translate([2, 0, 0])
-    mesh = without_crumbs(shapes.mesh_of(box - box.scale([0.8, 0.8, 0.8]) + crumb))
+def test_random_solids_keep_every_promise_and_are_the_same_for_the_same_seed(name):
+    mesh, again = (random_solid(np.random.default_rng(0), [name]) for _ in range(2))
+    assert mesh.vertices.dtype == np.float64 and 4 <= len(mesh.faces) <= MAX_FACES
     check_closed(mesh)
-    assert mesh.volume() == pytest.approx(1 - 0.8**3) and mesh.vertices.max() == 0.5
+    check_size(mesh)
+    assert mesh.volume() > 5e-5
+    assert np.array_equal(mesh.vertices, again.vertices)
+    assert draw_family(np.random.default_rng(1), [name]) is FAMILIES[name]
+
+
+@pytest.mark.parametrize("number, detail", [*((n, "usual") for n in range(6)), (0, "fine")])
+def test_every_part_is_a_solid_and_no_kind_trains_the_network(tmp_path, number, detail):
+    name, mesh = parts.draw_part(number, detail=detail)
+    assert name.startswith(f"part-{number:02d}-") and name.split("-")[2] not in FAMILIES
+    check_closed(mesh)
+    check_size(mesh)
+    assert 0.1 < mesh.volume() / np.prod(np.ptp(mesh.vertices, axis=0)) < 0.95
+
+
+def test_files_of_parts_are_the_same_for_the_same_seed(tmp_path):
+    parts.main([str(tmp_path / "one"), "--count", "2"])
+    for path in parts.write_parts(tmp_path / "two", 2):
+        assert path.read_bytes() == (tmp_path / "one" / path.name).read_bytes()
+        assert solid.load_solid(path)[0].is_closed
+
+
+def test_distances_to_smooth_bodies_are_exact():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500, 3)) * 11
+    found, off = settle(ellipsoid(np.full(3, 20.0)), points)
+    np.testing.assert_allclose(found, np.linalg.norm(points, axis=1) - 20, atol=1e-9)
+    assert off.max() < 1e-9
+    ring = np.hypot(np.hypot(*points.T[:2]) - 30, points[:, 2]) - 6
+    near = np.abs(ring) < 5
+    np.testing.assert_allclose(settle(torus(30, 6), points[near])[0], ring[near], atol=1e-9)
+    for _ in range(20):  # no point of the surface is nearer than the foot point
+        field = draw_smooth(rng, 1)
+        middle = foot_points(field, rng.normal(size=(1, 3)) * 40)
+        points = middle + rng.uniform(-1.5, 1.5, (200, 3))
+        distance, off = settle(field, points)
+        others = foot_points(field, middle + rng.uniform(-3, 3, (400, 3)))
+        least = np.linalg.norm(points[:, None] - others, axis=2).min(1)
+        assert off.max() > 1e-3 or (np.abs(distance) <= least + 1e-6).all()
+
+
+def test_smooth_samples_are_inverted_half_of_the_time_and_end_before_the_border():
+    drawn = [dataset.make_smooth_sample(np.random.default_rng(seed), 6) for seed in range(12)]
+    ijk = np.concatenate([sample.voxel_ijk for sample in drawn])
+    assert ijk.min() == dataset.EDGE and ijk.max() == dataset.WINDOW - 1 - dataset.EDGE
+    assert all((sample.targets < 0).any() and (sample.targets > 0).any() for sample in drawn)
+
+
+def test_signs_are_right_where_a_mesh_intersects_itself():
+    """Of two boxes that overlap."""
+    boxes = [trimesh.creation.box(bounds=bounds) for bounds in zip(LOW, HIGH)]
+    both, rng = trimesh.util.concatenate(boxes), np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.7, (4000, 3))
+    inside = ((points[:, None] > LOW) & (points[:, None] < HIGH)).all(2).any(1)
+    truth = solid.Solid(Mesh(np.array(both.vertices), np.array(both.faces, np.int32)))
+    np.testing.assert_array_equal(dataset.signed_distance(rng, truth, points) < 0, inside)
+
+
+def test_thin_solids_have_hardly_a_sample_inside():
+    samples = dataset.fill_shard(np.random.default_rng(0), [], 1.0, thin=1.0, count=2)
+    assert all(-0.2 < sample.window.min() / 2 < 0.6 for sample in samples)
+    assert all((sample.targets < 0).any() for sample in samples)

@@ -1,4 +1,4 @@
-"""Types of the arrays that the steps exchange."""
+"""Types of the arrays that the steps exchange, the places of a neighbourhood, and vectors."""
 
 from __future__ import annotations
 
@@ -14,6 +14,51 @@ Signs: TypeAlias = NDArray[np.int8]
 """1 outside, -1 inside, 0 unknown."""
 Triple: TypeAlias = tuple[float, float, float]
 """One number per axis: x, y, z."""
+
+NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
+"""Steps from the centre voxel to the 27 of a patch or of a row of a neighbour table, (27, 3)."""
+CORNERS: IntArray = np.indices((2, 2, 2)).reshape(3, 8).T.astype(np.int32)
+"""Steps from the lowest corner of a cell to all of them, (8, 3)."""
+CENTRE = 13
+"""Index of the centre voxel itself."""
+STRIDES = np.array([9, 3, 1])
+"""Difference of the indices of two places next to each other along each axis."""
+
+Index: TypeAlias = NDArray[np.int64]
+Numbers: TypeAlias = NDArray[np.float64]
+Vectors: TypeAlias = NDArray[np.float64]
+"""A vector in each row, (n, 3)."""
+
+
+def dot(a: Vectors, b: Vectors) -> Numbers:
+    """Return the products of vectors, (n,)."""
+    product: Numbers = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
+    return product
+
+
+def cross(a: Vectors, b: Vectors) -> Vectors:
+    """Return the cross products of vectors, (n, 3)."""
+    product: Vectors = np.empty_like(a)
+    for k in range(3):
+        product[..., k] = a[..., k - 2] * b[..., k - 1] - a[..., k - 1] * b[..., k - 2]
+    return product
+
+
+def length(vectors: Vectors) -> Numbers:
+    """Return the lengths of vectors, (n,)."""
+    lengths: Numbers = np.sqrt(dot(vectors, vectors))
+    return lengths
+
+
+def unit(vectors: Vectors) -> Vectors:
+    """Return vectors of length 1; 0 stays 0."""
+    units: Vectors = vectors / np.maximum(length(vectors), 1e-12)[..., None]
+    return units
+
+
+def sums_at(place: Index, vectors: Vectors, count: int) -> Vectors:
+    """Return the sums of vectors (m, 3) at each of ``count`` places, (count, 3)."""
+    return np.stack([np.bincount(place, component, count) for component in vectors.T], 1)
 
 
 def without_device(values: Any) -> Any:

@@ -1,8 +1,13 @@
 """Everything that this package raises on purpose, below ``SuperSdfError``.
 
 A message is one line: what is wrong, the value seen, the way out. Each class is also one of
-Python's own, so that code which knows only these catches it.
+Python's own, so that code which knows only these catches it. ``check_modules`` raises one where an
+optional library is missing.
 """
+
+from __future__ import annotations
+
+from importlib.util import find_spec
 
 
 class SuperSdfError(Exception):
@@ -18,7 +23,7 @@ class NoSurfaceError(GridError):
 
 
 class MeshError(SuperSdfError, ValueError):
-    """A reference mesh does not bound a solid, or slabs or bricks of a mesh do not meet."""
+    """A reference mesh does not bound a solid, or a mesh or the tiles of one are torn."""
 
 
 class OptionError(SuperSdfError, ValueError):
@@ -57,3 +62,42 @@ def seen(value: object) -> str:
     """Return the repr of a value for error messages: on one line, at most 60 characters."""
     text = " ".join(repr(value).split())
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+EXTRAS = {
+    "nifti": ("nibabel",),
+    "nrrd": ("nrrd",),
+    "metaimage": ("SimpleITK",),
+    "vti": ("vtkmodules",),
+    "tiff": ("tifffile",),
+    "hdf5": ("h5py",),
+    "zarr": ("zarr",),
+    "vdb": ("numcodecs",),
+    "mrc": ("mrcfile",),
+    "mat": ("h5py", "scipy"),
+    "netcdf": ("h5py", "scipy"),
+    "dicom": ("pydicom",),
+    "3mf": ("lxml", "networkx"),
+    "pyvista": ("pyvista",),
+    "simplify": ("igl", "pyfqmr"),
+    "eval": ("igl", "scipy"),
+    "report": ("igl", "pyfqmr"),
+    "cluster": ("distributed",),
+}
+"""The modules that each extra installs."""
+
+
+def missing_modules(modules: tuple[str, ...]) -> list[str]:
+    """Return the modules that are not installed."""
+    return [name for name in modules if find_spec(name) is None]
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra, from a clone of the sources."""
+    return f"pip install -e '.[{extra}]' in a clone of super-sdf"
+
+
+def check_modules(what: str, extra: str, modules: tuple[str, ...] | None = None) -> None:
+    """Raise FileError if modules that ``what`` needs, all of an extra or some, are missing."""
+    if missing := missing_modules(EXTRAS[extra] if modules is None else modules):
+        raise FileError(f"{what} needs {', '.join(missing)}: {how_to_install(extra)}")

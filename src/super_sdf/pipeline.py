@@ -1,11 +1,8 @@
-"""The method on a page: the paper's Section 4, one named step per line of ``refine``.
+"""The method on a page: the paper's Section 4, one named step per line of ``refine_band``.
 
     grid -> cubic lattice -> band -> patches and neighbour table -> network -> averaged shared nodes
          -> surface moved to touch the samples' spheres -> values kept within the samples' bounds
          -> isosurface
-
-A grid that is too large to be refined at once is refined slab by slab (see ``slabs``); the mesh is
-the same.
 
 >>> from super_sdf import make_grid, reconstruct
 >>> mesh = reconstruct(make_grid(values, spacing=0.1))            # doctest: +SKIP
@@ -13,49 +10,71 @@ the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
+from .arrays import CENTRE
+from .errors import OutOfMemoryError
 from .functions.function import Function, as_function, sampled
-from .grid.sdf_grid import SdfGrid, check_grid
-from .machine.memory import give_back
-from .surface.mesh import Mesh, join_meshes
-from .network.neighbourhood import CENTRE
-from .network.decoder import Decoder, decode
-from .network.network import given_or_loaded
+from .grid.cubic import cubic_grid
+from .grid.sdf_grid import SdfGrid, check_grid, crop
+from .network.decoder import Decoder, adapt, decode
+from .network.network import given_or_loaded, network_for
+from .options import Options
 from .progress import STEPS, Progress, StepCounter
-from .slabs.cutting import Slab
-from .slabs.preparing import Piece, Run, describe_piece, prepare
 from .refine import nodes
-from .refine.band import BandSummary
 from .refine.bounds import keep_within_bounds
-from .surface.cap import check_can_close, close, seen_octants
-from .refine.debris import count_between, drop_debris
-from .refine.field import FineField, SampleSpheres
-from .surface.meshers import extract_pieces
+from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.spheres import fit_to_spheres, spheres_of_band
 from .refine.spline import interpolate
-from .refine.survey import Band, no_surface
+from .refine.survey import Band, BandSummary, BandTooLarge, no_surface, summarise, survey
+from .surface.cap import check_can_close, seen_octants
+from .surface.extract import choose_mesher, extract
+from .surface.mesh import Mesh, vertex_type
+from .threads import in_words, useful_threads
+from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
 
 
 def refine(
+    grid: SdfGrid,
+    network: Decoder,
+    factor: int = 4,
+    offset: float = 0.0,
+    *,
+    threads: int = 1,
+    steps: StepCounter | None = None,
+    whole: BandSummary | None = None,
+) -> FineField:
+    """Return the fine field of a cubic grid, in one piece.
+
+    With ``whole`` the grid is a part of another one, of which that is the summary.
+    """
+    steps = steps or StepCounter()
+    band = survey(grid, offset, threads=threads, whole=whole)  # Eqs. 2 and 4
+    if whole is None and not band.decoded.any():
+        raise no_surface(grid, offset)
+    steps.finish("band")
+    field = refine_band(band, network, factor, threads, steps)
+    return replace(field, grid=grid, offset=offset)
+
+
+def refine_band(
     band: Band,
     network: Decoder,
     factor: int,
-    slab: Slab,
     threads: int = 1,
     steps: StepCounter | None = None,
 ) -> FineField:
-    """Return the fine field of a slab: the steps from the network to the final values."""
+    """Return the fine field of a band: the steps from the network to the final values."""
     steps = steps or StepCounter()
-    patches, table, voxels = inputs = band.network_inputs(slab.seen, slab.decoded)
-    seen_ijk, exact = band.voxel_ijk[slab.seen], np.flatnonzero(band.exact[slab.seen])
-    own_ijk = seen_ijk[voxels]
+    patches, table, voxels = inputs = band.network_inputs()
+    own_ijk, exact = band.voxel_ijk[voxels], np.flatnonzero(band.exact)
     if band.field.smooth is None:
         progress, offsets = steps.within("network"), nodes.block_offsets(factor)
         blocks = decode(network, inputs, offsets, progress, threads)  # Eqs. 3, 5
@@ -66,7 +85,7 @@ def refine(
     parts = nodes.share_parts(nodes.rows_among(voxels, len(table))[table[voxels]])
     index = nodes.VoxelIndex(own_ijk, band.shape)
     nodes.average_shared(blocks, parts, factor, threads)  # Eq. 7
-    spheres = spheres_of_band(seen_ijk, patches, exact, band.shape, band.limits, threads)
+    spheres = spheres_of_band(band.voxel_ijk, patches, exact, band.shape, band.limits, threads)
     fit_to_spheres(blocks, parts, factor, spheres, index, threads)
     del spheres
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
@@ -74,21 +93,24 @@ def refine(
         nodes.hold_sides(blocks, factor, patches, voxels)
     skipped = nodes.signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
     pinned = nodes.pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
-    touching = SampleSpheres(band.shape, seen_ijk[exact], patches[exact, CENTRE].copy())
-    dropped, lone = drop_debris(blocks, factor, parts, index, touching)
     steps.finish("nodes")
-    field = FineField(band.shape, factor, own_ijk, blocks[:, :-1], parts, slab.planes)
-    return replace(
-        field,
-        band_voxels=len(band.voxel_ijk),
-        noisy_voxels=band.count_noisy(),
-        pinned=int(pinned[field.own_rows].sum()),
-        dropped=count_between(dropped, slab.planes),
-        lone=count_between(lone, slab.planes),
-        spheres=touching,
-        decoded_voxels=int(band.decoded_before[-1]),
+    unseen = band.field.unseen
+    return FineField(
+        band.shape,
+        factor,
+        own_ijk,
+        blocks[:, :-1],
+        parts,
+        spheres=SampleSpheres(band.shape, band.voxel_ijk[exact], patches[exact, CENTRE].copy()),
         leaves=band.leaves,
-        octants=None if band.field.unseen is None else seen_octants(band.field.unseen, own_ijk),
+        octants=None if unseen is None else seen_octants(unseen, own_ijk),
+        counts={
+            "band_voxels": len(patches),
+            "noisy_voxels": band.count_noisy(),
+            "decoded_voxels": len(voxels),
+            "nodes": parts.count_nodes(factor),
+            "pinned_nodes": pinned,
+        },
     )
 
 
@@ -98,10 +120,9 @@ def upsample(
     factor: int = 4,
     *,
     offset: float = 0.0,
-    max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> FineField:
-    """Refine a coarse grid near its surface, all at once.
+    """Refine a coarse grid near its surface.
 
     Parameters
     ----------
@@ -116,8 +137,6 @@ def upsample(
         Refine the surface at this distance from the solid (world units) instead of the solid's own
         (Sec. 5.3). Positive is outwards, whichever sign the input had inside, since ``grid.values``
         are always negative inside. The distances must reach 1.5 spacings beyond the offset.
-    max_memory : int, optional
-        Bytes that the process may hold in all; by default a share of the free memory.
     progress : callable, optional
         Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
 
@@ -130,8 +149,6 @@ def upsample(
     ------
     OptionError
         If the factor is odd or out of range, or another argument is invalid.
-    OutOfMemoryError
-        If the fine values would not fit in memory.
     ModelError
         If the network returns values that are not finite.
     GridError
@@ -145,13 +162,13 @@ def upsample(
     options.check_progress(progress)
     factor, offset = options.check_factor(factor), options.check_distance(offset)
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
-    run = prepare(
-        grid, network, factor, offset, options.check_max_memory(max_memory), steps, at_once=True
-    )
-    field = refine(run.band, run.network, factor, run.slabs[0], run.threads, steps)
-    if len(field.signs()) < 2:
+    lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
+    vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
+    threads = useful_threads(chosen.threads)
+    field = refine(lattice, chosen, factor, offset, threads=threads, steps=steps)
+    if not field.has_surface:
         raise no_surface(grid, offset)
-    return replace(field, grid=run.lattice, offset=offset)
+    return field
 
 
 def reconstruct(
@@ -199,8 +216,8 @@ def reconstruct(
         "marching" for marching cubes, which cuts off edges and corners; "sharp" also puts vertices
         on them; "auto" is "sharp" for distances and "marching" for masks and noise.
     max_memory : int, optional
-        Bytes that the process may hold in all, besides the mesh; by default a share of the free
-        memory.
+        Bytes that the process may hold in all; by default a share of the free memory. A grid that
+        needs more is cut into tiles.
 
     Returns
     -------
@@ -211,21 +228,16 @@ def reconstruct(
     ------
     OptionError
         If there is a network, and besides what would load one.
+    OutOfMemoryError
+        If not even small tiles of the grid fit in the memory.
     """
     exact = None if function is None else as_function(function)
     grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
     network = given_or_loaded(network, quality, device=device, precision=precision, threads=threads)
-    pieces = reconstruct_slabs(
-        grid,
-        network,
-        factor,
-        offset=offset,
-        cap=cap,
-        mesher=mesher,
-        max_memory=max_memory,
-        progress=progress,
+    chosen = Options(
+        factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory
     )
-    mesh = join_meshes([mesh for piece in pieces for mesh in piece.meshes])
+    mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh
     from .functions.zero import put_on_zero  # imported here, as few call it
@@ -233,100 +245,135 @@ def reconstruct(
     return put_on_zero(mesh, exact, grid, factor, offset)
 
 
-def reconstruct_slabs(
+@dataclass(frozen=True, eq=False)
+class Result:
+    """The mesh of a grid, and what is known of how it was made."""
+
+    mesh: Mesh
+    open_edges: int
+    counts: dict[str, int]  # see ``FineField``; in tiles, a pinned node may count twice
+    leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
+    is_cut: bool  # whether the surface leaves the grid, or may end at unknown samples
+    seconds: dict[str, float]  # by step
+    tiles: int
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """All that a tile is made of, besides the network; it can be sent to another process."""
+
+    tile: Tile
+    grid: SdfGrid  # the samples of the tile
+    shape: tuple[int, int, int]  # samples of the whole grid
+    whole: BandSummary | None  # None of a tile that is the whole grid
+    options: Options
+    mesher: options.MesherName
+    threads: int
+
+
+MapTiles = Callable[[Callable[[Task], Part], Iterator[Task]], Iterable[Part]]
+"""Calls a function, which can be pickled, with each task, and returns the parts in any order."""
+
+
+def mesh_grid(
     grid: SdfGrid,
     network: Decoder,
-    factor: int = 4,
+    chosen: Options,
     *,
-    offset: float = 0.0,
-    cap: bool = True,
-    mesher: options.MesherName = options.DEFAULT_MESHER,
-    max_memory: int | None = None,
     progress: Progress | None = None,
-    save: Callable[[FineField], None] | None = None,
-    look: Callable[[Band], None] | None = None,
-) -> Iterator[Piece]:
-    """Yield the mesh of ``reconstruct`` slab by slab, in as few slabs as fit in memory.
+    save_field: Callable[[FineField], None] | None = None,
+    map_tiles: MapTiles | None = None,
+    least_tiles: int = 1,
+) -> Result:
+    """Return the mesh of a grid: in one piece, or in tiles if it does not fit in memory.
 
-    Joined, the pieces are the same mesh, bit for bit, for any number of slabs and threads. ``save``
-    is called with the field of each slab, final in the slab's own planes and in the one before;
-    ``look`` with the band of the grid.
+    ``save_field`` is called with the fine field, which needs one piece. ``map_tiles`` has tiles
+    made elsewhere, ``least_tiles`` or more, each within the memory bound.
     """
     check_grid(grid)
     options.check_network(network)
     options.check_progress(progress)
-    factor, offset, cap = (
-        options.check_factor(factor),
-        options.check_distance(offset),
-        options.check_cap(cap),
-    )
-    mesher, bound = options.check_mesher(mesher), options.check_max_memory(max_memory)
-    check_can_close(grid, cap=cap)
+    check_can_close(grid, cap=chosen.cap)
+    steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
+    lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
+    mesher = choose_mesher(chosen.mesher, exact=lattice.field.has_exact)
+    vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
+    threads, shape = useful_threads(decoder.threads), lattice.shape
+    room = Room.of(chosen.max_memory, factor, mesher, decoder.memory_bytes)
+    tiles, whole = [Tile((0, 0, 0), shape, (0, 0, 0), shape)], None
+    try:
+        is_one = map_tiles is None and least_tiles == 1
+        band = survey(lattice, offset, threads=threads, most=room.voxels if is_one else -1)
+    except BandTooLarge:
+        band, whole = None, summarise(lattice, offset, threads)
+        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
+        tiles = plan(shape, whole, margin, room, least_tiles)
+    steps.finish("band")
+    if whole and save_field:
+        raise OutOfMemoryError(
+            f"the refined field does not fit in the {in_words(room.bound)} that may be used: use a "
+            "smaller factor, allow more (--max-memory), or leave --save-field out"
+        )
 
-    def pieces() -> Iterator[Piece]:
-        run = prepare(grid, network, factor, offset, bound, StepCounter(progress), mesher)
-        if look:
-            look(run.band)
-        seen: set[bool] = set()
-        for piece in _mesh_slabs(run, cap, save):
-            seen |= piece.signs
-            yield piece
-            del piece  # before the next one is made
-        if len(seen) < 2:
-            raise no_surface(grid, offset)
+    def task_of(tile: Tile) -> Task:
+        part = crop(lattice, tile.low, tile.high) if whole else lattice
+        return Task(tile, part, shape, whole, chosen, mesher, threads)
 
-    return pieces()
+    if band:
+        parts = [make_tile(task_of(tiles[0]), decoder, band, steps, save_field)]
+    else:
+        parts = []
+        for part in (map_tiles or map)(partial(make_tile, network=decoder), map(task_of, tiles)):
+            parts.append(part)
+            steps.show(len(parts) / len(tiles))
+        parts.sort(key=lambda part: part.tile.low)
+    del band
+    mesh, leaves = join(parts), any(part.leaves for part in parts)
+    if not len(mesh.faces):
+        raise no_surface(grid, offset)
+    is_cut = any(part.is_cut for part in parts)
+    ends = lattice.field.unseen is not None
+    count = check_closed(mesh, lattice, parts, cap=chosen.cap or not is_cut, ends=ends)
+    counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
+    if whole:
+        counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
+    steps.finish("isosurface")
+    return Result(mesh, count, counts, leaves, is_cut, steps.take_seconds(), len(tiles))
 
 
-def reconstruct_planes(
-    grid: SdfGrid,
+def make_tile(
+    task: Task,
     network: Decoder,
-    factor: int,
-    planes: tuple[int, int],
-    *,
-    whole: BandSummary,
-    offset: float = 0.0,
-    cap: bool = True,
-    mesher: options.MesherName = options.DEFAULT_MESHER,
-    max_memory: int | None = None,
-    progress: Progress | None = None,
-) -> Iterator[Piece]:
-    """Yield the pieces of ``reconstruct_slabs`` in some planes; it is a brick of a huge grid.
-
-    Only these planes, from the first to before the second, are read, and those beside them on which
-    the mesh depends. The pieces of all bricks, in order, are the same mesh, bit for bit. Vertices
-    are counted from the first of the brick: those of the brick before have numbers below 0.
-    ``whole`` is of the band of the whole grid, see ``look_at_band``.
-    """
-    part, steps = (planes, whole), StepCounter(progress)
-    run = prepare(grid, network, factor, offset, max_memory, steps, mesher, part=part)
-    own = run.band.rows(*planes)
-    counts = {"band_voxels": own.stop - own.start, "noisy_voxels": run.band.count_noisy(own)}
-    for piece in _mesh_slabs(run, cap, None):
-        piece.whole.update(counts)
-        yield piece
-        del piece  # before the next one is made
-
-
-def _mesh_slabs(run: Run, cap: bool, save: Callable[[FineField], None] | None) -> Iterator[Piece]:
-    """Yield the piece of each slab of a run."""
-    steps, mesher, vertices = run.steps, run.mesher, 0
-    work = {"slabs": len(run.slabs), "planned_bytes": run.planned}
-    for slab in run.slabs:
-        if len(run.slabs) > 1:
-            give_back()
-        field = refine(run.band, run.network, run.factor, slab, run.threads, steps)
-        field = replace(field, grid=run.lattice, offset=run.offset)
-        if save:
-            save(field)
-            steps.watch.lap("save field")
-        whole = close(field, cap=cap, beside=mesher.planes_beside(run.factor))
-        meshes = extract_pieces(whole, run.lattice, vertices, run.threads, mesher)
-        piece = describe_piece(field, meshes, work, run.band.leaves)
-        del field, whole, meshes  # before those of the next slab are made
-        steps.finish("isosurface")
-        piece.seconds.update(steps.take_seconds())
-        vertices += piece.counts["vertices"]
-        yield piece
-        del piece  # before the next one is made
-        steps.watch.start()  # the time since the yield was the caller's
+    band: Band | None = None,
+    steps: StepCounter | None = None,
+    save_field: Callable[[FineField], None] | None = None,
+) -> Part:
+    """Return the part of the mesh that belongs to a tile, which may be the whole grid."""
+    tile, chosen, factor = task.tile, task.options, task.options.factor
+    band = band or survey(task.grid, chosen.offset, threads=task.threads, whole=task.whole)
+    if not band.decoded.any():
+        return Part.without_surface(tile)
+    field = refine_band(band, network, factor, task.threads, steps)
+    field = replace(field, grid=task.grid, offset=chosen.offset)
+    del band
+    if save_field:
+        save_field(field)
+    border = np.array([(0, 0, 0), task.shape]) - np.array(tile.low)
+    is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
+    mesh, keys = extract(
+        field,
+        task.grid,
+        mesher=task.mesher,
+        cap=chosen.cap,
+        threads=task.threads,
+        first=tile.low,
+        shape=task.shape,
+    )
+    counts = dict(field.counts)
+    if task.whole:
+        own = tile.owns(field.voxel_ijk + np.array(tile.low))
+        counts["decoded_voxels"] = int(np.count_nonzero(own))
+        counts["nodes"] = field.parts.count_nodes(factor, own)
+    more = {"counts": counts, "leaves": field.leaves, "is_cut": is_cut}
+    del field
+    return own_part(mesh, keys, tile, task.shape, factor, **more)

@@ -16,8 +16,7 @@ ShareCallback = Callable[[float], None]
 """Called with the finished share of a step, from 0 to 1."""
 
 TOTAL = 1000
-# Share of the time that each step takes with a network on a CPU. The first runs once, the others
-# once per slab.
+# Share of the time that each step takes with a network on a CPU.
 STEPS = {"band": 0.03, "network": 0.45, "nodes": 0.15, "isosurface": 0.37}
 
 
@@ -58,6 +57,10 @@ class Stopwatch:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + more
         self.start()
 
+    def rounded(self) -> dict[str, float]:
+        """Return the seconds of each stage as reports have them."""
+        return {stage: round(spent, 4) for stage, spent in self.seconds.items()}
+
 
 class StepCounter:
     """Reports progress and measures time, step by step; ``finish`` ends each step."""
@@ -69,16 +72,16 @@ class StepCounter:
         self.done = 0.0
         self.watch = Stopwatch()
 
-    def divide(self, slabs: int) -> None:
-        """Expect every step but the first once per slab."""
-        for name in self.lengths.keys() - {"band"}:
-            self.lengths[name] /= slabs
+    def show(self, share: float) -> None:
+        """Report the share of all that comes after the first step."""
+        first = self.lengths.get("band", 0)
+        self._show(first + share * (TOTAL - first))
 
     def finish(self, name: str) -> None:
         """Report that a step is done, and record its time."""
         self.watch.lap(name)
         self.done += self.lengths[name]
-        self._show(self.done)
+        self._show(TOTAL if name == "isosurface" else self.done)
 
     def take_seconds(self) -> dict[str, float]:
         """Return the seconds per step since the last call."""

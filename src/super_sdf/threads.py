@@ -1,21 +1,25 @@
-"""The threads, memory and indices of a run, and work cut into chunks for threads.
+"""The threads and the memory of a run, and work cut into chunks for threads.
 
-Threads and memory are decided once at the start, and passed down to every step. Pieces of work are
-independent of each other and may run at the same time; results come in order.
+Threads and memory are decided once at the start, and passed down. Pieces of work are independent of
+each other and may run at the same time; results come in order.
+
+On Linux the files of /proc and of control groups say how much memory is free and held, elsewhere
+psutil does. Control groups, those of a container, are nested; the tightest limit counts.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from math import ceil
-from typing import TypeVar
+from contextlib import suppress
+from math import ceil, inf
+from pathlib import Path
+from typing import NamedTuple, TypeVar
 
-from .errors import OptionError
-from .machine.memory import held_memory, memory_bound
-from .machine.system import bound_of_cores
+from .errors import OptionError, OutOfMemoryError
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -24,25 +28,16 @@ CHUNK = 1 << 19  # temporaries (array elements) per chunk, so that they stay in 
 MIN_PER_THREAD = 1 << 21  # array elements; with fewer, a thread costs more than it saves
 MAX_INDEX = 2**31 - 1  # of vertices and nodes, as in mesh files; beyond, one would mean another
 
+SYSTEM, GROUPS, OWN = Path("/proc/meminfo"), Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+SHARE = 0.6  # of the memory that is free, the share that is taken unless a bound is given
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt, from malloc.h
 
-@dataclass(frozen=True)
-class Resources:
-    """The threads that a run may use, and the bytes that its process may hold; None: no bound."""
+
+class Resources(NamedTuple):
+    """The threads that a process may use, and the bytes that it may hold; None: no bound."""
 
     threads: int = 1
     memory: int | None = None
-
-
-ONE_THREAD = Resources()
-"""One thread, and no memory bound."""
-
-
-def allot(threads: int = 0, max_memory: int | None = None) -> Resources:
-    """Return what a run may use: the threads asked for, 0 for one per core, which is also the most.
-
-    Without ``max_memory``, the bytes are what the process holds and a share of the free memory.
-    """
-    return Resources(useful_threads(threads), memory_bound(max_memory))
 
 
 def allot_each(count: int, threads: int = 0, max_memory: int | None = None) -> Resources:
@@ -65,7 +60,7 @@ def check_count(count: int, what: str) -> int:
 
 def count_cores() -> int:
     """Return the number of cores this process may use; in a container its quota, rounded up."""
-    return max(ceil(min(cores_of_system(), bound_of_cores())), 1)
+    return max(ceil(min(cores_of_system(), min(map(_cores_of, _groups("cpu")), default=inf))), 1)
 
 
 def cores_of_system() -> int:
@@ -119,3 +114,143 @@ def over_threads(
         return
     with ThreadPoolExecutor(threads) as pool:
         yield from pool.map(work, pieces)
+
+
+def free_memory() -> int | None:
+    """Return the bytes of memory that are free, None if the system does not tell.
+
+    In a container with a memory limit, at most what is left of the limit.
+    """
+    try:
+        sizes = _read_sizes(SYSTEM)
+    except OSError:
+        return _by_psutil("free")
+    rooms = [sizes.get("MemAvailable"), *map(_left_in, _groups("memory"))]
+    return None if rooms[0] is None else min(room for room in rooms if room is not None)
+
+
+def held_memory(peak: bool = False, pid: int | str = "self") -> int | None:
+    """Return the bytes of memory that a process holds, or its ``peak``; None if nothing tells."""
+    try:
+        sizes = _read_sizes(Path(f"/proc/{pid}/status"))
+    except OSError:
+        return None if peak else _by_psutil("rss", pid)
+    return sizes.get("VmHWM" if peak else "VmRSS")
+
+
+def memory_bound(max_memory: int | None = None) -> int | None:
+    """Return how many bytes this process may hold in all, None if that is not known.
+
+    ``max_memory`` if given; else what the process holds, and ``SHARE`` of what is free.
+    """
+    free = free_memory()
+    if max_memory is not None or free is None:
+        return max_memory
+    return (held_memory() or 0) + int(SHARE * free)
+
+
+def check_fits(need: int, what: str, way_out: str) -> None:
+    """Raise OutOfMemoryError if ``what``, which needs ``need`` bytes, does not fit into memory."""
+    free = free_memory()
+    if free is not None and need > free:
+        raise OutOfMemoryError(
+            f"{what} needs {in_words(need)} of memory, {in_words(free)} are free; {way_out}"
+        )
+
+
+def in_words(size: float) -> str:
+    """Return a number of bytes as text for users, in the form that ``--max-memory`` takes."""
+    return f"{size / 1e9:,.2f} GB" if size >= 1e9 else f"{size / 1e6:,.0f} MB"
+
+
+def give_back() -> None:
+    """Give freed memory back to the system, if the C library has a call for it (glibc)."""
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+def reuse_freed() -> None:
+    """Let this process use freed memory again, as glibc's own settings do after a while.
+
+    Dask sets ``MALLOC_TRIM_THRESHOLD_`` for its workers: then all arrays of more than 128 kB come
+    from the system as fresh pages, and converting a grid takes half as much processor time again.
+    """
+    with suppress(OSError, AttributeError, TypeError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_MMAP_THRESHOLD, 32 << 20)
+        mallopt(M_TRIM_THRESHOLD, 64 << 20)
+
+
+def described_processor() -> dict[str, str]:
+    """Return what Linux says of the first processor, by name; empty on other systems."""
+    with suppress(OSError), open("/proc/cpuinfo", "rb", buffering=0) as file:
+        first, _, _ = file.read(1 << 13).decode("ascii", "replace").partition("\n\n")
+        pairs = (line.partition(":") for line in first.splitlines())
+        return {name.strip(): value.strip() for name, _, value in pairs}
+    return {}
+
+
+def _read_sizes(path: Path) -> dict[str, int]:
+    """Return the sizes in a file of /proc, in bytes, by name."""
+    fields = (line.split(":", 1) for line in path.read_text().splitlines())
+    return {name: int(text.split()[0]) * 1024 for name, text in fields if text.endswith(" kB")}
+
+
+def _by_psutil(what: str, pid: int | str = "self") -> int | None:
+    """Return the bytes that are "free", or that a process holds ("rss"); None if psutil cannot."""
+    with suppress(ImportError, AttributeError):
+        import psutil
+
+        with suppress(psutil.Error):  # the process has ended
+            if what == "free":
+                return int(psutil.virtual_memory().available)
+            return int(psutil.Process(*[pid] if pid != "self" else []).memory_info().rss)
+    return None
+
+
+def _groups(controller: str) -> Iterator[Path]:
+    """Yield the folders of the control groups that this process is in, innermost first.
+
+    In a container the path of the group may not exist: what is mounted there is the group itself.
+    """
+    if sys.platform != "linux":
+        return
+    with suppress(OSError):
+        for line in OWN.read_text().splitlines():
+            _, names, path = line.split(":", 2)
+            if names and controller not in names.split(","):
+                continue
+            root = GROUPS / controller if names else GROUPS
+            inner = root / path.strip("/")
+            yield from (folder for folder in (inner, *inner.parents) if folder.is_relative_to(root))
+
+
+def _left_in(group: Path) -> int | None:
+    """Return how many bytes a control group may still take, None without a limit.
+
+    The kernel counts cached files as used, but drops inactive ones when memory is short.
+    """
+    for limit_name, used_name, cache_name in (
+        ("memory.max", "memory.current", "inactive_file"),
+        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ):
+        with suppress(OSError, ValueError):  # of the other version, or the limit is "max"
+            limit, used = (int((group / name).read_text()) for name in (limit_name, used_name))
+            statistics: dict[str, int] = {}
+            with suppress(OSError, ValueError):
+                lines = (group / "memory.stat").read_text().splitlines()
+                statistics = {key: int(number) for key, number in map(str.split, lines)}
+            return max(limit - max(used - statistics.get(cache_name, 0), 0), 0)
+    return None
+
+
+def _cores_of(group: Path) -> float:
+    """Return the cores' worth of time that a control group may use, infinity without a limit."""
+    with suppress(OSError, ValueError):  # as above
+        quota, period = (group / "cpu.max").read_text().split()
+        return int(quota) / int(period)
+    with suppress(OSError, ValueError):
+        quota, period = ((group / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
+        if int(quota) > 0:
+            return int(quota) / int(period)
+    return inf

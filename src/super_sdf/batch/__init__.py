@@ -1,4 +1,5 @@
-"""Converting many grids: find the inputs, plan, convert in several processes, resume.
+"""Many grids to meshes in several processes or on a Dask cluster; resumed after a kill.
 
-The command is ``super-sdf batch``. This room may import ``convert`` and what lies below it.
+``inputs`` finds the files, ``run`` plans and keeps the report (``record``), ``job`` converts one
+file. This room may import ``convert`` and what lies below it.
 """

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
-from ..convert import Conversion, ConvertOptions, convert
+from ..convert import convert
 from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.meshes import format_of
+from ..files.output import naming
 from ..files.regular import check_grid_file
 from ..labels.files import convert_labels
 from ..labels.names import Names
 from ..network.network import Network, load_network
-from ..options import AUTO, AUTO_PRECISION, Device, Precision
-from ..progress import Progress
-from .ledger import Fingerprint, Row, fingerprint
+from ..options import AUTO, AUTO_PRECISION, Device, Options, Precision
+from .record import Row, fingerprint
+
+load_once = lru_cache(maxsize=1)(load_network)
 
 
 @dataclass(frozen=True)
@@ -38,26 +41,15 @@ class Settings:
     items: Path | None = None  # the folder for what a page shows of each mesh
     cluster: str | None = None  # "local", or the address of a scheduler: where files are converted
     names: Names | None = None  # of labels
-    began: float = field(default_factory=time.time)  # what is newer was not there before
-
-    def load_network(self, threads: int) -> Network:
-        """Return the network of a worker."""
-        return load_network(
-            self.model, device=self.device, threads=threads, precision=self.precision
-        )
 
 
 @dataclass(frozen=True)
 class Job:
-    """A grid to convert: the path as it was given, the mesh below the output folder, and how.
-
-    ``replace`` are the existing files that may be replaced; decided when the job starts.
-    """
+    """A grid to convert: the path as it was given, the mesh below the output folder, and how."""
 
     source: Path
     mesh: str
-    options: ConvertOptions
-    replace: frozenset[str] = frozenset()
+    options: Options
 
     @property
     def has_label_files(self) -> bool:
@@ -72,6 +64,12 @@ class Job:
             return self.mesh
         return path.with_name(f"{path.stem}-*{path.suffix}").as_posix()
 
+    def failed(self, reason: str, *, retry: bool = True, content: Any = None) -> Row:
+        """Return the row of the job if it failed."""
+        row = {"in": os.path.abspath(self.source), "out": self.target, "status": "failed"}
+        row |= {"reason": reason, "retry": retry, "content": content}
+        return {**row, "output": None, "seconds": 0.0}
+
 
 class Result(NamedTuple):
     """A job and its row, of this run or an earlier one."""
@@ -85,148 +83,70 @@ class Result(NamedTuple):
         return one_line(reason if source in reason else f"{source}: {reason}")
 
 
-def attempt(
-    job: Job, settings: Settings, network: Network, progress: Progress | None = None
-) -> Row:
-    """Convert a file and return its row; an error becomes a row, too.
+def convert_job(job: Job, settings: Settings, stage: Path, threads: int) -> Row:
+    """Convert a file to meshes in the folder ``stage``, by the names that they will have.
 
-    A mesh that has appeared since the plan is replaced by the same mesh only: it was made by a
-    process that was killed before the row was written. An exception in ``progress`` ends the work.
+    An error becomes a row, too. The network is loaded once in each process; what that raises is
+    raised here.
     """
-    start, content = time.perf_counter(), fingerprint(job.source)
-    convert_it = _convert if job.options.labels is None else _convert_labels
-    prints = Prints(job, settings)
+    start, content, precision = time.perf_counter(), fingerprint(job.source), settings.precision
+    network = load_once(
+        settings.model, device=settings.device, threads=threads, precision=precision
+    )
+    row = job.failed("", content=content)
     try:
         check_grid_file(job.source)
-        _make_folder((settings.folder / job.mesh).parent)
-        facts = convert_it(job, settings, network, progress, prints)
+        with naming(settings.folder / job.mesh):
+            (stage / job.mesh).parent.mkdir(parents=True, exist_ok=True)
+        make = _make_mesh if job.options.labels is None else _make_labels
+        row |= make(job, settings, stage, network)
+        row |= {"status": "ok", "reason": None, "retry": False}
     except Exception as error:  # a bug that one file shows must not cost the others
         by_input = isinstance(error, (GridError, OptionError, FileError))
-        retry = not by_input or isinstance(error, WriteError)
-        row = failed_row(job, _reason(error), retry=retry, content=content)
-        return {**row, "seconds": round(time.perf_counter() - start, 4)}
-    return {
-        **_paths(job),
-        "status": "ok",
-        "reason": None,
-        "retry": False,
-        "content": content,
-        "output": prints.get(job.target, dict(prints)),
-        **facts,
-        "seconds": round(time.perf_counter() - start, 4),
-    }
+        row["retry"] = not by_input or isinstance(error, WriteError)
+        row["reason"] = _reason(error)
+    row["seconds"] = round(time.perf_counter() - start, 4)
+    # sentences may name files, which will be in the output folder
+    staged, final = (json.dumps(str(path))[1:-1] for path in (stage, settings.folder))
+    moved: Row = json.loads(json.dumps(row).replace(staged, final))
+    return moved
 
 
-class Prints(dict[str, Fingerprint]):
-    """Fingerprints of the files that a job writes, by their names below the output folder."""
-
-    def __init__(self, job: Job, settings: Settings) -> None:
-        self.replace, self.settings = job.replace, settings
-
-    def name(self, path: str | Path) -> str:
-        """Return the name of a file in the output folder."""
-        return Path(path).relative_to(self.settings.folder).as_posix()
-
-    def take(self, parts: Mapping[Path, Path]) -> None:
-        """Take complete files by their paths to be; WriteError if one would replace another."""
-        for path, part in parts.items():
-            if (made := fingerprint(part)) is None:
-                raise WriteError(f"{part} cannot be read again")
-            if os.path.lexists(path):
-                self._check_may_replace(path, made["sha256"])
-            self[self.name(path)] = made
-
-    def _check_may_replace(self, path: Path, made: str) -> None:
-        """Raise WriteError unless a file of this content may replace the one that is there."""
-        if path.is_symlink():
-            raise WriteError(f"{path} is a link: remove it")
-        may = self.settings.force or self.name(path) in self.replace
-        is_new = path.stat().st_mtime > self.settings.began
-        if (is_new or not may) and made != (fingerprint(path) or {}).get("sha256"):
-            raise WriteError(
-                f"{path} was written while this batch ran: give its inputs other names (out)"
-                if is_new
-                else f"{path} exists and is not what this batch makes: remove it or use --force"
-            )
-
-
-def _convert(
-    job: Job, settings: Settings, network: Network, progress: Progress | None, prints: Prints
-) -> Row:
+def _make_mesh(job: Job, settings: Settings, stage: Path, network: Network) -> Row:
     """Convert a file; return what its row says of the mesh."""
-    target = settings.folder / job.mesh
-    done = convert(
-        job.source,
-        target,
-        network,
-        job.options,
-        force=os.path.lexists(target),
-        progress=progress,
-        before_rename=lambda part: prints.take({target: part}),
-        keep=settings.check or settings.items is not None,
-    )
-    facts = done.report()
-    if settings.items or settings.check:
-        facts["check"] = _certify(job, done, prints[job.target], settings)
-    return {**facts, "stages": {stage: round(s, 4) for stage, s in done.seconds.items()}}
-
-
-def _convert_labels(
-    job: Job, settings: Settings, network: Network, progress: Progress | None, prints: Prints
-) -> Row:
-    """Convert the labels of a file; return what its row says of their meshes."""
-    made = convert_labels(
-        job.source,
-        settings.folder / job.mesh,
-        network,
-        job.options,
-        names=settings.names,
-        force=True,  # ``prints`` decides file by file
-        progress=progress,
-        before_rename=prints.take,
-    )
-    labels = [{**row, "output": prints.name(row["output"])} for row in made["labels"]]
-    closed = all(row["closed"] for row in labels)
-    return {**made, "labels": labels, "closed": closed, "warnings": []}
-
-
-def _certify(job: Job, done: Conversion, mesh: Fingerprint, settings: Settings) -> dict[str, Any]:
-    """Return the certificate of a finished mesh, or under ``error`` why it has none.
-
-    What a page shows of the mesh is written into the folder for that, if there is one.
-    """
+    target = stage / job.mesh
+    keep = settings.check or settings.items is not None
+    done = convert(job.source, target, network, job.options, force=True)
+    stages = {stage: round(seconds, 4) for stage, seconds in done.seconds.items()}
+    row = {"output": fingerprint(target), **done.report(), "stages": stages}
+    if not keep:
+        return row
     from ..check.check import check_files
 
-    files = settings.folder / job.target, job.source, job.options
     try:
         if settings.items is None:
-            return check_files(*files, kept=done.kept).report()
+            found = check_files(target, job.source, job.options, made=done)
+            return {**row, "check": found.report()}
         from ..pages.items import item_of_files, keep_item
 
-        item = item_of_files(*files, done.kept)
-        keep_item(item, settings.items, job.target, mesh["sha256"])
-        return item.certificate or {}
+        item = item_of_files(target, job.source, job.options, done)
+        keep_item(item, settings.items, job.target, row["output"]["sha256"])
+        return {**row, "check": item.certificate or {}}
     except Exception as error:  # the mesh is good all the same
-        return {"error": _reason(error)}
+        return {**row, "check": {"error": _reason(error)}}
 
 
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise WriteError(f"{folder} cannot be made: {error.strerror}") from error
-    except RecursionError:
-        raise WriteError(f"{folder} cannot be made: too many folders within each other") from None
-
-
-def failed_row(job: Job, reason: str, *, retry: bool = True, content: Any = None) -> Row:
-    """Return the row of a job that failed."""
-    outcome = {"status": "failed", "reason": reason, "retry": retry, "content": content}
-    return {**_paths(job), **outcome, "output": None, "seconds": 0.0}
-
-
-def _paths(job: Job) -> Row:
-    return {"in": os.path.abspath(job.source), "out": job.target}
+def _make_labels(job: Job, settings: Settings, stage: Path, network: Network) -> Row:
+    """Convert the labels of a file; return what its row says of their meshes."""
+    target, names = stage / job.mesh, settings.names
+    made = convert_labels(job.source, target, network, job.options, names=names, force=True)
+    labels = [
+        {**row, "output": Path(row["output"]).relative_to(stage).as_posix()} for row in made.labels
+    ]
+    files = {row["output"]: fingerprint(stage / row["output"]) for row in labels}
+    output = files if job.has_label_files else files[job.mesh]
+    facts = {"labels": labels, "closed": made.closed, "warnings": []}
+    return {"output": output, **made.report(), **facts}
 
 
 def _reason(error: Exception) -> str:

@@ -5,17 +5,29 @@ The meshes are beside the page and loaded when a file is opened, or within it if
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import quote
 
 from ..errors import SuperSdfError
 from ..pages.html import make_page, write_page
-from ..pages.items import (Entry, Item, entry_of, entry_of_report, find_item, item_name, item_of_files, item_path, items_folder, keep_item, read_meshes, remove_items)
+from ..pages.items import (
+    Entry,
+    Item,
+    entry_of,
+    entry_of_report,
+    find_item,
+    item_name,
+    item_of_files,
+    item_path,
+    items_folder,
+    keep_item,
+    read_meshes,
+    remove_items,
+)
 from .job import Job
-from .ledger import Row, asked_of, is_unchanged
-from .plan import Batch
+from .record import is_unchanged
+from .run import Batch
 
 MOST_WITHIN = 5_000_000  # bytes of meshes that a page may hold itself
 
@@ -23,79 +35,74 @@ MOST_WITHIN = 5_000_000  # bytes of meshes that a page may hold itself
 class BatchPage:
     """The page of a batch as it stands, at its end or interrupted.
 
-    ``jobs`` are all jobs of the run, ``rows`` those of the ledger by output, also of runs with
-    other inputs. Those of labels are left out.
+    It has the rows of the report, also of runs with other inputs; those of labels are left out.
     """
 
-    def __init__(self, path: Path, batch: Batch, jobs: Sequence[Job], rows: dict[str, Row]) -> None:
+    def __init__(self, path: Path, batch: Batch) -> None:
         self.path, self.batch, self.folder = path, batch, items_folder(path)
-        self.jobs = {job.target: job for job in jobs}
-        rows = rows | {result.job.target: result.row for result in batch.failures()}
-        self.rows = {name: row for name, row in rows.items() if asked_of(row).get("labels") is None}
-        finished = {result.job.target for result in (*batch.results(), *batch.failures())}
-        self.unfinished = [job for job in jobs if job.target not in finished]
+        failed = {result.job.target: result.row for result in batch.failures()}
+        rows = batch.record.rows | failed
+        finished = {result.job.target for result in batch.results()} | failed.keys()
+        self.unfinished = [job for job in batch.jobs if job.target not in finished]
+        for job in self.unfinished:
+            rows.pop(job.target, None)
+        of_labels = {name for name, row in rows.items() if (row.get("asked") or {}).get("labels")}
+        self.rows = {name: row for name, row in rows.items() if name not in of_labels}
 
     def write(
         self, title: str, lead: str, alert: str = "", *, force: bool = False, draw: bool = True
     ) -> None:
         """Write the page; with ``draw``, make first what is missing of the meshes of this run."""
-        for job in self.unfinished:
-            self.rows.pop(job.target, None)
-        meshes = self.batch.settings.folder
+        meshes, jobs = self.batch.settings.folder, {job.target: job for job in self.batch.jobs}
         items = {
-            name: self.item(row, draw)
+            name: self._item(name, row["output"]["sha256"], jobs.get(name) if draw else None)
             for name, row in self.rows.items()
             if row["status"] == "ok" and is_unchanged(meshes / name, row["output"])
         }
         drawn = {name: item for name, item in items.items() if item and item.size}
         within = draw and sum(item.size for item in drawn.values()) <= MOST_WITHIN
-        entries = self._entries(items, within)
+        entries = [entry_of(path, "failed", reason=why) for path, why in self.batch.unread]
+        entries += [entry_of(job.target, "waiting", line="not finished") for job in self.unfinished]
+        for name, row in self.rows.items():
+            if row["status"] != "ok":
+                facts, seconds = [["grid", row["in"]], ["mesh", name]], row.get("seconds")
+                entries.append(
+                    entry_of(name, "failed", reason=row["reason"], facts=facts, seconds=seconds)
+                )
+            elif name in items:
+                report = {**row, "input": row["in"], "output": name}
+                entry = entry_of_report(name, report, items[name]) | {"id": item_name(name)}
+                if name in drawn:
+                    beside = f"{quote(self.folder.name)}/{item_name(name)}.js"
+                    entry["meshes"] = "page" if within else beside
+                entries.append(entry)
         entries.sort(key=lambda entry: (_rank(entry), entry["name"]))
         packed = {
             item_name(name): read_meshes(item_path(self.folder, name)) for name in drawn if within
         }
+        counts = {
+            "files": len(entries),
+            "failed": sum(entry["status"] == "failed" for entry in entries),
+            "not finished": sum(entry["status"] == "waiting" for entry in entries),
+            "with faults": sum(bool(entry["faults"]) for entry in entries),
+            "with warnings": sum(bool(entry["warnings"]) for entry in entries),
+        }
+        summary = [[k, f"{count:,}"] for k, count in counts.items() if count or k == "files"]
         said = {"title": title, "lead": lead, "alert": alert, "notes": self.batch.notes}
-        facts = {**said, "summary": _tiles(entries), "files": entries}
-        write_page(make_page(facts, packed, beside=not within), self.path, force=force)
+        page = make_page({**said, "summary": summary, "files": entries}, packed, beside=not within)
+        write_page(page, self.path, force=force)
         if within:
             remove_items(self.folder, items)
 
-    def item(self, row: Row, draw: bool) -> Item | None:
-        """Return the item of a mesh without its meshes; made now if there is none and it can be."""
-        name, digest = row["out"], row["output"]["sha256"]
-        found, job = find_item(self.folder, name, digest), self.jobs.get(name)
-        if found or not draw or job is None:
-            return found
-        with suppress(SuperSdfError):  # then it is not shown
-            made = item_of_files(self.batch.settings.folder / name, job.source, job.options)
-            keep_item(made, self.folder, name, digest)
-        return find_item(self.folder, name, digest)
-
-    def _entries(self, items: dict[str, Item | None], within: bool) -> list[Entry]:
-        """Return the entries of all files, in no order."""
-        folder = None if within else f"{quote(self.folder.name)}/"
-        return [
-            *(_entry_of_item(self.rows[name], item, folder) for name, item in items.items()),
-            *(_entry_of_failure(row) for row in self.rows.values() if row["status"] != "ok"),
-            *(entry_of(path, "failed", reason=why) for path, why in self.batch.unread),
-            *(entry_of(job.target, "waiting", line="not finished") for job in self.unfinished),
-        ]
-
-
-def _entry_of_item(row: Row, item: Item | None, folder: str | None) -> Entry:
-    """Return the entry of a mesh; its meshes are in a folder beside the page, or within it."""
-    name = item_name(row["out"])
-    report = {**row, "input": row["in"], "output": row["out"]}
-    entry = entry_of_report(row["out"], report, item) | {"id": name}
-    if item and item.size:
-        entry["meshes"] = f"{folder}{name}.js" if folder else "page"
-    return entry
-
-
-def _entry_of_failure(row: Row) -> Entry:
-    facts = [["grid", row["in"]], ["mesh", row["out"]]]
-    why, seconds = row["reason"], row.get("seconds")
-    return entry_of(row["out"], "failed", reason=why, facts=facts, seconds=seconds)
+    def _item(self, name: str, digest: str, job: Job | None) -> Item | None:
+        """Return the item of a mesh without its meshes; made for the job if there is none."""
+        if not (found := find_item(self.folder, name, digest)) and job:
+            with suppress(SuperSdfError):  # then it is not shown
+                mesh = self.batch.settings.folder / name
+                item = item_of_files(mesh, job.source, job.options)
+                keep_item(item, self.folder, name, digest)
+            found = find_item(self.folder, name, digest)
+        return found
 
 
 def _rank(entry: Entry) -> int:
@@ -103,15 +110,3 @@ def _rank(entry: Entry) -> int:
     if entry["status"] != "ok":
         return 0 if entry["status"] == "failed" else 1
     return 2 if entry["faults"] or entry["warnings"] else 3
-
-
-def _tiles(entries: Sequence[Entry]) -> list[list[str]]:
-    """Return counts for the head of the page."""
-    counts = {
-        "files": len(entries),
-        "failed": sum(entry["status"] == "failed" for entry in entries),
-        "not finished": sum(entry["status"] == "waiting" for entry in entries),
-        "with faults": sum(bool(entry["faults"]) for entry in entries),
-        "with warnings": sum(bool(entry["warnings"]) for entry in entries),
-    }
-    return [[label, f"{count:,}"] for label, count in counts.items() if count or label == "files"]

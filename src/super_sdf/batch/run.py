@@ -3,176 +3,261 @@
 To resume after a kill, or with new inputs or other options, run it again: it does only what is not
 done yet with the same content and options. A failure caused by the input stands until the input
 changes; others, such as a killed process or a full disk, are tried again.
+
+Meshes are made in a folder within the output folder. When one is complete, its row is added to the
+report, and then it is moved to its place: so whatever is killed, a file that is there and that the
+report does not know is not the batch's. What a killed batch left in that folder is removed.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import os
+import secrets
+import shutil
 import time
-from collections.abc import Callable, Generator, Sequence
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
+from typing import Any
 
-from ..machine.memory import free_memory
-from .pool import Death, Pool, Work
-from ..threads import allot_each, count_cores
+from .. import __version__
+from ..files.output import naming
 from ..network.device import available_devices
-from .job import Job, Result, Settings, attempt, failed_row
-from .ledger import Ledger, Row
-from .plan import Batch, Planner, expected_work
+from ..network.network import find_model
+from ..threads import Resources, allot_each, count_cores, free_memory
+from .job import Job, Result, Settings, convert_job
+from .pool import Death, work_in_processes
+from .record import STAGE_NAME, Record, Row, file_state, fingerprint, is_unchanged, outputs_of
 
 # In units of ``expected_work``: done in the time that worker processes would take to start.
 SMALL_BATCH = 30_000
 BYTES_PER_WORKER = 10**9  # for the network and a grid of 128^3, where --jobs is not given
 MIN_BYTES_PER_WORKER = 3 * 10**8  # with less a worker cannot convert anything
 
-OnFile = Callable[[Batch], None]
-"""Called after each file, with the batch as it stands."""
 
-Results = Generator[tuple[Job, Row | Death], None, None]
-"""Jobs as they end, each with its row, or with a Death if its process ended."""
+class Batch:
+    """A batch as it stands: the jobs to be done, and the results so far.
 
-
-class Run:
-    """A batch that runs in its output folder, which is locked meanwhile."""
-
-    def __init__(self, jobs: Sequence[Job], settings: Settings) -> None:
-        self.settings = settings
-        self.ledger = Ledger(settings.folder)
-        self.planner = Planner(jobs, settings, self.ledger)
-        self.batch = self.planner.plan()
-        self.died: set[str] = set()  # outputs whose worker died once
-
-    def complete(
-        self, on_file: OnFile | None = None, warn: Callable[[str], None] | None = None
-    ) -> None:
-        """Convert what is to be converted; call ``on_file`` after each file is in the ledger.
-
-        ``warn`` is called with what may be wrong with the workers of a cluster; without it, that is
-        among the notes.
-        """
-        start = time.perf_counter()
-        for job, row in self.batch.failed_before:  # refused outputs that the ledger does not have
-            known = self.ledger.rows.get(job.target, {})
-            if row is not known and row["reason"] != known.get("reason"):
-                self.ledger.add(row)
-        self.ledger.remove_parts()
-        try:
-            with closing(self._convert(warn or self.batch.notes.append)) as results:
-                for job, result in results:
-                    self._take(job, result)
-                    self.batch.seconds = time.perf_counter() - start
-                    if on_file:
-                        on_file(self.batch)
-        finally:  # also what the workers of a killed batch wrote for a moment more
-            self.ledger.close()
-
-    def _convert(self, warn: Callable[[str], None]) -> Results:
-        """Convert in this process, in processes or on a cluster."""
-        settings = self.settings
-        if not self.batch.waiting or self.is_over():
-            return
-        workers = self._count_workers()
-        memory = self.batch.waiting[0].options.max_memory
-        if settings.cluster is not None:
-            from .on_cluster import convert_on_cluster
-
-            jobs = list(self.batch.waiting)
-            yield from convert_on_cluster(Queue(self), jobs, settings, workers, warn)
-        elif workers > 1:  # decided once, before the workers fill the memory
-            share = allot_each(workers, settings.threads, memory)
-            prepare = partial(prepare_worker, settings, share.threads)
-            yield from Pool(Queue(self, share.memory), prepare).results(workers)
-        else:
-            work, queue = prepare_worker(settings, settings.threads), Queue(self)
-            while len(queue):
-                job = queue.popleft()
-                yield job, work(job)
-
-    def _count_workers(self) -> int:
-        """Return how many processes convert files; on a cluster of this machine also for few."""
-        settings, jobs = self.settings, len(self.batch.waiting)
-        memory = self.batch.waiting[0].options.max_memory
-        if not settings.workers:
-            jobs = jobs if settings.cluster or self.batch.work > SMALL_BATCH else 1
-            return choose_workers(settings.device, jobs, memory)
-        workers, note = useful_workers(settings.workers, jobs, memory)
-        self.batch.notes += [note] if note else []
-        return workers
-
-    def is_over(self) -> bool:
-        """Return whether no further job may be started."""
-        return self.settings.fail_fast and bool(self.batch.failures())
-
-    def _take(self, job: Job, result: Row | Death) -> None:
-        """Keep the row of a job; if its worker died, try the job once more, after the others."""
-        if not isinstance(result, Death):
-            self._keep(job, result)
-            return
-        self.ledger.remove_parts()
-        if job.target in self.died:
-            reason = f"the process that converted it {result.cause}, twice"
-            self._keep(job, failed_row(job, reason))
-        else:
-            self.died.add(job.target)
-            self.batch.waiting.append(job)
-
-    def _keep(self, job: Job, row: Row) -> None:
-        """Put the row of a finished job into the ledger and count it."""
-        row |= self.planner.record(job)
-        if "labels" in row:
-            row["beside"] = self.ledger.others(row)
-        self.ledger.add(row)
-        (self.batch.done if row["status"] == "ok" else self.batch.failed).append(Result(job, row))
-        self.batch.work_done += expected_work(job)
-
-
-class Queue:
-    """The jobs of a run that were not started yet, and the bytes that each may hold, if limited.
-
-    Whether a job may replace its output is decided when it starts: that may have changed meanwhile.
+    Results of earlier runs that still hold are ``done_before`` and ``failed_before``, also outputs
+    that may not be replaced.
     """
 
-    def __init__(self, run: Run, memory: int | None = None) -> None:
-        self.run, self.memory = run, memory
+    def __init__(
+        self, jobs: Sequence[Job], settings: Settings, unread: Sequence[tuple[str, str]] = ()
+    ) -> None:
+        self.jobs, self.settings, self.unread = jobs, settings, list(unread)
+        self.waiting: list[Job] = []  # not started yet; the largest first
+        self.changed: dict[str, list[str]] = {}  # options of meshes that are made again
+        self.done_before: list[Result] = []
+        self.failed_before: list[Result] = []
+        self.done: list[Result] = []
+        self.failed: list[Result] = []
+        self.notes: list[str] = []  # for the user, on how the batch is run
+        self.seconds = 0.0  # since the start of the run
+        self.record = Record(settings.folder)
+        self.written: dict[str, str] = {}  # in this run: the output of each file
+        path, symmetries = find_model(settings.model, settings.precision)
+        self.network = (fingerprint(path) or {}).get("sha256"), symmetries
+        self.inputs = {os.path.realpath(job.source) for job in jobs}
+        for job in jobs:
+            self._plan(job)
+        self.waiting.sort(key=lambda job: -expected_work(job))
+        self.work, self.work_done = sum(map(expected_work, self.waiting)), 0.0
 
-    def __len__(self) -> int:
-        return 0 if self.run.is_over() else len(self.run.batch.waiting)
+    def failures(self) -> list[Result]:
+        """Return the failures of this run and of earlier ones."""
+        return self.failed_before + self.failed
 
-    def popleft(self) -> Job:
-        """Note in the ledger that the next job starts, and return it."""
-        run = self.run
-        job = run.batch.waiting.pop(0)
-        run.ledger.start(job.target)
-        job = replace(job, replace=run.planner.replaceable(job))
-        if self.memory is None:
-            return job
-        return replace(job, options=replace(job.options, max_memory=self.memory))
+    def results(self) -> list[Result]:
+        """Return the meshes that exist, of this run and of earlier ones."""
+        return self.done_before + self.done
+
+    def made_again(self) -> dict[str, Any]:
+        """Return how many outputs are made again since options changed, and which options."""
+        options = dict.fromkeys(name for names in self.changed.values() for name in names)
+        return {"outputs": len(self.changed), "options": list(options)}
+
+    def run(self, on_file: Callable[[Batch], None] | None = None) -> None:
+        """Convert what is to be converted; call ``on_file`` after each file is in the report."""
+        start = time.perf_counter()
+        for job, row in self.failed_before:  # refused outputs that the report does not have
+            if row["reason"] != self.record.rows.get(job.target, {}).get("reason"):
+                self.record.add(row)
+        if not self.waiting or (self.settings.fail_fast and self.failures()):
+            return
+        died: set[str] = set()  # outputs whose worker died once
+        with self._stage() as stage:
+            for job, row in self._results(stage):
+                if isinstance(row, Death) and job.target not in died:
+                    died.add(job.target)
+                    self.waiting.append(job)  # once more, after the others
+                    continue
+                if isinstance(row, Death):
+                    row = job.failed(f"the process that converted it {row.cause}, twice")
+                result = Result(job, self._keep(job, row, stage))
+                (self.done if result.row["status"] == "ok" else self.failed).append(result)
+                self.work_done += expected_work(job)
+                self.seconds = time.perf_counter() - start
+                if on_file:
+                    on_file(self)
+
+    @contextmanager
+    def _stage(self) -> Iterator[Path]:
+        """Make a folder for unfinished meshes, and remove it, and those of killed batches."""
+        whole = self.settings.folder / STAGE_NAME
+        stage = whole / secrets.token_hex(4)  # orphans on a cluster write into another one
+        shutil.rmtree(whole, ignore_errors=True)
+        with naming(whole):
+            stage.mkdir(parents=True)
+        try:
+            yield stage
+        finally:
+            shutil.rmtree(whole, ignore_errors=True)
+
+    def _results(self, stage: Path) -> Generator[tuple[Job, Any], None, None]:
+        """Convert in this process, in processes or on a cluster; yield jobs with their rows."""
+        settings, threads = self.settings, self.settings.threads
+        memory = self.waiting[0].options.max_memory
+        is_large = settings.workers or settings.cluster is not None or self.work > SMALL_BATCH
+        jobs = len(self.waiting) if is_large else 1
+        workers = count_workers(settings.workers, settings.device, jobs, memory)
+        share = Resources(threads, memory)
+        if workers > 1 and settings.cluster is None:  # before the workers fill the memory
+            share = allot_each(workers, threads, memory)
+        work = partial(convert_job, settings=settings, stage=stage, threads=share.threads)
+
+        def take() -> Job | None:
+            if not self.waiting or (settings.fail_fast and self.failed):
+                return None
+            job = self.waiting.pop(0)
+            options = replace(job.options, max_memory=share.memory)
+            return replace(job, options=options) if share.memory else job
+
+        if settings.cluster is not None:
+            from .cluster import convert_on_cluster
+
+            yield from convert_on_cluster(self.jobs, settings, stage, take, workers)
+        elif workers > 1:
+            with closing(work_in_processes(take, work, workers)) as results:
+                yield from results
+        else:
+            while (job := take()) is not None:
+                yield job, work(job)
+
+    def _keep(self, job: Job, row: Row, stage: Path) -> Row:
+        """Add the row of a finished job to the report, and move its files to their places.
+
+        If they may not be written, the row that is returned says why.
+        """
+        folder, names = self.settings.folder, list(outputs_of(row))
+        if why := self._why_not(job, names):
+            row = job.failed(why, content=row["content"])
+        if "labels" in row:
+            others = self.record.made.get(job.target, {}).keys() - set(names)
+            row["beside"] = sorted(name for name in others if os.path.lexists(folder / name))
+        self.record.add(row | self._how(job))
+        try:
+            for name in names if row["status"] == "ok" else ():
+                (folder / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(stage / name, folder / name)
+                self.written[name] = job.target
+        except OSError as error:
+            why = f"{folder / name} cannot be written: {error.strerror}"
+            self.record.add(job.failed(why, content=row["content"]) | self._how(job))
+        return self.record.rows[job.target]
+
+    def _why_not(self, job: Job, names: Iterable[str]) -> str | None:
+        """Return why a job may not write some files, None if it may."""
+        for name in names:
+            path, owner = self.settings.folder / name, self.written.get(name, job.target)
+            if owner != job.target:
+                way_out = "give its inputs other names (out)"
+                return f"{path} was written while this batch ran: {way_out}"
+            if os.path.islink(path):
+                return f"{path} is a link: remove it"
+            if os.path.realpath(path) in self.inputs:
+                return f"{path} is an input: give another folder, or another name (out)"
+            if os.path.exists(path) and not self.settings.force:
+                known = self.record.made.get(job.target, {}).get(name, set())
+                if (fingerprint(path) or {}).get("sha256") not in known:
+                    why = "changed after a batch made it" if known else "not made by a batch"
+                    return f"{path} exists and was {why}: remove it or use --force"
+        return None
+
+    def _plan(self, job: Job) -> None:
+        """Put a job among those that are done, failed for good, refused, or to be done."""
+        row, how = self.record.rows.get(job.target), json.loads(json.dumps(self._how(job)))
+        if row and self._holds(job, row, how["options"]):
+            before = self.done_before if row["status"] == "ok" else self.failed_before
+            before.append(Result(job, row))
+            return
+        # of files of labels those of the row are known; others show when the job has made its own
+        names = [job.target] if not job.has_label_files else outputs_of(row) if row else []
+        if why := self._why_not(job, names):
+            self.failed_before.append(Result(job, job.failed(why) | how))
+            return
+        self.waiting.append(job)
+        if row and row["status"] == "ok" and row["options"] != how["options"]:
+            asked, before = how["asked"], row.get("asked") or {}
+            changed = [name for name in {**asked, **before} if asked.get(name) != before.get(name)]
+            others = ("version", "model", "precision", "network")
+            changed += [key for key in others if how[key] != row.get(key)]
+            self.changed[job.target] = changed or ["version"]
+
+    def _holds(self, job: Job, row: Row, digest: str) -> bool:
+        """Return whether the row of an earlier run still holds."""
+        settings, is_ok = self.settings, row["status"] == "ok"
+        if settings.force or row["options"] != digest or row["retry"]:
+            return False
+        if (settings.retry and not is_ok) or (is_ok and settings.check and "check" not in row):
+            return False
+        same_path = row["in"] == os.path.abspath(job.source)
+        return is_unchanged(job.source, row["content"], same_path=same_path) and all(
+            is_unchanged(settings.folder / name, known) for name, known in outputs_of(row).items()
+        )
+
+    def _how(self, job: Job) -> Row:
+        """Return what a row says of how a mesh was made: enough to make it again.
+
+        The digest is of all that a mesh depends on, besides its grid. Device, threads and memory do
+        not count: the mesh asked for is the same. If the precision follows the device, the network
+        for the CPU counts.
+        """
+        asked, names = job.options.digest(), self.settings.names
+        if job.options.labels is not None and names:  # a hash stands for the table
+            asked["names"] = hashlib.sha256(json.dumps(names).encode()).hexdigest()
+        digest = hashlib.sha256(json.dumps([asked, self.network, __version__]).encode())
+        return {
+            "version": __version__,
+            "network": self.network[0],
+            "model": self.settings.model,
+            "precision": self.settings.precision,
+            "asked": asked,
+            "options": digest.hexdigest(),
+        }
 
 
-def prepare_worker(settings: Settings, threads: int) -> Work:
-    """Load the network; return the function that converts a job and returns its row."""
-    network = settings.load_network(threads)
-    return lambda job: attempt(job, settings, network)
+def expected_work(job: Job) -> float:
+    """Return the estimated work of a job: proportional to its surface, plus a constant."""
+    try:
+        size = file_state(job.source)[0]
+    except OSError:
+        size = 0
+    return 1000 + float(size ** (2 / 3))
 
 
-def choose_workers(device: str, jobs: int, max_memory: int | None = None) -> int:
-    """Return how many processes to use: one per core if memory allows; one on a GPU."""
-    if device == "cuda" or (device == "auto" and "cuda" in available_devices()):
+def count_workers(asked: int, device: str, jobs: int, max_memory: int | None = None) -> int:
+    """Return how many processes to use: those asked for, or one per core, but one on a GPU.
+
+    There are no more than cores, jobs, and what the memory allows.
+    """
+    if not asked and (device == "cuda" or (device == "auto" and "cuda" in available_devices())):
         return 1
     free = max_memory or free_memory()
-    room = count_cores() if free is None else free // BYTES_PER_WORKER
-    return max(1, min(count_cores(), room, jobs))
-
-
-def useful_workers(asked: int, jobs: int, max_memory: int | None = None) -> tuple[int, str | None]:
-    """Return how many of the processes asked for are useful, and a note if that is fewer."""
-    limits = [
-        (jobs, "there is no more to do"),
-        (count_cores(), "this process may use no more cores"),
-    ]
-    if max_memory is not None:
-        room = max(1, max_memory // MIN_BYTES_PER_WORKER)
-        limits.append((room, "--max-memory has no room for more"))
-    most, cause = min(limits)
-    return min(asked, most), None if asked <= most else f"--jobs {asked} is cut to {most}: {cause}"
+    each = MIN_BYTES_PER_WORKER if asked else BYTES_PER_WORKER
+    room = count_cores() if free is None else free // each
+    return max(1, min(asked or count_cores(), count_cores(), room, jobs))

@@ -1,6 +1,6 @@
 """The certificate of a mesh: its faults as a surface, and how well it fits its grid's samples.
 
->>> from super_sdf.certificate.check import check_files
+>>> from super_sdf.check.check import check_files
 >>> check_files("part.ply", "part.npz").report()                         # doctest: +SKIP
 """
 
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
-from ..convert import Kept
 from ..errors import OptionError, OutOfMemoryError
 from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
@@ -24,25 +23,32 @@ from ..files.output import check_free
 from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import give_back, held_memory, in_words, memory_bound
-from ..threads import allot, useful_threads
-from ..surface.mesh import Mesh
-from ..options import LENGTHS, MASK, ConvertOptions, check_distance, check_max_memory
-from ..refine.survey import Band, no_surface, survey
-from ..truth.mesh_files import merged, read_mesh
 from ..labels.volumes import volume_of_samples
-from .search import search
+from ..options import LENGTHS, MASK, Options, check_distance, check_max_memory
+from ..refine.survey import Band, no_surface, survey
+from ..surface.mesh import Mesh
+from ..threads import give_back, held_memory, in_words, memory_bound, useful_threads
+from ..truth.mesh_files import merged, read_mesh
+from .samples import (
+    NOTICEABLE,
+    REACH,
+    Strays,
+    Touching,
+    exact_samples,
+    find_strays,
+    search,
+    touch,
+    vertex_residuals,
+)
 from .surface import Surface, examine_surface
-from .touching import (NOTICEABLE, Strays, Touching, exact_samples, find_strays, touch, vertex_residuals)
 
 # Bytes for each triangle and each exact sample, beside mesh and band, at the most: search trees.
 BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
 OFF_OF_MASKS = 0.5  # voxels by which the distances that are made of a mask may be off
-REACH = 2.0  # voxels: how far slabs look; the samples near the surface are within 1.4 of it
 HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
-AS_GIVEN = ConvertOptions()
+AS_GIVEN = Options()
 FULL = 0.1  # voxels: residual at which a colour is saturated
 TOUCHING, PIERCED, NOT_TOUCHING, UNKNOWN = (
     (240, 240, 240),
@@ -193,36 +199,35 @@ def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> li
 def check_files(
     mesh: str | Path,
     grid: str | Path,
-    options: ConvertOptions = AS_GIVEN,
+    options: Options = AS_GIVEN,
     *,
-    kept: Kept | None = None,
+    made: Any = None,
     intersections: bool = True,
-    processes: int = 1,
 ) -> Certificate:
     """Check a mesh file against the grid file that it was made from; see ``check_mesh``.
 
     ``options`` are those that the mesh was made with: how the grid is read, the offset, the memory
-    bound. What the conversion ``kept`` is used instead of reading the files again.
+    bound. What was ``made`` has the ``mesh`` and the ``grid``, so that they are not read again.
     """
-    kept = read_for_check(mesh, grid, options, kept)
-    return check_kept(kept, options, intersections=intersections, processes=processes)
+    both = read_for_check(mesh, grid, options, made)
+    return check_mesh(*both, options, intersections=intersections)
 
 
 def read_for_check(
-    mesh: str | Path, grid: str | Path, options: ConvertOptions, kept: Kept | None = None
-) -> Kept:
-    """Return a mesh and its grid: what was ``kept``, else read; OutOfMemoryError before both."""
-    if kept:
-        return Kept(kept.grid, merged(kept.mesh), kept.band)
+    mesh: str | Path, grid: str | Path, options: Options, made: Any = None
+) -> tuple[Mesh, SdfGrid]:
+    """Return a mesh and its grid: those that were ``made``, else read from their files."""
+    if made is not None:
+        return merged(made.mesh), made.grid
     check_room(stated_triangles(check_regular_file(mesh)), 0, options.max_memory)
     samples, read = read_grid(grid, **options.reading()), read_mesh(mesh, options.max_memory)
     if options.unit and Path(mesh).suffix.lower() == ".glb":  # it is in metres
         read = Mesh(read.vertices / LENGTHS[options.unit], read.faces)
-    return Kept(samples, read)
+    return read, samples
 
 
 def check_mesh(
-    mesh: Mesh, grid: SdfGrid, options: ConvertOptions = AS_GIVEN, *, intersections: bool = True
+    mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN, *, intersections: bool = True
 ) -> Certificate:
     """Check a mesh against the grid that it was made from.
 
@@ -231,49 +236,27 @@ def check_mesh(
     GridError if the grid has no surface at the offset; OutOfMemoryError if the search trees would
     not fit in memory.
     """
-    return check_kept(Kept(grid, mesh), options, intersections=intersections)
-
-
-def check_kept(
-    kept: Kept, options: ConvertOptions, *, intersections: bool = True, processes: int = 1
-) -> Certificate:
-    """Check a mesh with its grid and, if it is known, the band; see ``check_mesh``.
-
-    ``processes`` is how many may search large meshes at the same time; 0: one per core.
-    """
-    mesh, band, offset = kept.mesh, band_of(kept, options), options.offset
+    band, offset = band_of(grid, options), options.offset
     check_room(len(mesh.faces), len(band.voxel_ijk), options.max_memory)
-    grid = cubic_grid(kept.grid, offset)
-    samples = exact_samples(band, grid)
-    found = search(
-        mesh,
-        samples.points,
-        REACH * grid.voxel_size,
-        intersections=intersections,
-        processes=useful_threads(processes),
-    )
+    lattice, rows = cubic_grid(grid, offset), exact_samples(band)
+    reach, points = REACH * lattice.voxel_size, lattice.to_world(band.voxel_ijk[rows])
+    found = search(mesh, points, reach, intersections=intersections)
     surface = examine_surface(mesh, found.intersections)
     give_back()
-    touching = touch(mesh, samples, found, grid.voxel_size, simple=surface.is_simple)
-    del found
-    give_back()
-    is_mask, strays = grid.field.kind == MASK, None
-    if is_mask or len(touching.values):
-        slack = OFF_OF_MASKS * is_mask
-        strays = find_strays(mesh.vertices, grid, band, offset, slack)
-    volume = volume_of_samples(kept.grid, offset) if is_mask else None
-    return Certificate(mesh, grid, surface, touching, strays, volume)
+    touching = touch(mesh, band, lattice, rows, found, simple=surface.is_simple)
+    is_mask, strays = lattice.field.kind == MASK, None
+    if is_mask or len(rows):
+        strays = find_strays(mesh.vertices, lattice, offset, OFF_OF_MASKS * is_mask)
+    volume = volume_of_samples(grid, offset) if is_mask else None
+    return Certificate(mesh, lattice, surface, touching, strays, volume)
 
 
-def band_of(kept: Kept, options: ConvertOptions) -> Band:
+def band_of(grid: SdfGrid, options: Options = AS_GIVEN) -> Band:
     """Return the band of a grid on its cubic lattice; NoSurfaceError if it has none."""
     offset = check_distance(options.offset)
-    if kept.band:
-        return kept.band
-    resources = allot(0, check_max_memory(options.max_memory))
-    band = survey(cubic_grid(kept.grid, offset), offset, resources)
+    band = survey(cubic_grid(grid, offset), offset, threads=useful_threads(0))
     if not len(band.voxel_ijk):
-        raise no_surface(kept.grid, offset)
+        raise no_surface(grid, offset)
     return band
 
 

@@ -6,13 +6,17 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import IntArray
 from ..surface.mesh import Mesh
-from ..surface.topology import (Edges, count_fans, pair_edges, vertex_components, without_collapsed)
 
-FACES_AT_ONCE = 1 << 18  # for area and volume
+
+@dataclass(frozen=True)
+class Edges:
+    """Numbers of edges that are not shared by exactly two triangles of the same orientation."""
+
+    open_edges: int  # of an odd number of triangles
+    crowded_edges: int  # of more than two triangles: not manifold
+    flipped_edges: int  # of two triangles that pass them in the same direction
 
 
 @dataclass(frozen=True)
@@ -51,11 +55,10 @@ class Surface:
 
     def faults(self) -> list[str]:
         """Return what keeps the mesh from being the boundary of a solid, in words."""
-        edges = self.edges
         counts = {
-            "open edges": edges.open_edges,
-            "edges of more than two triangles": edges.crowded_edges,
-            "edges between triangles of opposite orientation": edges.flipped_edges,
+            "open edges": self.edges.open_edges,
+            "edges of more than two triangles": self.edges.crowded_edges,
+            "edges between triangles of opposite orientation": self.edges.flipped_edges,
             "vertices where several fans of triangles meet": self.pinched_vertices,
             "pairs of triangles that intersect": self.self_intersections or 0,
         }
@@ -72,25 +75,16 @@ class Surface:
 
 def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surface:
     """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
-    faces, count = without_collapsed(mesh.faces), len(mesh.vertices)
-    opposite, edges = pair_edges(faces, count)
-    pinched = int(np.count_nonzero(count_fans(faces, opposite) > 1))
-    del opposite
-    pieces, size = count_components(faces, count), measure(mesh.vertices, faces)
-    return Surface(count, len(faces), edges, pinched, pieces, self_intersections, *size)
-
-
-def count_components(faces: IntArray, count: int) -> int:
-    """Return the number of pieces of a mesh that share no vertex; unused vertices do not count."""
-    return len(np.unique(vertex_components(faces, count)[faces[:, 0]]))
-
-
-def measure(vertices: NDArray[Any], faces: IntArray) -> tuple[float, float]:
-    """Return the enclosed volume and the area, in cubic and square world units."""
-    middle = vertices.mean(0, dtype=np.float64)
-    volume = area = 0.0
-    for first in range(0, len(faces), FACES_AT_ONCE):
-        a, b, c = vertices[faces[first : first + FACES_AT_ONCE].T] - middle
-        volume += float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6
-        area += float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
-    return volume, area
+    a, b, c = mesh.faces.T
+    whole = Mesh(mesh.vertices, mesh.faces[(a != b) & (b != c) & (c != a)])
+    opposite, uses, flipped = whole.pair_edges()
+    return Surface(
+        len(whole.vertices),
+        len(whole.faces),
+        Edges(int((uses % 2).sum()), int((uses > 2).sum()), flipped),
+        int(np.count_nonzero(whole.count_fans(opposite) > 1)),
+        whole.components()[0],
+        self_intersections,
+        whole.volume(),
+        whole.area(),
+    )

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
+import json
+import os
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import SuperSdfError, WriteError
+from ..errors import OptionError, SuperSdfError, WriteError, check_modules
 from ..files.formats import NAMED, list_formats
-from ..machine.extras import check_modules
-from ..options import MESH_FORMATS
-from .batch_report import (made_again_lines, print_plan, print_summary, progress_line, sentence, summary)
-from .common import (CONTEXT, GroupedCommand, InterruptedCommand, check_can_check, check_cluster, check_names, check_option, check_page, chosen_model, cluster_option, conversion_options, labels_option, make_options, names_option, one_line_errors, print_stderr, report_option)
-from .interrupts import describe_interrupt, exit_code, raising_interrupts
+from ..options import MESH_FORMATS, OPTIONS, WORK
+from . import common
+from .common import option, print_stderr, print_stdout
 
 if TYPE_CHECKING:
-    from ..batch.job import Job, Settings
-    from ..batch.plan import Batch
-    from ..batch.run import Run
+    from ..batch.job import Job
+    from ..batch.run import Batch
 
 HELP = f"""Convert many grids to meshes in the folder DIR, each as upsample would.
 
@@ -39,107 +39,89 @@ Examples:
   super-sdf batch 'scans/**/*.npz' more.txt --out meshes/ --format stl --factor 2
   super-sdf batch cases/ --out meshes/ --format stl --labels all --names organs.ctbl
 """
+MOST_FAILURES = 20  # printed; the report has all
 
 
-@click.command(
-    "batch",
-    cls=GroupedCommand,
-    context_settings=CONTEXT,
-    epilog=EXAMPLES,
-    short_help="Convert many grids; can be stopped and resumed.",
-    help=HELP,
-)
+# fmt: off
+@click.command(cls=common.Command, context_settings=common.CONTEXT, epilog=EXAMPLES, help=HELP,
+    short_help="Convert many grids; can be stopped and resumed.")
 @click.argument("sources", metavar="IN...", nargs=-1, required=True)
-@click.option(
-    "--out",
-    "folder",
-    metavar="DIR",
-    required=True,
-    type=click.Path(path_type=Path),
-    help="Folder for the meshes and report.jsonl; subfolders of IN are kept.",
-)
-@click.option(
-    "--format",
-    "kind",
-    type=click.Choice(MESH_FORMATS),
-    default=MESH_FORMATS[0],
-    show_default=True,
-    help="Mesh file format.",
-)
-@conversion_options
-@labels_option
-@names_option
-@check_option
-@report_option
-@click.option(
-    "--jobs",
-    type=click.IntRange(0),
-    default=0,
-    show_default=True,
-    help="Worker processes; 0 means one per core, or a single one on CUDA. They share the cores "
-    "unless --threads is given.",
-)
-@cluster_option
-@click.option("--fail-fast", is_flag=True, help="Start no further file after the first failure.")
-@click.option("--retry", is_flag=True, help="Retry inputs that failed before and have not changed.")
-@click.option(
-    "--force",
-    is_flag=True,
-    help="Convert everything again; replace files that are not as a batch wrote them.",
-)
-@click.option("--dry-run", is_flag=True, help="Show what would be done; write nothing.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary, or the plan, as JSON.")
-@click.option("-q", "--quiet", is_flag=True, help="Print failures only.")
-def batch_command(sources: tuple[str, ...], folder: Path, **options: Any) -> None:
-    """Convert many grids to meshes."""
-    with one_line_errors():
-        run_batch(sources, folder, options)
-
-
-def run_batch(sources: tuple[str, ...], folder: Path, options: dict[str, Any]) -> None:
+@option("--out", "folder", metavar="DIR", required=True, type=common.FILE,
+    help="Folder for the meshes and report.jsonl; subfolders of IN are kept.")
+@option("--format", "kind", type=click.Choice(MESH_FORMATS), default=MESH_FORMATS[0],
+    show_default=True, help="Mesh file format.")
+@common.table_options(*OPTIONS)
+@common.shared("names", "cluster", "jobs")
+@option("--fail-fast", is_flag=True, group=WORK,
+    help="Start no further file after the first failure.")
+@option("--retry", is_flag=True, group=WORK,
+    help="Retry inputs that failed before and have not changed.")
+@option("--dry-run", is_flag=True, group=WORK, help="Show what would be done; write nothing.")
+@common.shared("check", "report")
+@option("--force", is_flag=True,
+    help="Convert everything again; replace files that are not as a batch wrote them.")
+@common.shared("json", "quiet")
+# fmt: on
+def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     """Find the inputs, convert what is not done yet, print a summary."""
-    start, page = time.perf_counter(), options["report"]
-    chosen, suffix = make_options(options), f".{options['kind']}"
+    start, page, quiet = time.perf_counter(), given["report"], given["quiet"]
+    options = common.chosen_options(given)
     from ..batch.inputs import find_jobs
     from ..batch.job import Settings
-    from ..batch.ledger import Ledger
-    from ..batch.plan import Planner
+    from ..batch.record import folder_lock
+    from ..batch.run import Batch
     from ..labels.files import check_options
     from ..labels.names import read_names
     from ..network.network import find_model
 
-    if options["check"]:
-        check_can_check()
-    check_cluster(options)
-    names = read_names(options["names"]) if options["names"] else None
-    jobs, unread = find_jobs(sources, suffix, chosen, names)
+    names = read_names(given["names"]) if given["names"] else None
+    jobs, unread = find_jobs(sources, f".{given['kind']}", options, names)
     of_labels = [job.options for job in jobs if job.options.labels is not None]
-    check_names(options["names"], of_labels or None)
+    if names and not of_labels:
+        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
     for each in of_labels:
-        check_options(each, [name for name in ("check", "report") if options[name]])
+        check_options(each, [name for name in ("check", "report") if given[name]])
     if any(job.options.goals() for job in jobs):  # a list may say so
         check_modules("simplify", "simplify")
-    items = check_batch_page(page, jobs, folder, force=options["force"]) if page else None
-    model = chosen_model(options)
-    find_model(model, options["precision"])
-    taken = "precision", "device", "threads", "cluster", "force", "retry", "fail_fast", "check"
-    settings = Settings(
-        folder,
-        model,
-        workers=options["jobs"],
-        items=items,
-        names=names,
-        **{name: options[name] for name in taken},
-    )
-    if options["dry_run"]:
-        plan = Planner(jobs, settings, Ledger(folder)).plan()
-        plan.unread = unread
-        print_plan(plan, options["as_json"])
+    items = check_batch_page(page, jobs, folder, force=given["force"]) if page else None
+    model = options.network()["model"]
+    find_model(model, options.precision)
+    some = {name: given[name] for name in ("cluster", "force", "retry", "fail_fast", "check")}
+    where = (folder, model, options.precision, options.device, options.threads, given["jobs"])
+    settings = Settings(*where, items=items, names=names, **some)
+    if given["dry_run"]:
+        print_plan(Batch(jobs, settings, unread), given["as_json"])
         return
-    done = complete(jobs, settings, options, unread)
-    done.seconds = time.perf_counter() - start
-    print_summary(done, options)
-    if done.failures() or done.unread:
+    with folder_lock(folder):
+        batch = Batch(jobs, settings, unread)
+        total = len(batch.waiting)
+        for line in () if quiet else made_again_lines(batch):
+            print_stderr(line)
+        try:
+            with common.progress_bar("converting", quiet or not total) as progress:
+
+                def show(batch: Batch) -> None:
+                    if progress:
+                        progress(len(batch.done) + len(batch.failed), total)
+
+                batch.run(show)
+            write_page(batch, page)
+        except KeyboardInterrupt:
+            with suppress(SuperSdfError):
+                write_page(batch, page, "interrupted")
+            done = f"{len(batch.done)} of {total} are done and kept"
+            raise KeyboardInterrupt(f"{done}; run it again to go on") from None
+    batch.seconds = time.perf_counter() - start
+    report, failures = folder / "report.jsonl", batch.failures()
+    if given["as_json"]:
+        print_stdout(json.dumps(summary(batch), indent=2), f"all is in {report}")
+    lines = [f"Failed: {result.failure()}" for result in failures]
+    lines += [f"Failed: {path} {reason}" for path, reason in unread]
+    more = len(lines) - MOST_FAILURES
+    lines[MOST_FAILURES:] = [f"and {more} more, see {report}"] * (more > 0)
+    for line in lines if quiet else (*lines, *remarks(batch, report), sentence(batch)):
+        print_stderr(line)
+    if failures or unread:
         sys.exit(1)
 
 
@@ -148,59 +130,121 @@ def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) 
 
     A page that super-sdf wrote may be replaced, so that a batch can be resumed.
     """
-    check_modules("--report", "report")
     from ..files.regular import files_of
     from ..pages.html import is_page
     from ..pages.items import items_folder
 
     files = (path for job in jobs for path in (*files_of(job.source), folder / job.target))
-    check_page("--report", page, files, force=force or is_page(page))
+    common.check_page("--report", page, files, force=force or is_page(page))
     beside = items_folder(page)
     if beside.exists() and not beside.is_dir():
         raise WriteError(f"{beside}, for the meshes of the page, is no folder: move it")
     return beside
 
 
-def complete(
-    jobs: list[Job], settings: Settings, options: dict[str, Any], unread: list[tuple[str, str]]
-) -> Batch:
-    """Run the batch and write its page; an interrupt reports how many files are done."""
-    from ..batch.ledger import folder_lock
-    from ..batch.run import Run
-
-    with raising_interrupts(), folder_lock(settings.folder):
-        run = Run(jobs, settings)
-        run.batch.unread = unread
-        for line in () if options["quiet"] else made_again_lines(run.batch):
-            print_stderr(line)
-        total = len(run.batch.waiting)
-        # in place of a progress line, if one is shown
-        cleared = "\r\x1b[K" if sys.stderr is not None and sys.stderr.isatty() else ""
-        try:
-            with progress_line(total, options["quiet"]) as progress, raising_interrupts():
-                run.complete(progress, lambda text: print_stderr(f"{cleared}Warning: {text}"))
-            write_page(run, jobs, options["report"])
-        except KeyboardInterrupt as error:
-            try:
-                write_page(run, jobs, options["report"], describe_interrupt(exit_code(error)))
-            except SuperSdfError as fault:
-                print_stderr(f"Warning: {fault}")
-            kept = f": {len(run.batch.done)} of {total} are done and kept; run it again to go on"
-            raise InterruptedCommand(kept, error, summary(run.batch)) from None
-    return run.batch
-
-
-def write_page(run: Run, jobs: list[Job], path: Path | None, interrupted: str = "") -> None:
+def write_page(batch: Batch, path: Path | None, interrupted: str = "") -> None:
     """Write the page, if one was asked for; after an interrupt, at once and without drawing."""
     if path is None:
         return
     from ..batch.page import BatchPage
     from ..pages.html import is_page
 
-    page = BatchPage(path, run.batch, jobs, run.ledger.rows)
-    alert = ""
+    page, alert = BatchPage(path, batch), ""
     if page.unfinished or interrupted:
         why = f", {interrupted}" if interrupted else ""
         alert = f"Incomplete{why}: {len(page.unfinished)} not finished; run it again to go on"
-    title, force = f"Batch: {run.settings.folder}", run.settings.force or is_page(path)
-    page.write(title, sentence(run.batch), alert, force=force, draw=not interrupted)
+    title, force = f"Batch: {batch.settings.folder}", batch.settings.force or is_page(path)
+    page.write(title, sentence(batch), alert, force=force, draw=not interrupted)
+
+
+def print_plan(plan: Batch, as_json: bool) -> None:
+    """Print what would be done with each file, and the counts."""
+    failed = [(result.row["retry"], _failure(result.row)) for result in plan.failed_before]
+    report: dict[str, list[dict[str, Any]]] = {
+        "to_do": [_paths(job) for job in plan.waiting],
+        "done_before": [_paths(job) for job, _ in plan.done_before],
+        "failed_before": [row for retry, row in failed if not retry],
+        "refused": [row for retry, row in failed if retry],
+        "unread": [{"in": path, "reason": reason} for path, reason in plan.unread],
+    }
+    if as_json:
+        print_stdout(json.dumps({**report, "made_again": plan.made_again()}, indent=2))
+    counts = []
+    for kind, rows in report.items():
+        words = kind.replace("_", " ")
+        counts += [f"{len(rows)} {words}"] if rows or kind != "unread" else []
+        for row in () if as_json else rows:
+            end = row.get("reason") or f"-> {plan.settings.folder / row['out']}"
+            line = f"{words}: {os.path.relpath(row['in'])} {end}"
+            print_stdout("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
+    for line in (*made_again_lines(plan), ", ".join(counts)):
+        print_stderr(line)
+
+
+def made_again_lines(batch: Batch) -> list[str]:
+    """Return a line that says how much is made again since options changed, if anything is."""
+    again = batch.made_again()
+    names = ", ".join(name.replace("_", "-") for name in again["options"])
+    return [f"Note: {again['outputs']} are made again, since these changed: {names}"] * bool(names)
+
+
+def _paths(job: Job) -> dict[str, Any]:
+    return {"in": os.path.abspath(job.source), "out": job.target}
+
+
+def _failure(row: dict[str, Any]) -> dict[str, Any]:
+    return {name: row[name] for name in ("in", "out", "reason")}
+
+
+def remarks(batch: Batch, report: Path) -> list[str]:
+    """Return notes, and how many of the new meshes have notes and warnings in the report."""
+    rows = [result.row for result in batch.done]
+    noted = sum(bool(row["inferred"] or row.get("missing")) for row in rows)
+    warned = sum(bool(row["warnings"] or row.get("beside")) for row in rows)
+    checks = [row["check"] for row in rows if "check" in row]
+    means = [check["residual"]["mean"] for check in checks if check.get("residual")]
+    counts = {
+        "Note: {} have notes": noted,
+        "Warning: {} have warnings": warned,
+        "Warning: {} have no residual": len(checks) - len(means),
+        f"Check: mean residual {max(means, default=0):.4f} voxels at most, of {{}}": len(means),
+    }
+    lines = [f"{text.format(count)}: see {report}" for text, count in counts.items() if count]
+    return [*(f"Note: {note}" for note in batch.notes), *lines]
+
+
+def sentence(batch: Batch) -> str:
+    """Return in one line what was done."""
+    facts, seconds = summary(batch), round(batch.seconds)
+    if batch.done or batch.failed or batch.waiting:
+        counts = [f"{facts['done']} done, {facts['failed']} failed"]
+        more = {"done before": facts["done_before"], "not begun": facts["not_begun"]}
+    else:
+        counts, retry = [f"nothing to do: {facts['done_before']} done before"], "--retry tries again"
+        more = {f"failed before ({retry})": facts["failed_before"], "refused": facts["refused"]}
+    counts += [f"{count} {kind}" for kind, count in more.items() if count]
+    time_ = f"{batch.seconds:.1f} s" if seconds < 60 else f"{seconds // 60} min {seconds % 60} s"
+    closed = f"{facts['closed']} meshes closed, {facts['open']} open"
+    return f"{', '.join(counts)}; {closed}; {time_}"
+
+
+def summary(batch: Batch) -> dict[str, Any]:
+    """Return the counts, and each failure with its reason, as ``--json`` prints them."""
+    counts = [(len(row.get("labels", [row])), bool(row["closed"])) for _, row in batch.results()]
+    closed = sum(count for count, is_closed in counts if is_closed)
+    unread = [{"in": path, "out": None, "reason": reason} for path, reason in batch.unread]
+    refused = sum(bool(result.row["retry"]) for result in batch.failed_before)
+    return {
+        "done": len(batch.done),
+        "done_before": len(batch.done_before),
+        "failed": len(batch.failures()) + len(batch.unread),
+        "failed_before": len(batch.failed_before) - refused,
+        "refused": refused,
+        "not_begun": len(batch.waiting),
+        "closed": closed,
+        "open": sum(count for count, _ in counts) - closed,
+        "seconds": round(batch.seconds, 3),
+        "made_again": batch.made_again(),
+        "failures": [*(_failure(row) for _, row in batch.failures()), *unread],
+        "report": str(batch.settings.folder / "report.jsonl"),
+    }

@@ -3,250 +3,183 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
-from click.core import ParameterSource
 
-from ..errors import OptionError, SuperSdfError, seen
-from ..machine.extras import check_modules
-from ..options import MARCHING, OPTIONS, UPSAMPLE, ConvertOptions, Option
-from .interrupts import describe_interrupt, exit_code
-
-if TYPE_CHECKING:
-    from ..network.network import Network
+from ..errors import OptionError, SuperSdfError, check_modules
+from ..options import GRID, MESH, OPTIONS, VALUES, WORK, Option, Options
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 PIPE_CLOSED = 141  # exit code of programs whose reader has ended: 128 and SIGPIPE
-PAGES = (".html", ".htm")
-CHECK_MODULES = ("igl",)  # of the extra report, for certificates
+OUTPUT = "Output"
+FILE = click.Path(path_type=Path)
 
 Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 """Adds options to a command."""
 
 
-GROUPS = {
-    "The grid": ("spacing", "origin", "direction", "axes", "space"),
-    "Its values": ("inside", "field", "label", "labels", "names", "level", "scale"),
-    "The mesh": (
-        "factor",
-        "offset",
-        "cap",
-        "mesher",
-        "simplify",
-        "tolerance",
-        "triangles",
-        "keep_volume",
-        "unit",
-    ),
-    "The work": (
-        *("quality", "precision", "model", "device", "max_memory", "threads"),
-        *("cluster", "jobs", "fail_fast", "retry", "dry_run"),
-    ),
-}
-"""Options by what they are about; the others are about output."""
-
-
-class GroupedCommand(click.Command):
-    """A command with many options: its help lists them under headings."""
+class Command(click.Command):
+    """A command whose help lists many options under headings, and whose errors are one line."""
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, each under its heading."""
-        rows: dict[str, list[tuple[str, str]]] = {heading: [] for heading in (*GROUPS, "Output")}
+        rows: dict[str, list[Any]] = {name: [] for name in (GRID, VALUES, MESH, WORK, OUTPUT)}
         for option in self.get_params(ctx):
-            if not isinstance(option, click.Option):
-                continue
-            among = (heading for heading, names in GROUPS.items() if option.name in names)
-            if row := option.get_help_record(ctx):
-                rows[next(among, "Output")].append(row)
-        for heading, some in rows.items():
-            with formatter.section(heading):
-                formatter.write_dl(some)
+            if record := option.get_help_record(ctx):
+                rows[getattr(option, "group", OUTPUT)].append(record)
+        headings = [heading for heading, some in rows.items() if some]
+        for heading in headings:
+            with formatter.section(heading if len(headings) > 1 else "Options"):
+                formatter.write_dl(rows[heading])
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; turn errors into click's, one line each."""
+        try:
+            return super().invoke(ctx)
+        except OptionError as error:
+            raise click.UsageError(str(error)) from error
+        except SuperSdfError as error:
+            raise click.ClickException(" ".join(str(error).splitlines())) from error
+        except MemoryError:
+            raise click.ClickException("out of memory: use a smaller --factor or grid") from None
+        except OSError as error:  # the system refused something, such as another file handle
+            named = f"{error.filename}: " if error.filename else ""
+            raise click.ClickException(f"{named}{error.strerror or error}") from error
+
+
+class GroupedOption(click.Option):
+    """An option with the heading under which help lists it."""
+
+    def __init__(self, *names: Any, group: str = OUTPUT, **more: Any) -> None:
+        super().__init__(*names, **more)
+        self.group = group
 
 
 class Parsed(click.ParamType):  # type: ignore[type-arg]  # generic since click 8.2
-    """A value that a function makes of text; its ValueError says what to give instead."""
+    """What the kind of an option makes of text."""
 
     name = "text"
 
-    def __init__(self, parse: Callable[[str], Any]) -> None:
-        self.parse = parse
+    def __init__(self, row: Option, word: str) -> None:
+        self.row, self.word = row, word
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the value of text."""
         try:
-            return self.parse(value)
+            parsed = self.row.kind.parse(value) if isinstance(value, str) else value
+            return self.row.check(parsed, self.word)
+        except OptionError as error:
+            raise click.UsageError(str(error)) from error
         except ValueError as error:
-            self.fail(f"{value!r}: {error}", param, ctx)
+            raise click.UsageError(f"{self.word} is {value!r}: {error}") from error
 
 
-def table_options(*names: str) -> Decorator:
-    """Return what adds options of the table to a command, in this order."""
+def option(*names: str, **more: Any) -> Decorator:
+    """Return what adds an option that is not in the table to a command."""
+    return click.option(*names, cls=GroupedOption, **more)
+
+
+def table_options(*names: str, **helps: str) -> Decorator:
+    """Return what adds options of the table to a command, in this order; some with another help."""
 
     def add(command: Callable[..., Any]) -> Callable[..., Any]:
         for name in reversed(names):
-            command = _from_table(OPTIONS[name])(command)
+            row, word = OPTIONS[name], f"--{name.replace('_', '-')}"
+            more: dict[str, Any] = {"is_flag": True}
+            if not isinstance(row.default, bool):
+                kind: Any = click.Choice(row.kind.choices) if row.kind.choices else Parsed(row, word)
+                shown = row.default is not None
+                more = {"type": kind, "metavar": row.metavar, "show_default": shown}
+            word, text = f"{word}/--{row.off}" if row.off else word, helps.get(name, row.help)
+            command = option(word, default=row.default, help=text, group=row.group, **more)(command)
         return command
 
     return add
 
 
-def _from_table(option: Option) -> Decorator:
-    """Return an option of a command; flags are off by their opposite."""
-    word = f"--{option.name.replace('_', '-')}"
-    if option.off:
-        return click.option(f"{word}/--{option.off}", default=option.default, help=option.help)
-    if option.parse is bool:
-        return click.option(word, is_flag=True, default=option.default, help=option.help)
-    kind: Any = option.parse
-    if option.choices:
-        kind = click.Choice(option.choices)
-    elif kind is int and option.default == 0:  # as many as there are
-        kind = click.IntRange(0)
-    elif kind not in (int, float, str):
-        kind = Parsed(kind)
-    return click.option(
-        word,
-        type=kind,
-        default=option.default,
-        show_default=option.default is not None,
-        metavar=option.metavar,
-        help=option.help,
-    )
+# fmt: off
+SHARED = {
+    "names": option("--names", type=FILE, metavar="TABLE", group=VALUES,
+        help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP "
+        "or FreeSurfer, CSV, or JSON such as nnU-Net's dataset.json. --labels takes names then."),
+    "cluster": option("--cluster", metavar="ADDRESS", group=WORK,
+        help="Convert on the workers of the Dask scheduler at ADDRESS, such as "
+        "tcp://10.0.0.1:8786, or with 'local' on Dask workers of this machine. --max-memory is "
+        "then the limit of each worker at an ADDRESS. Needs the extra cluster."),
+    "jobs": option("--jobs", type=click.IntRange(0), default=0, metavar="N", group=WORK,
+        help="Worker processes of a batch, or of --cluster local; 0 means one per core, or a "
+        "single one on CUDA. They share the cores unless --threads is given."),
+    "check": option("--check", is_flag=True,
+        help="Check each mesh against its samples, as check does. Needs the extra report."),
+    "report": option("--report", type=FILE, metavar="PAGE.html",
+        help="Also write a page for the browser: figures, times, warnings, the check of each mesh, "
+        "and a 3-D view of it beside coarse marching cubes. The check needs the extra report."),
+    "force": option("--force", is_flag=True, help="Replace output files that exist."),
+    "json": option("--json", "as_json", is_flag=True, help="Print results as JSON."),
+    "quiet": option("-q", "--quiet", is_flag=True, help="Print errors only."),
+}
+# fmt: on
+"""Options of several commands that are not about a conversion."""
 
 
-conversion_options = table_options(*UPSAMPLE)
-check_option = click.option(
-    "--check",
-    is_flag=True,
-    help="Check each mesh against its samples, as check does. Needs the extra report.",
-)
-labels_option = table_options("labels")
-names_option = click.option(
-    "--names",
-    type=click.Path(path_type=Path),
-    metavar="TABLE",
-    help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP or "
-    "FreeSurfer, CSV, or JSON such as nnU-Net's dataset.json. --labels takes names then.",
-)
-cluster_option = click.option(
-    "--cluster",
-    metavar="ADDRESS",
-    help="Convert on the workers of the Dask scheduler at ADDRESS, such as tcp://10.0.0.1:8786, or "
-    "with 'local' on Dask workers of this machine. --max-memory is then the limit of each worker "
-    "at an ADDRESS. Needs the extra cluster.",
-)
-report_option = click.option(
-    "--report",
-    type=click.Path(path_type=Path),
-    metavar="PAGE.html",
-    help="Also write a page for the browser: figures, times, warnings, the check of each mesh, and "
-    "a 3-D view of it beside coarse marching cubes. Needs the extra report.",
-)
+def shared(*names: str) -> Decorator:
+    """Return what adds shared options to a command, in this order."""
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for name in reversed(names):
+            command = SHARED[name](command)
+        return command
+
+    return add
 
 
-class InterruptedCommand(BaseException):  # as KeyboardInterrupt, no error
-    """A signal ended the command: the message names the signal and what was kept.
+def chosen_options(given: dict[str, Any]) -> Options:
+    """Return the options of a conversion, from all options of a command that may go with them."""
+    chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
+    for name in chosen.goals():
+        check_modules(f"--{name}", "simplify")
+    if given.get("check"):
+        check_modules("--check", "report", ("igl",))
+    if (address := given.get("cluster")) is not None:
+        if not address.strip():
+            raise OptionError("--cluster is empty: give local or the address of a Dask scheduler")
+        if given["jobs"] and address != "local":
+            raise OptionError(f"--jobs {given['jobs']} and --cluster {address}: leave --jobs out")
+        check_modules("--cluster", "cluster")
+    return chosen
 
-    ``facts`` are what ``--json`` prints of what was done.
-    """
 
-    def __init__(
-        self, kept: str, interrupt: KeyboardInterrupt, facts: dict[str, Any] | None = None
-    ) -> None:
-        self.exit_code, self.facts = exit_code(interrupt), facts or {}
-        super().__init__(f"{describe_interrupt(self.exit_code)}{kept}")
+def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
+    """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
+    from ..files.output import check_apart, check_free
+
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise OptionError(f"{page} is not a page: give {word} a file .html or .htm")
+    check_free(page, force=force)
+    check_apart(page, others)
 
 
 @contextmanager
-def one_line_errors(*targets: str | os.PathLike[str] | None) -> Iterator[None]:
-    """Turn errors into click's, one line each.
-
-    The exit code is 2 for usage errors, 128 + n after signal n, and 1 for all others. After an
-    interrupt the line says which of the targets, the output files, are written.
-    """
-    before = {str(target): _file_at(target) for target in targets if target is not None}
-    try:
-        yield
-    except SuperSdfError as error:
-        kind = click.UsageError if isinstance(error, OptionError) else click.ClickException
-        line = " ".join(str(error).splitlines())  # names may have line breaks
-        raise kind(_as_typed(line) if kind is click.UsageError else line) from error
-    except MemoryError:
-        raise click.ClickException("out of memory: use a smaller --factor or grid") from None
-    except OSError as error:  # the system refused something, such as another file handle: no bug
-        reason = error.strerror or str(error)
-        named = f"{error.filename}: {reason}" if error.filename else reason
-        raise click.ClickException(named) from error
-    except KeyboardInterrupt as error:
-        raise InterruptedCommand(_what_is_written(before), error) from None
-
-
-def _as_typed(line: str) -> str:
-    """Return a message with the options that it begins with as the user typed them."""
-    context = click.get_current_context(silent=True)
-    given = context.params if context else {}
-    for option in context.command.params if context else ():
-        word, value = option.opts[0], given.get(option.name or "")
-        for part in (value, *value) if isinstance(value, tuple) else (value,):
-            typed = part if isinstance(part, str) else repr(part).removesuffix(".0")
-            name, shown = word.lstrip("-").replace("-", "_"), re.escape(seen(part))
-            shown += f"|{re.escape(typed)}"
-            found = re.match(rf"(.* and )?{name} (is )?(?:{shown})(?=[:,]| and )", line)
-            if found and word.startswith("-"):
-                head = f"{found[1] or ''}{word} {found[2] or ''}{typed}"
-                line = head + line[found.end() :]
-    return line
-
-
-def _file_at(path: str | os.PathLike[str]) -> tuple[int, int] | None:
-    """Return what tells the file at a path from one that replaces it; None without a file."""
-    try:
-        found = os.stat(path)
-    except (OSError, ValueError):  # ValueError: a NUL in the name
-        return None
-    return found.st_dev, found.st_ino
-
-
-def _what_is_written(before: dict[str, tuple[int, int] | None]) -> str:
-    """Return which files are not those of before, as the end of a sentence."""
-    written = [path for path, file in before.items() if _file_at(path) != file]
-    if not written:
-        return "; nothing was written" if before else ""
-    return f"; {' and '.join(written)} {'is' if len(written) == 1 else 'are'} written"
-
-
-@contextmanager
-def progress_bar(
-    label: str, quiet: bool, then: tuple[float, str] | None = None
-) -> Iterator[Callable[[int, int], None] | None]:
-    """Draw a progress bar with the remaining time on stderr; None if stderr is no terminal.
-
-    ``then`` is another label, and the share of the work from which on it is right.
-    """
+def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Draw a progress bar with the remaining time on stderr; None if stderr is no terminal."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
     with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
-
-        def show(done: int, total: int) -> None:
-            if then and done >= then[0] * total:
-                shown.label = then[1]
-            shown.update(1000 * done // total - shown.pos)
-
-        yield show
+        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
 
 
 def print_stderr(line: str) -> None:
     """Print a line to stderr, if that can be written; line breaks of file names become spaces."""
-    with suppress(OSError):
+    try:
         click.echo(line.replace("\n", " "), err=True)
+    except OSError:
+        _discard(2)
 
 
 def print_stdout(text: str, kept: str = "") -> None:
@@ -256,85 +189,15 @@ def print_stdout(text: str, kept: str = "") -> None:
     """
     try:
         click.echo(text)
-    except BrokenPipeError:
-        raise click.exceptions.Exit(PIPE_CLOSED) from None
     except OSError as error:
+        _discard(1)
+        if isinstance(error, BrokenPipeError):
+            raise click.exceptions.Exit(PIPE_CLOSED) from None
         said = f"stdout cannot be written: {error.strerror or error}"
         raise click.ClickException(f"{said}; {kept}" if kept else said) from error
 
 
-def check_page(option: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
-    """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
-    from ..files.output import check_apart, check_free
-
-    if page.suffix.lower() not in PAGES:
-        raise OptionError(f"{page} is not a page: give {option} a file {' or '.join(PAGES)}")
-    check_free(page, force=force)
-    check_apart(page, others)
-
-
-def check_can_check() -> None:
-    """Raise FileError if the library for ``--check`` is missing."""
-    check_modules("--check", "report", CHECK_MODULES)
-
-
-def check_cluster(options: dict[str, Any]) -> None:
-    """Raise an error if ``--cluster`` cannot be used, or not with the other options."""
-    address, jobs = options["cluster"], options.get("jobs", 0)
-    if address is None:
-        return
-    if not address.strip():
-        raise OptionError("--cluster is empty: give local or the address of a Dask scheduler")
-    if jobs and address != "local":
-        raise OptionError(
-            f"--jobs {jobs} is for workers of this machine: those at {address} are as many as "
-            "were started there; give only one of --jobs and that --cluster"
-        )
-    check_modules("--cluster", "cluster")
-
-
-def check_names(table: Path | None, labels: Any) -> None:
-    """Raise OptionError if a table of names was given, but no labels."""
-    if table is not None and labels is None:
-        raise OptionError(f"--names {table} is for --labels: give that, too")
-
-
-def chosen_model(options: dict[str, Any]) -> str:
-    """Return the value of ``--model`` or ``--quality``; OptionError if both were given."""
-    if options["model"] is None:
-        return str(options["quality"])
-    given = click.get_current_context().get_parameter_source("quality")
-    if given is not ParameterSource.DEFAULT:
-        raise OptionError(
-            f"--model {options['model']} replaces --quality {options['quality']}: give only one "
-            "of them"
-        )
-    return str(options["model"])
-
-
-def load_chosen(options: dict[str, Any], meanwhile: Callable[[], None] = lambda: None) -> Network:
-    """Load the network that a command's options choose; import the rest, and more, meanwhile."""
-    from ..network.network import load_network
-
-    chosen = {name: options[name] for name in ("device", "threads", "precision")}
-    with ThreadPoolExecutor(1) as pool:
-        loading = pool.submit(load_network, chosen_model(options), **chosen)
-        from .. import convert  # noqa: F401  # onnxruntime needs no interpreter while it loads
-        from ..surface.cell_cases import loop_table, triangle_table
-
-        meanwhile()
-        triangle_table()  # it is kept
-        if options.get("mesher") != MARCHING:
-            from ..surface.sharp import mesher  # noqa: F401
-
-            loop_table()
-        return loading.result()
-
-
-def make_options(options: dict[str, Any]) -> ConvertOptions:
-    """Return the conversion's options, picked from all options of a command."""
-    taken = options.keys() & ConvertOptions.__dataclass_fields__.keys()
-    chosen = ConvertOptions(**{name: options[name] for name in taken})
-    for name in chosen.goals():
-        check_modules(f"--{name}", "simplify")
-    return chosen
+def _discard(number: int) -> None:
+    """Let what a stream still holds go nowhere: Python would complain about it at its end."""
+    with suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)

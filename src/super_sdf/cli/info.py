@@ -3,153 +3,162 @@
 from __future__ import annotations
 
 import json
+import platform
 import sys
-from dataclasses import asdict
+from collections.abc import Iterator
 from typing import Any
 
 import click
 
-from .. import __version__
-from ..errors import OptionError, SuperSdfError
-from ..options import DEVICES, FLOAT32, MESHERS, Device
-from .common import CONTEXT, one_line_errors, print_stdout
+from .. import __version__, errors
+from ..options import EXACT, FLOAT32, MARCHING, MASK, MESHERS, Device
+from .common import CONTEXT, Command, option, print_stdout, shared, table_options
 
 EXAMPLES = """\b
 Examples:
   super-sdf info --check
   super-sdf info --check --device cuda
   super-sdf info scan.zarr
-  super-sdf info fire.vdb
 """
+OK, MISSING, FAILED = "ok", "missing", "failed"
+SAMPLES, CENTRE, RADIUS = 32, 15.63, 12.0  # of a ball, in voxels; the centre is on no sample
+MOST_OFF, MOST_OFF_OF_MASK = 0.05, 0.6  # voxels; a mask shows the surface to half a voxel
 
 
-@click.command(
-    "info",
-    context_settings=CONTEXT,
-    epilog=EXAMPLES,
-    short_help="Show versions, devices and networks, check them, or describe a grid file.",
-)
+# fmt: off
+@click.command(cls=Command, context_settings=CONTEXT, epilog=EXAMPLES,
+    short_help="Show versions, devices and networks, check them, or describe a grid file.")
 @click.argument("source", metavar="[GRID]", required=False)
-@click.option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails.")
-@click.option(
-    "--device",
-    type=click.Choice(DEVICES),
-    default=DEVICES[0],
-    show_default=True,
-    help="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work.",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def info_command(source: str | None, check: bool, device: Device, as_json: bool) -> None:
+@option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails.")
+@table_options("device",
+    device="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work.")
+@shared("json")
+# fmt: on
+def command(source: str | None, check: bool, device: Device, as_json: bool) -> None:
     """Show versions, devices, and the shipped networks with their metadata.
 
     With GRID, show instead what that grid file states: shape, type, spacing, origin, and
     how it is stored, such as the chunks of a Zarr array; of an OpenVDB file, all its grids.
 
-    With --check, test instead whether they work on this machine: each network is run on a ball,
-    whose distances are known, on the CPU and on CUDA. What is missing is listed with the command
-    that installs it.
+    With --check, test instead whether they work on this machine: each network refines a ball on the
+    CPU and on CUDA. What is missing is listed with the command that installs it.
     """
-    with one_line_errors():
-        if source is not None and check:
-            raise OptionError(f"{source} and --check: give only one of them")
+    if source is not None and check:
+        raise errors.OptionError(f"{source} and --check: give only one of them")
+    if check:
+        findings = []
+        for state, what, says in run_checks(device):
+            findings.append({"state": state, "what": what, "says": says})
+            if not as_json:
+                print_stdout(f"{state:<8} {what}: {says}")
+        failed = sum(finding["state"] == FAILED for finding in findings)
+        said = f"{failed} of {len(findings)} checks failed" if failed else "What is installed works."
+        facts: dict[str, Any] = {"works": not failed, "findings": findings}
+    else:
         if source is not None:
-            print_grid(source, as_json)
-        elif not (print_checks(device, as_json) if check else print_facts(as_json)):
-            sys.exit(1)
+            from ..files.grids import describe_grid_file
+
+        facts = gather_facts() if source is None else describe_grid_file(source)
+        cards = facts.get("models", {}).values()
+        failed = "fault" in facts or any("fault" in card for card in cards)
+        said = "\n".join(in_words(facts))
+    print_stdout(json.dumps(facts, indent=2) if as_json else said)
+    if failed:
+        sys.exit(1)
 
 
-def print_grid(source: str, as_json: bool) -> None:
-    """Print what a grid file states."""
-    from ..files.grids import describe_grid_file
-
-    found = describe_grid_file(source)
-    if as_json:
-        print_stdout(json.dumps(found, indent=2))
-        return
-    notes, grids = found.pop("notes", ()), found.pop("grids", ())
-    for key, value in found.items():
-        print_stdout(f"{key}: {_in_words(value)}")
-    for grid in grids:
-        print_stdout(f"grid: {_grid_in_words(grid)}")
-    for note in notes:
-        print_stdout(f"note: {note}")
-
-
-def _in_words(value: Any) -> str:
-    if value is None:
-        return "not stated"
-    if isinstance(value, list):
-        return ", ".join(f"{x:.10g}" for x in value)
-    return f"{value:,}" if isinstance(value, int) else str(value)
-
-
-def _grid_in_words(grid: dict[str, Any]) -> str:
-    """Return one of the grids that a file of OpenVDB holds."""
-    words = [grid["name"] or "without a name", grid["type"], grid["class"]]
-    if grid["active_voxels"] is not None:
-        words.append(f"{grid['active_voxels']:,} active voxels")
-    return ", ".join(words)
-
-
-def print_checks(device: Device, as_json: bool) -> bool:
-    """Run the checks and print each result as it comes; return whether none failed."""
-    from .selftest import FAILED, run_checks
-
-    findings = []
-    for finding in run_checks(device):
-        findings.append(finding)
-        if not as_json:
-            print_stdout(f"{finding.state:<8} {finding.what}: {finding.says}")
-    failed = sum(finding.state == FAILED for finding in findings)
-    if as_json:
-        report = {"works": not failed, "findings": [asdict(finding) for finding in findings]}
-        print_stdout(json.dumps(report, indent=2))
-    elif failed:
-        print_stdout(f"{failed} of {len(findings)} checks failed")
-    else:
-        print_stdout("What is installed works.")
-    return not failed
-
-
-def print_facts(as_json: bool) -> bool:
-    """Print versions, devices and the networks' cards; return whether all networks load."""
-    facts = gather_facts()
-    if as_json:
-        print_stdout(json.dumps(facts, indent=2))
-    else:
-        for key in ("super-sdf", "python", "onnxruntime"):
-            print_stdout(f"{key} {facts[key]}")
-        for key in ("devices", "meshers"):
-            print_stdout(f"{key}: {', '.join(facts[key])}")
-        for name, card in facts["models"].items():
-            print_stdout(f"model {name}")
-            for key, value in sorted(card.items()):
-                print_stdout(f"  {key.replace('_', ' ')}: {value}")
-        if not facts["models"]:
-            print_stdout(f"models: {facts['fault']}")
-    return "fault" not in facts and not any("fault" in card for card in facts["models"].values())
+def in_words(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield lines of facts: one each, one for each of several, or a heading with lines below."""
+    for key, value in facts.items():
+        name = key.replace("_", " ")
+        if isinstance(value, dict):
+            for of, inner in value.items():
+                yield f"{name.removesuffix('s')} {of}"
+                yield from (f"  {line}" for line in in_words(inner))
+        elif isinstance(value, (list, tuple)) and value and isinstance(value[0], dict):
+            for inner in value:  # the grids of a file of OpenVDB
+                said = [x for x in inner.values() if x]
+                words = (f"{x:,} active voxels" if isinstance(x, int) else str(x) for x in said)
+                yield f"{name.removesuffix('s')}: {', '.join(words)}"
+        elif key == "notes":
+            yield from (f"note: {note}" for note in value)
+        elif isinstance(value, (list, tuple)) and value:
+            words = (f"{x:.10g}" if isinstance(x, (int, float)) else str(x) for x in value)
+            yield f"{name}: {', '.join(words)}"
+        elif value not in ([], ()):
+            text = f"{value:,}" if isinstance(value, int) else str(value)
+            yield f"{name}: {'not stated' if value is None else text}"
 
 
 def gather_facts() -> dict[str, Any]:
     """Return versions, devices and the networks' cards, or under ``fault`` why one cannot load."""
-    import platform
-
     from ..network.device import available_devices
     from ..network.network import NO_NETWORKS, load_network, shipped_models
     from ..network.onnx import ort
 
-    models: dict[str, dict[str, Any]] = {}
+    models: dict[str, Any] = {}
     for name in shipped_models():
         try:
             models[name] = dict(load_network(name, device="cpu", precision=FLOAT32).card)
-        except SuperSdfError as error:
+        except errors.SuperSdfError as error:
             models[name] = {"fault": str(error)}
-    facts = {
+    return {
         "super-sdf": __version__,
         "python": platform.python_version(),
         "onnxruntime": ort.__version__,
         "devices": available_devices(),
         "meshers": MESHERS,
         "models": models,
+        **({} if models else {"fault": NO_NETWORKS}),
     }
-    return facts if models else {**facts, "fault": NO_NETWORKS}
+
+
+def run_checks(device: Device) -> Iterator[tuple[str, str, str]]:
+    """Yield state, name and words of each check; CUDA is needed if onnxruntime is built for it."""
+    from ..network.device import available_devices, check_cuda, describe_gpu, onnxruntime_version
+    from ..network.network import NO_NETWORKS, shipped_models
+
+    versions = f"super-sdf {__version__}, Python {platform.python_version()}"
+    yield (OK, "versions", f"{versions}, {onnxruntime_version()}")
+    devices: list[Device] = ["cpu"]
+    if device != "cpu":
+        try:
+            check_cuda()
+            devices.append("cuda")
+            yield (OK, "cuda", describe_gpu() or "its libraries are there")
+        except errors.DeviceError as error:
+            needed = device == "cuda" or "cuda" in available_devices()
+            yield (FAILED if needed else MISSING, "cuda", str(error))
+    if not shipped_models():
+        yield (FAILED, "networks", NO_NETWORKS)
+    for name in shipped_models():
+        for each in devices[:1] if name.endswith("-int8") else devices:
+            yield check_network(name, each)
+    for name, modules in errors.EXTRAS.items():
+        lacking, says = errors.missing_modules(modules), ", ".join(modules)
+        if lacking:
+            says = f"no {', '.join(lacking)}: {errors.how_to_install(name)}"
+        yield (MISSING if lacking else OK, f"extra {name}", says)
+
+
+def check_network(name: str, device: Device) -> tuple[str, str, str]:
+    """Refine a ball with a shipped network on a device."""
+    import numpy as np
+
+    from ..grid.sdf_grid import make_grid
+    from ..network.network import load_network
+    from ..pipeline import reconstruct
+
+    values: Any = np.linalg.norm(np.indices((SAMPLES,) * 3) - CENTRE, axis=0) - RADIUS
+    is_mask, what = name.startswith(MASK), f"network {name} on {device}"
+    values, most = (values < 0, MOST_OFF_OF_MASK) if is_mask else (values, MOST_OFF)
+    grid = make_grid(values, spacing=1.0, origin=0.0, field=MASK if is_mask else EXACT)
+    try:
+        network = load_network(name, device=device, precision=FLOAT32)  # its own file
+        found = reconstruct(grid, network, mesher=MARCHING).vertices
+    except errors.SuperSdfError as error:
+        return (FAILED, what, str(error))
+    off = float(np.abs(np.linalg.norm(found - CENTRE, axis=1) - RADIUS).max())
+    works = off <= most  # False for NaN
+    says = f"off by {off:.3f} voxels at most on a ball" + f"; allowed are {most}" * (not works)
+    return (OK if works else FAILED, what, says)

@@ -1,74 +1,43 @@
-"""The command group, and what a failed or interrupted command prints and returns.
-
-Only click is imported at the top, so that ``super-sdf --help`` is quick.
-"""
+"""The group of commands, and how a command ends: exit code, one line on stderr, signals."""
 
 from __future__ import annotations
 
 import difflib
 import json
+import os
+import signal
 import sys
 from contextlib import suppress
-from typing import Any
+from importlib import import_module
+from types import FrameType
 
 import click
 
 from .. import __version__
-from .common import CONTEXT, PIPE_CLOSED, InterruptedCommand, print_stderr, print_stdout
-from .interrupts import wants_json
+from .common import CONTEXT, print_stderr, print_stdout
 
 COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
+SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 
 
-class LazyGroup(click.Group):
-    """A group that imports a command when it is used, so that one does not wait for the others."""
+class Commands(click.Group):
+    """The commands, each in a module of its name that is imported when it is used."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of the commands, in the order of the help."""
         return list(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command, None if there is none of this name."""
-        match cmd_name:
-            case "upsample":
-                from .upsample import upsample_command
-
-                return upsample_command
-            case "batch":
-                from .batch import batch_command
-
-                return batch_command
-            case "check":
-                from .check import check_command
-
-                return check_command
-            case "sample":
-                from .sample import sample_command
-
-                return sample_command
-            case "view":
-                from .view import view_command
-
-                return view_command
-            case "info":
-                from .info import info_command
-
-                return info_command
-        return None
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Return the command that is meant; for a name that is none, name the nearest."""
-        name = args[0]
-        if name not in COMMANDS and not name.startswith("-"):
-            near = difflib.get_close_matches(name, COMMANDS, 1)
-            way_out = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}"
-            ctx.fail(f"there is no command {name!r}: {way_out}")
-        return super().resolve_command(ctx, args)
+        """Return a command; for a name that is none, name the nearest."""
+        if cmd_name in COMMANDS:
+            found: click.Command = import_module(f"..{cmd_name}", __name__).command
+            return found
+        near = difflib.get_close_matches(cmd_name, COMMANDS, 1)
+        way_out = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}"
+        ctx.fail(f"there is no command {cmd_name!r}: {way_out}")
 
 
-@click.group(cls=LazyGroup, context_settings=CONTEXT, invoke_without_command=True)
+@click.group(cls=Commands, context_settings=CONTEXT, invoke_without_command=True)
 @click.version_option(__version__, prog_name="super-sdf")
 @click.pass_context
 def cli(context: click.Context) -> None:
@@ -84,27 +53,50 @@ def main() -> None:
 
 
 def run() -> int:
-    """Run a command; return the exit code."""
+    """Run a command; return the exit code: 2 for usage errors, 128 + n after signal n.
+
+    A signal raises KeyboardInterrupt, so that files that were begun are removed; one that the
+    parent process ignores, as ``nohup`` does, stays ignored.
+    """
+    heard: list[int] = []
+
+    def hear(number: int, frame: FrameType | None) -> None:
+        heard.append(number)
+        raise KeyboardInterrupt
+
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    for number in SIGNALS:
+        if before[number] not in (signal.SIG_IGN, None):
+            signal.signal(number, hear)
+    for number in range(3):  # a standard stream that is closed; else the next file gets its text
+        with suppress(OSError):
+            os.fstat(number)
+            continue
+        os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
+    sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(os.devnull, "w")
     try:
         code = cli.main(standalone_mode=False)  # a number if a command ended early
-    except click.ClickException as error:
-        return _end(error.format_message(), error.exit_code)
-    except InterruptedCommand as error:
-        return _end(str(error), error.exit_code, error.facts)
-    except click.Abort:  # an interrupt outside of a command's work
-        return _end("interrupted", 130)
-    except OSError as error:  # outside of a command's work, while help is printed
-        if isinstance(error, BrokenPipeError):
-            return PIPE_CLOSED
-        print_stderr(f"Error: stdout cannot be written: {error.strerror or error}")
-        return 1
-    return code if isinstance(code, int) else 0
+        return code if isinstance(code, int) else 0
+    except OSError as error:  # while help is printed
+        return end(f"stdout cannot be written: {error.strerror or error}", 1)
+    except (Exception, KeyboardInterrupt) as error:
+        if heard:  # also what a library has made of the interrupt
+            name = signal.Signals(heard[0]).name
+            said = "interrupted" if name == "SIGINT" else f"ended by {name}"
+            kept = getattr(error.__cause__, "args", ())  # of a command that says what it has kept
+            return end(f"{said}: {kept[0]}" if kept else said, 128 + heard[0])
+        if isinstance(error, click.ClickException):
+            return end(error.format_message(), error.exit_code)
+        raise
+    finally:
+        for number in SIGNALS:
+            signal.signal(number, before[number])
 
 
-def _end(line: str, code: int, facts: dict[str, Any] | None = None) -> int:
+def end(line: str, code: int) -> int:
     """Print an error, with ``--json`` also as JSON to stdout; return the exit code."""
-    if wants_json():
+    if "--json" in sys.argv[1:]:
         with suppress(click.ClickException, click.exceptions.Exit):
-            print_stdout(json.dumps({**(facts or {}), "error": line}, indent=2))
+            print_stdout(json.dumps({"error": line}, indent=2))
     print_stderr(f"Error: {line}")
     return code

@@ -9,10 +9,8 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from ..errors import OptionError
-from ..machine.extras import check_modules
-from .common import CONTEXT, one_line_errors, print_stderr, progress_bar
-from .interrupts import raising_interrupts
+from ..errors import OptionError, check_modules
+from .common import CONTEXT, FILE, Command, option, print_stderr, progress_bar, shared
 
 EXAMPLES = """\b
 Examples:
@@ -21,90 +19,59 @@ Examples:
 """
 
 
-@click.command(
-    "sample",
-    context_settings=CONTEXT,
-    epilog=EXAMPLES,
-    short_help="Sample a closed mesh as a signed distance grid.",
-)
-@click.argument("source", metavar="MESH", type=click.Path(path_type=Path))
-@click.argument("target", metavar="OUT", type=click.Path(path_type=Path))
-@click.option("-n", "samples", type=int, help="Samples along the longest axis.")
-@click.option(
-    "--spacing", type=float, metavar="H", help="World distance between samples, instead of -n."
-)
-@click.option(
-    "--padding",
-    type=float,
-    default=2.0,
-    show_default=True,
-    help="Voxels between the bounding box of the mesh and the outermost samples.",
-)
-@click.option(
-    "--frame",
-    type=click.Choice(["world", "unit"]),
-    default="world",
-    show_default=True,
+# fmt: off
+@click.command(cls=Command, context_settings=CONTEXT, epilog=EXAMPLES,
+    short_help="Sample a closed mesh as a signed distance grid.")
+@click.argument("source", metavar="MESH", type=FILE)
+@click.argument("target", metavar="OUT", type=FILE)
+@option("-n", "samples", type=int, help="Samples along the longest axis.")
+@option("--spacing", type=float, metavar="H", help="World distance between samples, instead of -n.")
+@option("--padding", type=float, default=2.0, show_default=True,
+    help="Voxels between the bounding box of the mesh and the outermost samples.")
+@option("--frame", type=click.Choice(["world", "unit"]), default="world", show_default=True,
     help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and centres "
-    "it in a unit cube, sampled at n^3 voxel centres.",
-)
-@click.option(
-    "--band",
-    type=float,
-    metavar="VOXELS",
+    "it in a unit cube, sampled at n^3 voxel centres.")
+@option("--band", type=float, metavar="VOXELS",
     help="Exact distances up to this many voxels from the surface, clamped beyond. Default: exact "
-    "everywhere up to 256^3 samples, within 4 voxels in larger grids.",
-)
-@click.option("--allow-open", is_flag=True, help="Accept a mesh with holes; its inside is a guess.")
-@click.option("--force", is_flag=True, help="Replace OUT if it exists.")
-@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
-def sample_command(source: Path, target: Path, **options: Any) -> None:
+    "everywhere up to 256^3 samples, within 4 voxels in larger grids.")
+@option("--allow-open", is_flag=True, help="Accept a mesh with holes; its inside is a guess.")
+@shared("force", "quiet")
+# fmt: on
+def command(source: Path, target: Path, **given: Any) -> None:
     """Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
 
     MESH is any mesh file that trimesh reads. OUT is a .npz file (keys values, spacing, origin);
     its values are in the units of the mesh and negative inside.
     """
-    with one_line_errors(target):
-        check_modules("sample", "eval")
-        run_sample(source, target, options)
-
-
-def run_sample(source: Path, target: Path, options: dict[str, Any]) -> None:
-    """Read the mesh, lay out the grid, sample it, write it, print notes and the size."""
+    check_modules("sample", "eval")
     from ..files.grids import check_grid_target, write_grid
     from ..files.output import check_apart
     from ..truth.sampling import check_numbers, fitted_layout, sample_solid, unit_layout
     from ..truth.solid import Solid, load_solid, normalise
 
-    start, in_unit = time.perf_counter(), options["frame"] == "unit"
-    check_grid_target(target, force=options["force"])
+    start, in_unit = time.perf_counter(), given["frame"] == "unit"
+    check_grid_target(target, force=given["force"])
     check_apart(target, [source])
-    size = {"n": options["samples"], "spacing": options["spacing"]}
-    check_layout(in_unit, **size)
-    padding = 0 if in_unit else options["padding"]
-    check_numbers(**size, padding=padding, band=options["band"])
-    solid, notes = load_solid(source, allow_open=options["allow_open"])
-    if in_unit:
-        solid, layout = Solid(normalise(solid.mesh)), unit_layout(options["samples"])
-    else:
-        layout = fitted_layout(solid.mesh, **size, padding=padding)
-    with progress_bar("sampling", options["quiet"]) as progress:
-        grid = sample_solid(solid, layout, band=options["band"], progress=progress)
-    with raising_interrupts():
-        write_grid(grid, target, force=options["force"])
-    if not options["quiet"]:
-        for note in (*notes, *grid.notes):
-            print_stderr(f"Note: {note}")
-        shape, seconds = " x ".join(map(str, grid.shape)), time.perf_counter() - start
-        print_stderr(f"{target}: {shape} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")
-
-
-def check_layout(in_unit: bool, n: int | None, spacing: float | None) -> None:
-    """Raise OptionError for options that do not go together."""
-    if (n is None) == (spacing is None):
+    size = {"n": given["samples"], "spacing": given["spacing"]}
+    if (size["n"] is None) == (size["spacing"] is None):
         raise OptionError("give either -n (samples along the longest axis) or --spacing")
-    if in_unit and n is None:
+    if in_unit and size["n"] is None:
         raise OptionError("--frame unit has a side of 1: give -n, not --spacing")
     padded = click.get_current_context().get_parameter_source("padding")
     if in_unit and padded is not ParameterSource.DEFAULT:
         raise OptionError("--frame unit has a side of 1: it takes no --padding")
+    padding = 0 if in_unit else given["padding"]
+    check_numbers(**size, padding=padding, band=given["band"])
+    solid, notes = load_solid(source, allow_open=given["allow_open"])
+    if in_unit:
+        solid, layout = Solid(normalise(solid.mesh)), unit_layout(size["n"])
+    else:
+        layout = fitted_layout(solid.mesh, **size, padding=padding)
+    with progress_bar("sampling", given["quiet"]) as progress:
+        grid = sample_solid(solid, layout, band=given["band"], progress=progress)
+    write_grid(grid, target, force=given["force"])
+    if not given["quiet"]:
+        for note in (*notes, *grid.notes):
+            print_stderr(f"Note: {note}")
+        shape, seconds = " x ".join(map(str, grid.shape)), time.perf_counter() - start
+        print_stderr(f"{target}: {shape} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")

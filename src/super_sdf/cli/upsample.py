@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import json
-import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
-from ..machine.extras import check_modules
-from ..options import MESH_FORMATS, QUALITIES, ConvertOptions
-from ..progress import Progress, Stopwatch
-from .common import (CONTEXT, GroupedCommand, check_can_check, check_cluster, check_names, check_option, check_page, chosen_model, cluster_option, conversion_options, labels_option, load_chosen, make_options, names_option, one_line_errors, print_stderr, print_stdout, progress_bar, report_option)
-from .interrupts import raising_interrupts
-
-if TYPE_CHECKING:
-    from ..check.check import Certificate
-    from ..convert import Conversion
-    from ..network.network import Network
+from ..options import MESH_FORMATS, OPTIONS, Options
+from ..progress import Stopwatch
+from . import common
+from .common import option, print_stderr, print_stdout
 
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
 
@@ -41,305 +33,153 @@ MANY = 50_000  # triangles of which simplifying is worth a hint
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 
-@click.command(
-    "upsample",
-    cls=GroupedCommand,
-    context_settings=CONTEXT,
-    epilog=EXAMPLES,
-    short_help="Refine a grid and write its surface as a mesh.",
-    help=HELP,
-)
+# fmt: off
+@click.command(cls=common.Command, context_settings=common.CONTEXT, epilog=EXAMPLES, help=HELP,
+    short_help="Refine a grid and write its surface as a mesh.")
 @click.argument("source", metavar="IN")
 @click.argument("target", metavar="OUT")
-@conversion_options
-@labels_option
-@names_option
-@check_option
-@click.option(
-    "--save-field",
-    metavar="FIELD",
+@common.table_options(*OPTIONS)
+@common.shared("names", "cluster", "jobs", "check")
+@option("--save-field", metavar="FIELD",
     help="Also write the refined field: .npz for the values near the surface, .vdb for a level set "
-    "of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti.",
-)
-@report_option
-@cluster_option
-@click.option(
-    "--jobs",
-    type=click.IntRange(0),
-    default=0,
-    metavar="N",
-    help="Worker processes of --cluster local; 0 means one per core.",
-)
-@click.option("--force", is_flag=True, help="Replace OUT, FIELD and PAGE.html if they exist.")
-@click.option("--json", "as_json", is_flag=True, help="Print counts, times and notes as JSON.")
-@click.option("-q", "--quiet", is_flag=True, help="Print errors only.")
-@click.option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
-def upsample_command(source: str, target: str, **options: Any) -> None:
-    """Convert one grid to a mesh."""
-    with one_line_errors(target, options["save_field"], options["report"]):
-        chosen = make_options(options)
-        check_names(options["names"], chosen.labels)
-        if chosen.labels is None:
-            Upsampling(source, target, chosen, options).complete()
-        else:
-            upsample_labels(source, target, chosen, options)
+    "of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti.")
+@common.shared("report", "force", "json", "quiet")
+@option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
+# fmt: on
+def command(source: str, target: str, **given: Any) -> None:
+    """Convert one grid to a mesh, or the labels of an image to meshes."""
+    options, watch = common.chosen_options(given), Stopwatch()
+    check_outputs(source, target, options, given)
+    from ..network.network import digest_of_model, load_network
 
-
-class Upsampling:
-    """One run of the command: its options, its result, and the time of each stage."""
-
-    def __init__(
-        self, source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
-    ) -> None:
-        watch = Stopwatch()
-        self.source, self.target, self.options = source, target, options
-        self.chosen, self.model = chosen, chosen_model(options)
-        self.network = load_chosen(options, meanwhile=self._check_arguments)
-        watch.lap("load network")
-        self.seconds = watch.seconds
-        self.result: Conversion
-        self.certificate: Certificate | None = None
-
-    def complete(self) -> None:
-        """Convert the grid, check its mesh and write its page if asked for, print the result."""
-        options = self.options
-        from ..convert import SHARE_BEFORE
-
-        then = (SHARE_BEFORE, "simplifying") if self.chosen.goals() else None
-        with raising_interrupts(), progress_bar("upsampling", options["quiet"], then) as progress:
-            convert = self._convert_here if options["cluster"] is None else self._convert_there
-            self.result = convert(progress)
-        self.seconds |= self.result.seconds
-        with raising_interrupts():
-            if options["check"]:
-                self._check()
-            if options["report"]:
-                self._write_page()
-            self.print_report()
-
-    def _check_arguments(self) -> None:
-        """Raise an error for what can be seen to fail before the work."""
-        from ..files.meshes import check_target
-        from ..files.regular import files_of
-
-        options, force = self.options, self.options["force"]
-        check_target(self.target, force=force, unit=self.chosen.unit)
-        outputs: list[str] = [self.target]
-        if options["save_field"] is not None:
-            from ..files.fields import check_field_target
-
-            check_field_target(options["save_field"], force=force)
-            outputs.append(options["save_field"])
-        if options["check"]:
-            check_can_check()
-        if options["report"]:
-            check_modules("--report", "report")
-            files: list[str | Path] = [*files_of(self.source), *outputs]
-            check_page("--report", options["report"], files, force=force)
-        if options["cluster"] is not None:
-            check_cluster(options)
-            from ..cluster.bricks import check_can_brick
-
-            check_can_brick(self.source, self.chosen, options["save_field"])
-        elif options["jobs"]:
-            raise OptionError(
-                f"--jobs {options['jobs']} is for --cluster local: give that, too, or leave it out"
-            )
-
-    def _convert_here(self, progress: Progress | None) -> Conversion:
-        from ..convert import convert
-
-        return convert(
-            self.source,
-            self.target,
-            self.network,
-            self.chosen,
-            force=self.options["force"],
-            progress=progress,
-            announce=self._announce,
-            save_field=self.options["save_field"],
-            keep=bool(self.options["check"] or self.options["report"]),
-        )
-
-    def _convert_there(self, progress: Progress | None) -> Conversion:
-        from ..cluster.bricks import convert_on_cluster
-        from ..cluster.checking import Needs
-        from ..cluster.connecting import connect
-
-        options, model = self.options, self.model
-        if model not in QUALITIES:
-            model = str(Path(model).absolute())
-        needs = Needs(model, options["precision"], options["device"])
-        limits = {"threads": options["threads"], "max_memory": options["max_memory"]}
-        with connect(options["cluster"], workers=options["jobs"], **limits) as cluster:
-            return convert_on_cluster(
-                self.source,
-                self.target,
-                cluster,
-                needs,
-                self.chosen,
-                force=options["force"],
-                progress=progress,
-                announce=self._announce,
-            )
-
-    def _announce(self, line: str) -> None:
-        """Print, before the work, what may make the user stop it; the bar is redrawn below."""
-        if not self.options["quiet"]:
-            print_stderr(f"\r{line}\x1b[K" if sys.stderr.isatty() else line)
-
-    def _check(self) -> None:
-        """Check the finished mesh against its samples."""
-        from ..check.check import check_files
-
-        watch, threads = Stopwatch(), self.options["threads"]
-        files = self.target, self.source, self.chosen
-        try:
-            self.certificate = check_files(*files, kept=self.result.kept, processes=threads)
-        except SuperSdfError as error:
-            raise type(error)(f"{error}; {self.target} is written, but not checked") from error
-        watch.lap("check")
-        self.seconds |= watch.seconds
-
-    def _write_page(self) -> None:
-        """Write the page; what cannot be shown in it is said there."""
-        from ..pages.html import page_of_conversion, write_page
-
-        watch, threads = Stopwatch(), self.options["threads"]
-        report = {**self._report(), "notes": [*self.result.remarks(), *self.network.notes]}
-        given = self.chosen, self.result.kept, self.certificate
-        text = page_of_conversion(report, *given, processes=threads)
-        write_page(text, self.options["report"], force=self.options["force"])
-        watch.lap("page")
-        self.seconds |= watch.seconds
-
-    def print_report(self) -> None:
-        """Print notes, warnings and a summary to stderr, and with ``--json`` JSON to stdout."""
-        result = self.result
-        if self.options["as_json"]:
-            print_stdout(json.dumps(self._report(), indent=2), f"{self.target} is written")
-        if self.options["quiet"]:
-            return
-        for note in (*result.notes, *result.remarks(), *self.network.notes):
-            print_stderr(f"Note: {note}")
-        for warning in result.warnings:
-            print_stderr(f"Warning: {warning}")
-        if self.options["verbose"]:
-            report = self._report()
-            for key in ("shape", "spacing", "origin", "device", "band_voxels", "nodes"):
-                print_stderr(f"{key.replace('_', ' ')}: {report[key]}")
-            for stage, seconds in self.seconds.items():
-                print_stderr(f"{stage}: {seconds:.3f} s")
-        print_stderr(f"{self.target}: {_describe_mesh(result, sum(self.seconds.values()))}")
-        if result.saved_field:
-            print_stderr(f"{self.options['save_field']}: {_describe_field(result.saved_field)}")
-        if result.simplified:
-            print_stderr(f"Simplified: {_describe_simplified(result.simplified, self.chosen.unit)}")
-        if self.certificate:
-            print_stderr(f"Check: {self.certificate.summary()}")
-        if self.options["report"]:
-            print_stderr(f"Report: {self.options['report']}")
-
-    def _report(self) -> dict[str, Any]:
-        """Return counts, times and notes as ``--json`` prints them."""
-        return {
-            "input": self.source,
-            "output": self.target,
-            "version": __version__,
-            "asked": self.chosen.digest(),
-            **_describe_network(self.model, self.network),
-            **self.result.report(),
-            **({"check": self.certificate.report()} if self.certificate else {}),
-            "seconds": _rounded(self.seconds),
-        }
-
-
-def upsample_labels(
-    source: str, target: str, chosen: ConvertOptions, options: dict[str, Any]
-) -> None:
-    """Convert the labels of an image to meshes, and print what was made."""
-    from ..labels.files import check_options, convert_labels, missing_note
-    from ..labels.names import read_names
-
-    watch, model = Stopwatch(), chosen_model(options)
-    check_options(chosen, [name for name in NOT_WITH_LABELS if options[name]])
-    names = read_names(options["names"]) if options["names"] else None
-    network = load_chosen(options)
+    network = load_network(**options.network())
     watch.lap("load network")
-    with raising_interrupts(), progress_bar("upsampling", options["quiet"]) as progress:
-        made = convert_labels(
-            *(source, target, network, chosen),
-            names=names,
-            force=options["force"],
-            progress=progress,
-        )
-    watch.lap("convert")
-    if options["as_json"]:
-        report = {
-            "input": source,
-            "output": target,
-            "version": __version__,
-            "asked": chosen.digest(),
-            **_describe_network(model, network),
-            **made,
-            "seconds": _rounded(watch.seconds),
-        }
-        print_stdout(json.dumps(report, indent=2), "the meshes are written")
-    if options["quiet"]:
-        return
-    for note in (*made["inferred"], *missing_note(made["missing"]), *network.notes):
-        print_stderr(f"Note: {note}")
-    for row in made["labels"]:
-        print_stderr(
-            f"{row['output']}: {row['name']}, {row['vertices']:,} vertices, "
-            f"{row['triangles']:,} triangles, "
-            f"{row['components']:,} closed component{'s' * (row['components'] != 1)}, "
-            f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
-        )
-    print_stderr(f"{len(made['labels'])} labels, {sum(watch.seconds.values()):.1f} s")
+    done: Any
+    force = given["force"]
+    with common.progress_bar("upsampling", given["quiet"]) as progress:
+        where = source, target, network, options
+        if options.labels is None:
+            from ..convert import convert
 
+            done = convert(*where, progress=progress, save_field=given["save_field"], force=force)
+        else:
+            from ..labels.files import convert_labels
+            from ..labels.names import read_names
 
-def _describe_network(model: str, network: Network) -> dict[str, Any]:
-    from ..network.network import digest_of_model
-
-    return {
+            names = read_names(given["names"]) if given["names"] else None
+            done = convert_labels(*where, progress=progress, names=names, force=force)
+    watch.take(done.seconds)
+    model, notes = options.network()["model"], [*done.remarks(), *network.notes]
+    report = {
+        "input": source,
+        "output": target,
+        "version": __version__,
+        "asked": options.digest(),
         "model": model,
         "network": digest_of_model(model, network.precision),
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),
+        **done.report(),
     }
+    certificate = None
+    if given["check"]:
+        from ..check.check import check_files
+
+        try:
+            certificate = check_files(target, source, options, made=done)
+        except SuperSdfError as error:
+            raise type(error)(f"{error}; {target} is written, but not checked") from error
+        report["check"] = certificate.report()
+        watch.lap("check")
+    if given["report"]:
+        from ..pages.html import page_of_conversion, write_page
+
+        said = {**report, "seconds": watch.rounded(), "notes": notes}
+        text = page_of_conversion(said, options, done, certificate)
+        write_page(text, given["report"], force=force)
+        watch.lap("page")
+    report["seconds"] = watch.rounded()
+    if given["as_json"]:
+        print_stdout(json.dumps(report, indent=2), f"{target} is written")
+    if given["quiet"]:
+        return
+    lines = [f"Note: {note}" for note in (*done.notes, *notes)]
+    lines += [f"Warning: {warning}" for warning in done.warnings]
+    if given["verbose"]:
+        keys = ("shape", "spacing", "origin", "device", "band_voxels", "nodes")
+        lines += [f"{key.replace('_', ' ')}: {report[key]}" for key in keys if key in report]
+        lines += [f"{stage}: {seconds:.3f} s" for stage, seconds in watch.seconds.items()]
+    describe = describe_mesh if options.labels is None else describe_labels
+    lines += describe(report, f"{sum(watch.seconds.values()):.1f} s")
+    lines += [f"Check: {certificate.summary()}"] if certificate else []
+    lines += [f"Report: {given['report']}"] * bool(given["report"])
+    for line in lines:
+        print_stderr(line)
 
 
-def _rounded(seconds: dict[str, float]) -> dict[str, float]:
-    return {stage: round(spent, 4) for stage, spent in seconds.items()}
+def check_outputs(source: str, target: str, options: Options, given: dict[str, Any]) -> None:
+    """Raise an error for what can be seen to fail before the work."""
+    from ..files.regular import files_of
+
+    force, field = given["force"], given["save_field"]
+    if given["names"] and options.labels is None:
+        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
+    if options.labels is not None:
+        from ..labels.files import check_options
+
+        check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
+    else:
+        from ..files.meshes import check_target
+
+        check_target(target, force=force, unit=options.unit)
+    if field is not None:
+        from ..files.fields import check_field_target
+
+        check_field_target(field, force=force)
+    if given["report"]:
+        outputs = (target, field) if field else (target,)
+        common.check_page("--report", given["report"], [*files_of(source), *outputs], force=force)
+    if given["cluster"] is not None:
+        raise OptionError("--cluster is for batch: leave it out")
+    if given["jobs"]:
+        raise OptionError(f"--jobs {given['jobs']} is for --cluster local: give that, or no --jobs")
 
 
-def _describe_mesh(result: Conversion, seconds: float) -> str:
-    counts = result.counts
-    low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in result.bounds)
-    closed = "closed" if result.closed else "open"
-    is_large = not result.simplified and counts["triangles"] > MANY
-    hint = "; far fewer triangles within 0.02 voxels of these: --simplify 0.02" if is_large else ""
-    return (
-        f"{counts['vertices']:,} vertices, {counts['triangles']:,} triangles, {closed}, "
-        f"from {low} to {high}, {seconds:.1f} s{hint}"
-    )
+def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:
+    """Return lines on a mesh, its field and how it was simplified."""
+    few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
+    low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in report["bounds"])
+    hint = "; far fewer triangles within 0.02 voxels of these: --simplify 0.02"
+    lines = [
+        f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "
+        f"{'closed' if report['closed'] else 'open'}, from {low} to {high}, {seconds}"
+        + hint * (not few and triangles > MANY)
+    ]
+    if field:
+        shape = " x ".join(map(str, field["shape"]))
+        place = [", ".join(f"{x:.12g}" for x in field[key]) for key in ("spacing", "origin")]
+        said = f"lattice {shape}, spacing {place[0]}, origin {place[1]}"
+        lines.append(f"{field['path']}: the refined field, {said}")
+    if few:
+        off, unit = few["deviation"], report["asked"]["unit"] or "in world units"
+        largest = max(off["largest"], off["largest_back"]) * few["voxel_size"]
+        lines.append(
+            f"Simplified: from {few['triangles_before']:,} to {few['triangles']:,} triangles; "
+            f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
+            f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}; "
+            f"at most {largest:.4g} {unit}"
+        )
+    return lines
 
 
-def _describe_field(field: dict[str, Any]) -> str:
-    shape = " x ".join(map(str, field["shape"]))
-    spacing, origin = (", ".join(f"{x:.12g}" for x in field[k]) for k in ("spacing", "origin"))
-    return f"the refined field, lattice {shape}, spacing {spacing}, origin {origin}"
-
-
-def _describe_simplified(simplified: dict[str, Any], unit: str | None) -> str:
-    """Describe in one line how much simpler a mesh is and how far from the unsimplified one."""
-    off = simplified["deviation"]
-    largest = max(off["largest"], off["largest_back"])
-    return (
-        f"from {simplified['triangles_before']:,} to {simplified['triangles']:,} triangles; "
-        f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
-        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}; "
-        f"at most {largest * simplified['voxel_size']:.4g} {unit or 'in world units'}"
-    )
+def describe_labels(report: dict[str, Any], seconds: str) -> list[str]:
+    """Return a line on the mesh of each label."""
+    lines = [
+        f"{row['output']}: {row['name']}, {row['vertices']:,} vertices, "
+        f"{row['triangles']:,} triangles, "
+        f"{row['components']:,} closed component{'s' * (row['components'] != 1)}, "
+        f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
+        for row in report["labels"]
+    ]
+    return [*lines, f"{len(lines)} labels, {seconds}"]

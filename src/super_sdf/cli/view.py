@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any
 
 import click
 
-from ..machine.extras import check_modules
-from .common import (CONTEXT, check_page, conversion_options, load_chosen, make_options, one_line_errors, print_stderr)
-from .interrupts import raising_interrupts
+from ..options import OPTIONS
+from .common import (
+    CONTEXT,
+    FILE,
+    Command,
+    check_page,
+    chosen_options,
+    option,
+    print_stderr,
+    shared,
+    table_options,
+)
 
 EXAMPLES = """\b
 Examples:
@@ -20,55 +29,45 @@ Examples:
 
 
 @click.command(
-    "view",
+    cls=Command,
     context_settings=CONTEXT,
     epilog=EXAMPLES,
     short_help="Look at meshes and grids in the browser.",
 )
 @click.argument("sources", metavar="MESH|GRID...", nargs=-1, required=True)
-@click.option(
+@option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=FILE,
     metavar="PAGE.html",
     help="File for the page. Default: one in the temporary folder that only you can read.",
 )
-@click.option("--force", is_flag=True, help="Replace PAGE.html if it exists.")
-@click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
-@conversion_options
-def view_command(sources: tuple[str, ...], **options: Any) -> None:
+@shared("force")
+@option("--no-browser", is_flag=True, help="Print the address and open no browser.")
+@table_options(*(name for name in OPTIONS if name != "labels"))
+def command(
+    sources: tuple[str, ...], out: Path | None, force: bool, no_browser: bool, **given: Any
+) -> None:
     """Look at meshes, and at grids refined as by upsample, in the browser.
 
     MESH is any mesh file that trimesh reads. GRID is what upsample takes; its refined mesh is shown
     beside coarse marching cubes of the samples, from one camera, with the residuals of its samples
     as colours. The options below apply to grids.
 
-    The page is one file, which shows all of it without a server; its address is printed. Needs the
-    extra report.
+    The page is one file, which shows all of it without a server; its address is printed. Residuals
+    need the extra report.
     """
-    with one_line_errors():
-        page = write_view(sources, options)
-    print_stderr(page.as_uri())
-    if not options["no_browser"]:
-        import webbrowser
-
-        if not webbrowser.open(page.as_uri()):
-            print_stderr("Note: no browser can be started here: open that address in yours")
-
-
-def write_view(sources: tuple[str, ...], options: dict[str, Any]) -> Path:
-    """Read and refine the files and write their page; return its absolute path."""
-    from tempfile import mkdtemp
-
+    from ..network.network import load_network
     from ..pages.html import viewed_page, write_page
 
-    check_modules("view", "report")
-    page: Path | None = options["out"]
-    if page:
-        check_page("--out", page, sources, force=options["force"])
-    chosen = make_options(options)
-    with raising_interrupts():
-        text = viewed_page(sources, partial(load_chosen, options), chosen)
-        # a folder that only this user can read
-        page = page or Path(mkdtemp(prefix="super-sdf-"), "view.html")
-        write_page(text, page, force=options["force"])
-    return page.absolute()
+    if out:
+        check_page("--out", out, sources, force=force)
+    options = chosen_options(given)
+    text = viewed_page(sources, lambda: load_network(**options.network()), options)
+    page = out or Path(mkdtemp(prefix="super-sdf-"), "view.html")  # only this user can read it
+    write_page(text, page, force=force)
+    print_stderr(page.absolute().as_uri())
+    if not no_browser:
+        import webbrowser
+
+        if not webbrowser.open(page.absolute().as_uri()):
+            print_stderr("Note: no browser can be started here: open that address in yours")

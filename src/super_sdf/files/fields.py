@@ -2,127 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from math import prod
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
 
 from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
-from .output import check_free, free_space, little_endian, naming, replacing
-from ..grid.sdf_grid import SdfGrid
-from ..machine.extras import check_modules
-from ..machine.memory import held_memory, in_words, memory_bound
 from ..options import check_path
+from ..refine.field import FineField, fine_grid, lattice_planes, lattice_shape
 from ..surface.cap import check_all_seen
-from ..refine.field import FineField, fine_grid, lattice_shape, own_planes
-from .sparse import SparseWriter
-from .level_set import VdbWriter
-
-BYTES = 4  # of a value
-Shape = tuple[int, int, int]
+from ..threads import held_memory, in_words, memory_bound
+from .output import check_free, free_space, naming, replacing
+from .sparse import write_sparse
+from .vdb_writer import write_level_set
 
 
-class NpyWriter:
-    """Writes the planes of the fine lattice, slab by slab."""
-
-    def __init__(self, part: Path, shape: Shape, files: ExitStack) -> None:
-        self.file: IO[bytes] = files.enter_context(part.open("wb"))
-        header = {"descr": "<f4", "fortran_order": False, "shape": shape}
-        npy.write_array_header_1_0(self.file, header)
-
-    def add(self, field: FineField) -> None:
-        """Write the planes of nodes of a slab."""
-        for _, planes in own_planes(field):
-            self.file.write(little_endian(planes))
-
-    def finish(self) -> None:
-        """Complete the file."""
-        self.file.close()
+def write_npy(field: FineField, path: Path) -> None:
+    """Write the whole fine lattice as NumPy's ``.npy``, in float32."""
+    shape = lattice_shape(field.shape, field.factor)
+    with path.open("wb") as file:
+        npy.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
+        for _, planes in lattice_planes(field):
+            file.write(planes.astype("<f4", copy=False).tobytes())
 
 
-class VtiWriter:
-    """Gathers the fine lattice in memory and writes it as VTK image data at the end.
-
-    The memory is filled at once, so that the plan of the work counts it.
-    """
-
-    def __init__(self, part: Path, shape: Shape, files: ExitStack) -> None:
-        self.part = part
-        self.values = np.full(shape[::-1], np.float32(np.inf))  # x is the fastest
-        self.grid: SdfGrid | None = None
-
-    def add(self, field: FineField) -> None:
-        """Copy the planes of nodes of a slab."""
-        self.grid = fine_grid(field)
-        for first, planes in own_planes(field):
-            self.values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
-
-    def finish(self) -> None:
-        """Write the file."""
-        from vtkmodules.util.numpy_support import numpy_to_vtk
-        from vtkmodules.vtkCommonCore import vtkObject
-        from vtkmodules.vtkCommonDataModel import vtkImageData
-        from vtkmodules.vtkCommonMisc import vtkErrorCode
-        from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
-
-        image = vtkImageData()
-        image.SetDimensions(*self.values.shape[::-1])
-        if self.grid:
-            image.SetSpacing(*self.grid.spacing)
-            image.SetOrigin(*self.grid.origin)
-            image.SetDirectionMatrix(np.ravel(self.grid.direction).tolist())
-        array = numpy_to_vtk(self.values.reshape(-1))
-        array.SetName("distance")
-        image.GetPointData().SetScalars(array)
-        writer = vtkXMLImageDataWriter()
-        writer.SetFileName(str(self.part))
-        writer.SetInputData(image)
-        writer.EncodeAppendedDataOff()
-        writer.SetCompressorTypeToNone()
-        logs = vtkObject.GetGlobalWarningDisplay()
-        vtkObject.GlobalWarningDisplayOff()
-        written = writer.Write()
-        vtkObject.SetGlobalWarningDisplay(logs)
-        if not written:
-            reason = vtkErrorCode.GetStringFromErrorCode(writer.GetErrorCode())
-            raise OSError(f"VTK says {reason!r}")
+def write_vti(field: FineField, path: Path) -> None:
+    """Write the whole fine lattice as VTK image data, from memory: x is the fastest there."""
+    grid = fine_grid(field)
+    values = np.empty(grid.shape[::-1], "<f4")
+    for first, planes in lattice_planes(field):
+        values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
+    extent = " ".join(f"0 {nodes - 1}" for nodes in grid.shape)
+    place = {"Origin": grid.origin, "Spacing": grid.spacing, "Direction": np.ravel(grid.direction)}
+    placed = " ".join(f'{n}="{" ".join(map(repr, map(float, at)))}"' for n, at in place.items())
+    head = (
+        '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
+        f'<ImageData WholeExtent="{extent}" {placed}>\n<Piece Extent="{extent}">\n'
+        '<PointData Scalars="distance">\n<DataArray type="Float32" Name="distance" '
+        'format="appended" offset="0"/>\n</PointData>\n</Piece>\n</ImageData>\n'
+        '<AppendedData encoding="raw">\n_'
+    )
+    with path.open("wb") as file:
+        file.write(head.encode("ascii") + struct.pack("<Q", values.nbytes))
+        file.write(values.data)
+        file.write(b"\n</AppendedData>\n</VTKFile>\n")
 
 
-WRITERS: dict[str, Any] = {
-    ".npz": SparseWriter,
-    ".vdb": VdbWriter,
-    ".npy": NpyWriter,
-    ".vti": VtiWriter,
+FIELD_TABLE: dict[str, Callable[[FineField, Path], None]] = {
+    ".npz": write_sparse,
+    ".vdb": write_level_set,
+    ".npy": write_npy,
+    ".vti": write_vti,
 }
-"""Each takes the path, the nodes along each axis of the lattice, and what closes files at the end.
-
-A writer has the methods ``add`` and ``finish``. Those not in ``SPARSE`` write every node.
-"""
-FIELD_SUFFIXES = tuple(WRITERS)
-SPARSE = (".npz", ".vdb")
+"""What writes a field to a path, by suffix: the last two write every node."""
 
 
 def check_field_target(path: str | Path, *, force: bool = False) -> Path:
     """Return the path if a field can be written there; called before the work starts."""
     path = check_path(path, "path")
-    suffix = path.suffix.lower()
-    if suffix not in WRITERS:
-        raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_SUFFIXES)}")
-    if suffix == ".vti":
-        check_modules("Writing .vti", "vti")
+    if path.suffix.lower() not in FIELD_TABLE:
+        raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_TABLE)}")
     return check_free(path, force=force)
 
 
-def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) -> None:
+def check_field_fits(
+    path: Path, shape: tuple[int, int, int], max_memory: int | None = None
+) -> None:
     """Raise an error if a dense file of a lattice does not fit on the disk, or .vti in memory."""
     suffix = path.suffix.lower()
-    if suffix in SPARSE:
+    if suffix not in (".npy", ".vti"):
         return
-    size = BYTES * prod(shape)
+    size = 4 * prod(shape)
     what = f"{' x '.join(map(str, shape))} values take {in_words(size)}"
     free, bound = free_space(path), memory_bound(max_memory)
     if size > free:
@@ -138,40 +94,30 @@ def check_field_fits(path: Path, shape: Shape, max_memory: int | None = None) ->
         )
 
 
+@dataclass
 class FieldFile:
-    """A file of a field that is being written; errors name it."""
+    """A file of a field that appears when all is done; ``report`` is what was written, for JSON."""
 
-    def __init__(self, path: Path, shape: Shape, writer: Any) -> None:
-        self.path, self.shape, self.writer = path, shape, writer
-        self.place: dict[str, Any] = {}  # spacing and origin of the lattice, once there is a field
+    path: Path
+    part: Path
+    report: dict[str, Any] = field(default_factory=dict)
 
-    def add(self, field: FineField) -> None:
-        """Write the own planes of a slab's field."""
-        if not self.place:
-            check_all_seen(field.placed, "write the mesh alone, without its field")
-            fine = fine_grid(field)
-            self.place = {"spacing": list(fine.spacing), "origin": list(fine.origin)}
+    def write(self, field: FineField) -> None:
+        """Write the field; errors name the file."""
+        check_all_seen(field.placed, "write the mesh alone, without its field")
         with naming(self.path):
-            self.writer.add(field)
-
-    def finish(self) -> None:
-        """Complete the file."""
-        with naming(self.path):
-            self.writer.finish()
-
-    def report(self) -> dict[str, Any]:
-        """Return what was written, for JSON."""
-        return {"path": str(self.path), "shape": list(self.shape), **self.place}
+            FIELD_TABLE[self.path.suffix.lower()](field, self.part)
+        fine = fine_grid(field)
+        place = {"spacing": list(fine.spacing), "origin": list(fine.origin)}
+        self.report = {"path": str(self.path), "shape": list(fine.shape), **place}
 
 
 @contextmanager
-def saving_field(path: Path, shape: Shape, *, force: bool = False) -> Iterator[FieldFile]:
-    """Yield a file to write a field to; it appears at the end, if ``finish`` was called.
-
-    ``shape`` is the number of nodes of the fine lattice along each axis.
-    """
-    with replacing(path, force=force) as part, ExitStack() as files:
-        yield FieldFile(path, shape, WRITERS[path.suffix.lower()](part, shape, files))
+def saving_field(path: str | Path, *, force: bool = False) -> Iterator[FieldFile]:
+    """Yield a file to write a field to; it appears at the end of the block, if that succeeds."""
+    path = check_field_target(path, force=force)
+    with replacing(path, force=force) as part:
+        yield FieldFile(path, part)
 
 
 def write_field(field: FineField, path: str | Path, *, force: bool = False) -> None:
@@ -201,8 +147,6 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
     path = check_field_target(path, force=force)
-    shape = lattice_shape(field.placed.shape, field.factor)
-    check_field_fits(path, shape)
-    with saving_field(path, shape, force=force) as writer:
-        writer.add(field)
-        writer.finish()
+    check_field_fits(path, lattice_shape(field.placed.shape, field.factor))
+    with saving_field(path, force=force) as file:
+        file.write(field)

@@ -1,7 +1,7 @@
 """Output files: checked before the work starts, and either complete or absent afterwards.
 
 Process 123 writes ``.part.ply.123.part`` beside ``part.ply`` and holds a lock on it meanwhile. A
-file without a lock was abandoned; where there are no locks, one whose process has ended.
+file without a lock was left by a process that was killed, and goes with the next run.
 """
 
 from __future__ import annotations
@@ -10,21 +10,20 @@ import os
 import re
 import shutil
 import stat
-import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
-
-from numpy.typing import NDArray
 
 from ..errors import SuperSdfError, WriteError
 
+try:
+    import fcntl
+except ImportError:  # Windows, where files that are open cannot be removed
+    fcntl = None  # type: ignore[assignment]
+
 WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
-# File systems allow names of 255 bytes (some 143); the name of a spool file is 9 bytes longer.
-LONGEST = 96
-PART = re.compile(r"(?P<stem>\..+\.)(?P<pid>\d+)\.part(\.\w+)?", re.DOTALL)
-SPOOL_BYTES = 4_000_000  # kept in memory before a file is made
+LONGEST = 96  # bytes of a name; file systems allow 255, some 143, and that of a part is longer
+PART = re.compile(r"(?P<stem>\..+\.)\d+\.part", re.DOTALL)
 
 
 def check_free(path: Path, *, force: bool = False) -> Path:
@@ -33,14 +32,14 @@ def check_free(path: Path, *, force: bool = False) -> Path:
     Without ``force`` no file may exist. A link counts as its target; a dangling link counts as an
     existing file.
     """
-    kind = _kind_at(path)
-    if kind is not None and stat.S_ISDIR(kind):
+    mode = _mode_of(path)
+    if mode is not None and stat.S_ISDIR(mode):
         raise WriteError(f"{path} is a folder: give a file")
     if os.path.lexists(path) and not force:
         raise WriteError(f"{path} exists: remove it or use --force")
-    if kind is not None and not stat.S_ISREG(kind):
+    if mode is not None and not stat.S_ISREG(mode):
         raise WriteError(f"{path} is not a regular file: give another name")
-    _check_not_protected(path, kind)
+    _check_not_protected(path, mode)
     folder = _behind_links(path).parent
     if not folder.is_dir():
         raise WriteError(f"{folder} is not a folder: make it first")
@@ -62,7 +61,7 @@ def free_space(path: Path) -> int:
         return shutil.disk_usage(_behind_links(path).parent).free
 
 
-def _kind_at(path: Path) -> int | None:
+def _mode_of(path: Path) -> int | None:
     try:
         return path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
@@ -81,31 +80,6 @@ def _behind_links(path: Path) -> Path:
 
 
 @contextmanager
-def replacing(
-    path: Path, *, force: bool = True, before_rename: Callable[[Path], None] | None = None
-) -> Iterator[Path]:
-    """Yield a temporary path beside the target, renamed to the target if the block succeeds.
-
-    A link stays, and the file it points to is replaced and keeps its mode. Temporary files of the
-    same target that killed processes left are removed. Without ``force`` a file that exists at the
-    end stays, which is an error. ``before_rename`` is called with the path of the complete file.
-    """
-    target = _behind_links(path) if force else path
-    with naming(path), _reserved_part(target) as part:
-        yield part
-        if before_rename:
-            before_rename(part)
-        if not force:
-            _rename_if_free(part, target)
-            return
-        mode = _kind_at(target)
-        _check_not_protected(target, mode)
-        if mode is not None:
-            part.chmod(stat.S_IMODE(mode))
-        os.replace(part, target)
-
-
-@contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Turn the system's errors in the block into a WriteError that names the path."""
     try:
@@ -120,31 +94,52 @@ def _cannot_be_written(path: Path, error: OSError | ValueError) -> WriteError:
     return WriteError(f"{path} cannot be written: {getattr(error, 'strerror', None) or error}")
 
 
-def _rename_if_free(part: Path, target: Path) -> None:
-    """Rename a file unless the target exists: a hard link, unlike a rename, never replaces."""
-    taken = WriteError(
-        f"{target} was created by another program meanwhile: remove it or use --force"
-    )
+@contextmanager
+def replacing(path: Path, *, force: bool = True) -> Iterator[Path]:
+    """Yield a temporary path beside the target, renamed to the target if the block succeeds.
+
+    A link stays, and the file it points to is replaced and keeps its mode. Temporary files of the
+    same target that killed processes left are removed. Without ``force`` a file that exists at the
+    end stays, which is an error.
+    """
+    target = _behind_links(path) if force else path
+    part = target.with_name(f"{_stem(target.name)}{os.getpid()}.part")
+    with naming(path):
+        remove_abandoned_parts([target])
+        try:
+            file = os.open(part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
+        except FileExistsError:
+            raise WriteError(f"{target} is being written already: wait for it") from None
+        with os.fdopen(file, "wb") as locked:
+            if fcntl is None or not _lock(file):
+                locked.close()  # Windows does not rename files that are open
+            try:
+                yield part
+                _rename(part, target, force=force)
+            finally:
+                part.unlink(missing_ok=True)
+
+
+def _rename(part: Path, target: Path, *, force: bool) -> None:
+    """Rename a file; without ``force`` only if the target does not exist."""
+    if force:
+        mode = _mode_of(target)
+        _check_not_protected(target, mode)
+        if mode is not None:
+            part.chmod(stat.S_IMODE(mode))
+        os.replace(part, target)
+        return
     try:
-        os.link(part, target)
-    except FileExistsError:
-        raise taken from None
-    except OSError:  # a file system without hard links: check just before the rename
-        if os.path.lexists(target):
-            raise taken from None
+        os.link(part, target)  # unlike a rename, never replaces a file
+    except OSError as error:  # it exists, or the file system has no hard links
+        if isinstance(error, FileExistsError) or os.path.lexists(target):
+            said = "was created by another program meanwhile: remove it or use --force"
+            raise WriteError(f"{target} {said}") from None
         os.rename(part, target)
 
 
-# Temporary files
-
-
-def part_path(target: Path) -> Path:
-    """Return the path of the unfinished target that this process writes."""
-    return target.with_name(f"{_stem(target.name)}{os.getpid()}.part")
-
-
 def _stem(name: str) -> str:
-    """Return the prefix of the names of a target's parts; long names are hashed."""
+    """Return how the names of a target's parts begin; a long name is hashed."""
     raw = name.encode("utf-8", "surrogatepass")  # a report may hold names that no file can have
     if len(raw) <= LONGEST:
         return f".{name}."
@@ -153,105 +148,32 @@ def _stem(name: str) -> str:
     return f".{sha256(raw).hexdigest()[:32]}."
 
 
-@contextmanager
-def _reserved_part(target: Path) -> Iterator[Path]:
-    remove_abandoned_parts([target])
-    part = part_path(target)
-    try:
-        file = os.open(part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
-    except FileExistsError:
-        raise WriteError(f"{target} is being written already: wait for it") from None
-    has_lock = take_lock(file) is not None
-    if not has_lock:
-        os.close(file)
-    try:
-        yield part
-    finally:
-        part.unlink(missing_ok=True)
-        if has_lock:
-            os.close(file)
-
-
-def remove_abandoned_parts(targets: Iterable[Path], pid: int | None = None) -> None:
-    """Remove unfinished parts of the targets that ended processes, or process ``pid``, left.
+def remove_abandoned_parts(targets: Iterable[Path]) -> None:
+    """Remove unfinished parts of the targets that killed processes left.
 
     A ``*`` in the name of a target stands for anything.
     """
     stems_in: dict[Path, set[str]] = {}
     for target in targets:
-        stems_in.setdefault(target.parent, set()).add(_stem(target.name))
-    for folder, stems in stems_in.items():
-        pattern = "|".join(re.escape(stem).replace(r"\*", ".*") for stem in stems)
-        is_one = re.compile(pattern, re.DOTALL).fullmatch
+        pattern = re.escape(_stem(target.name)).replace(r"\*", ".*")
+        stems_in.setdefault(target.parent, set()).add(pattern)
+    for folder, patterns in stems_in.items():
+        is_one = re.compile("|".join(patterns), re.DOTALL).fullmatch
         with suppress(OSError):
             for name in os.listdir(folder):
                 match = PART.fullmatch(name)
                 if match and is_one(match["stem"]):
-                    owner = int(match["pid"])
-                    if owner == pid or _is_abandoned(folder / name, owner):
-                        (folder / name).unlink(missing_ok=True)
+                    with suppress(OSError):  # another user's, or gone
+                        with (folder / name).open("rb+") as file:
+                            is_free = fcntl is None or _lock(file.fileno())
+                        if is_free:
+                            (folder / name).unlink()
 
 
-def _is_abandoned(path: Path, pid: int) -> bool:
-    """Return whether no process holds a part's lock; without locks, whether its process ended."""
-    try:
-        file = os.open(path, os.O_RDWR)
-    except OSError:  # another user's, or gone
-        return False
-    try:
-        taken = take_lock(file)
-    finally:
-        os.close(file)
-    return taken if taken is not None else not _is_running(pid)
-
-
-def take_lock(file: int) -> bool | None:
-    """Lock an open file until it is closed.
-
-    Return whether that worked, or None if the system or file system has no locks.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        return None
+def _lock(file: int) -> bool:
+    """Lock an open file until it is closed, and return whether that worked."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
+    except OSError:  # it is locked, or the file system has no locks
         return False
-    except OSError:  # a file system without locks
-        return None
     return True
-
-
-def _is_running(pid: int) -> bool:
-    if os.name == "nt":  # where open files cannot be removed
-        return False
-    try:
-        os.kill(pid, 0)
-    except OSError as error:
-        return not isinstance(error, ProcessLookupError)  # it may be another user's
-    with suppress(OSError):  # a zombie has ended
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    return True
-
-
-@contextmanager
-def spool_beside(part: Path) -> Iterator[IO[bytes]]:
-    """Open a temporary file without a name beside a file that is being written.
-
-    Where the system has no such files, ``remove_abandoned_parts`` recognises its name.
-    """
-    folder, name = str(part.parent), f"{part.name}."
-    with tempfile.SpooledTemporaryFile(SPOOL_BYTES, dir=folder, prefix=name) as spool:
-        yield spool
-
-
-def append_spool(waiting: IO[bytes], file: IO[bytes]) -> None:
-    """Copy the temporary file ``waiting`` to the end of ``file``."""
-    waiting.seek(0)
-    shutil.copyfileobj(waiting, file, SPOOL_BYTES)
-
-
-def little_endian(array: NDArray[Any]) -> bytes:
-    """Return the bytes of an array in little-endian order."""
-    return array.astype(array.dtype.newbyteorder("<"), copy=False).tobytes()

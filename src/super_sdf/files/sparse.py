@@ -1,4 +1,4 @@
-"""Refined fields as sparse ``.npz`` files: written slab by slab, read back by ``read_field``.
+"""Refined fields as sparse ``.npz`` files: written by ``write_field``, read back by ``read_field``.
 
 docs/reference/files.md describes the keys. Values are in world units and exact: as float32 if the
 spacing is a power of two, since the field's own are float32 in half voxels, else as float64.
@@ -8,121 +8,88 @@ from __future__ import annotations
 
 import math
 import zipfile
-from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
-from ..arrays import FloatArray, IntArray
-from ..errors import FileError, GridError, OptionError
-from .numpy_files import Member, open_archive
-from .output import append_spool, little_endian, spool_beside
-from .regular import check_regular_file
+from ..arrays import FloatArray
+from ..errors import FileError, GridError, OptionError, SuperSdfError
 from ..grid.field import Field
-from ..grid.planes import InputFile, SamplePlanes
+from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import check_fits
 from ..options import check_factor, check_path
 from ..refine.band import neighbour_table
-from ..surface.cap import find_border_inside
 from ..refine.field import FineField, SampleSpheres
 from ..refine.nodes import copies_agree, share_parts
+from ..surface.cap import find_border_inside
+from ..threads import check_fits
+from .regular import check_regular_file
 
 VERSION = 1
 CHUNK = 1 << 20  # values at a time
 LONGEST = 1 << 20  # samples along an axis
-# Small arrays first; the values, which are large, before the arrays that grow with them.
-HEAD = ("version", "shape", "factor", "spacing", "origin", "direction", "offset", "leaves")
-LISTS = ("voxels", "sample_voxels", "sample_distances", "border_inside")
-KEYS = (*HEAD, "values", *LISTS)
-NOT_FINITE = "not all values are finite"
+# Which kinds of numbers each array has, and its shape, where None is any length; that of the values
+# depends on the factor.
+ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    "version": ("iu", ()),
+    "shape": ("iu", (3,)),
+    "factor": ("iu", ()),
+    "spacing": ("f", (3,)),
+    "origin": ("f", (3,)),
+    "direction": ("f", (3, 3)),
+    "offset": ("f", ()),
+    "leaves": ("b", ()),
+    "values": ("f", (None, None, None, None)),
+    "voxels": ("i", (None, 3)),
+    "sample_voxels": ("i", (None, 3)),
+    "sample_distances": ("f", (None,)),
+    "border_inside": ("i", (None, 3)),
+}
 
 
-class SparseWriter:
-    """Writes a field slab by slab: blocks to the archive, voxels and samples to temporary files."""
-
-    def __init__(self, part: Path, shape: tuple[int, int, int], files: ExitStack) -> None:
-        self.archive = zipfile.ZipFile(part, "w")
-        files.callback(self._close)
-        self.lists = {name: files.enter_context(spool_beside(part)) for name in LISTS}
-        self.counts = dict.fromkeys(LISTS, 0)
-        self.values: IO[bytes] | None = None
-        self.types: dict[str, DTypeLike] = {}
-
-    def add(self, field: FineField) -> None:
-        """Write the own planes of a slab's field."""
-        if self.values is None:
-            self._begin(field)
-        assert self.values is not None
-        rows = field.own_rows
-        self._extend("voxels", field.voxel_ijk[rows])
-        step = max(CHUNK // len(field.blocks), 1)
-        for first in range(rows.start, rows.stop, step):
-            some = slice(first, min(first + step, rows.stop))
-            self.values.write(self._bytes("values", field.block_distances(some)))
-        self._add_samples(field)
-        if field.leaves:
-            self._extend("border_inside", find_border_inside(field, *field.planes))
-
-    def finish(self) -> None:
-        """Complete the archive with the arrays of which the length is known only now."""
-        if self.values is None:
-            return
-        self.values.close()
-        for name, spool in self.lists.items():
-            shape = (self.counts[name], *([3] if self.types[name] is np.int32 else []))
-            with self._open(name, shape, self.types[name]) as member:
-                append_spool(spool, member)
-        self.archive.close()
-
-    def _close(self) -> None:
-        with suppress(OSError, ValueError):
-            if self.values is not None:
-                self.values.close()
-        with suppress(OSError, ValueError):
-            self.archive.close()
-
-    def _begin(self, field: FineField) -> None:
-        grid, side = field.placed, field.factor + 1
-        # float32 is exact where world units only change exponents
-        is_power = math.frexp(grid.voxel_size)[0] == 0.5 and 1e-20 < grid.voxel_size < 1e20
-        exact = np.float32 if is_power else np.float64
-        self.types = {**dict.fromkeys(LISTS, np.int32), "values": exact, "sample_distances": exact}
-        head = (
-            *(VERSION, field.shape, field.factor),
-            *(grid.spacing, grid.origin, grid.direction, field.offset, field.leaves),
-        )
-        for name, value in zip(HEAD, head):
-            array = np.asarray(value)
-            with self._open(name, array.shape, array.dtype) as member:
-                member.write(little_endian(array))
-        self.values = self._open("values", (field.decoded_voxels, side, side, side), exact)
-
-    def _add_samples(self, field: FineField) -> None:
-        spheres = field.spheres
-        if spheres is None:
-            return
-        first, last = np.searchsorted(spheres.voxel_ijk[:, 0], field.planes)
-        self._extend("sample_voxels", spheres.voxel_ijk[first:last])
-        distances = field.in_world_units(spheres.distance[first:last])
-        self._extend("sample_distances", distances)
-
-    def _extend(self, name: str, rows: NDArray[Any]) -> None:
-        self.lists[name].write(self._bytes(name, rows))
-        self.counts[name] += len(rows)
-
-    def _bytes(self, name: str, array: NDArray[Any]) -> bytes:
-        return little_endian(array.astype(self.types[name], copy=False))
-
-    def _open(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> IO[bytes]:
-        member = self.archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True)
-        descr = np.dtype(dtype).newbyteorder("<").str
-        header = {"descr": descr, "fortran_order": False, "shape": tuple(map(int, shape))}
-        npy.write_array_header_1_0(member, header)
-        return member
+def write_sparse(field: FineField, path: Path) -> None:
+    """Write a field to an ``.npz`` file, its values block by block."""
+    grid, side, count = field.placed, field.factor + 1, len(field.voxel_ijk)
+    # float32 is exact where world units only change exponents
+    is_power = math.frexp(grid.voxel_size)[0] == 0.5 and 1e-20 < grid.voxel_size < 1e20
+    exact = np.dtype("<f4" if is_power else "<f8")
+    samples, distances = np.empty((0, 3), np.int32), np.empty(0)
+    if field.spheres is not None:
+        samples = field.spheres.voxel_ijk
+        distances = field.in_world_units(field.spheres.distance)
+    border = np.empty((0, 3), np.int32)
+    if field.leaves:
+        border = find_border_inside(field)
+    arrays: dict[str, Any] = {
+        "version": VERSION,
+        "shape": field.shape,
+        "factor": field.factor,
+        "spacing": grid.spacing,
+        "origin": grid.origin,
+        "direction": grid.direction,
+        "offset": field.offset,
+        "leaves": field.leaves,
+        "values": None,  # in chunks
+        "voxels": field.voxel_ijk,
+        "sample_voxels": samples,
+        "sample_distances": distances.astype(exact),
+        "border_inside": border,
+    }
+    header = {"descr": exact.str, "fortran_order": False, "shape": (count, side, side, side)}
+    step = max(CHUNK // side**3, 1)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                if array is not None:
+                    npy.write_array(member, np.asarray(array))
+                    continue
+                npy.write_array_header_1_0(member, header)
+                for first in range(0, count, step):
+                    blocks = field.block_distances(slice(first, min(first + step, count)))
+                    member.write(blocks.astype(exact).tobytes())
 
 
 class NoSamples(SamplePlanes):
@@ -162,130 +129,96 @@ def read_field(path: str | Path) -> FineField:
     path = check_path(path, "path")
     if path.suffix.lower() != ".npz":
         raise OptionError(f"{path} is no sparse field: give .npz")
-    file = InputFile.open(check_regular_file(path))
-    try:
-        with open_archive(path) as archive:
-            return _Reader(archive, str(path)).read()
-    finally:
-        file.check_unchanged()  # a change explains whatever else went wrong
+    arrays = _read_arrays(check_regular_file(path))
 
+    def no_field(why: str) -> FileError:
+        return FileError(f"{path} is no refined field: {why}")
 
-class _Reader:
-    """Reads the arrays of an archive and checks that they make a field."""
+    def damaged(key: str, why: str) -> FileError:
+        return FileError(f"{path}[{key}] is damaged: {why}")
 
-    def __init__(self, archive: zipfile.ZipFile, name: str) -> None:
-        self.archive, self.name = archive, name
-        self.members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
-
-    def read(self) -> FineField:
-        missing = [key for key in KEYS if key not in self.members]
-        if missing:
-            raise self._no_field(f"it has no key {missing[0]!r}")
-        version = int(self._array("version", "iu", ()))
-        if version != VERSION:
-            said = f"has format version {version}, this program reads {VERSION}"
-            raise FileError(f"{self.name} {said}: use a newer one")
-        shape = tuple(map(int, self._array("shape", "iu", (3,))))
-        if not 2 <= min(shape) <= max(shape) <= LONGEST:
-            raise self._no_field(f"its grid has the shape {shape}")
-        try:
-            factor, grid = check_factor(int(self._array("factor", "iu", ()))), self._grid(shape)
-        except (GridError, OptionError) as error:
-            raise self._no_field(str(error)) from None
-        voxels = self._voxels("voxels", shape)
-        if not len(voxels):
-            raise self._no_field("it has no blocks")
-        blocks = self._blocks(len(voxels), factor, grid)
-        parts = share_parts(neighbour_table(voxels, shape))
-        if not copies_agree(blocks, parts, factor):
-            raise self._damaged("values", "blocks differ at nodes that they share")
-        samples = self._voxels("sample_voxels", shape)
-        distance = self._array("sample_distances", "f", (len(samples),))
-        return FineField(
-            (shape[0], shape[1], shape[2]),
-            factor,
-            voxels,
-            blocks,
-            parts,
-            (0, shape[0]),
-            spheres=SampleSpheres(shape, samples, _in_half_voxels(distance, grid)),  # type: ignore[arg-type]
-            decoded_voxels=len(voxels),
-            grid=grid,
-            offset=float(self._array("offset", "f", ())),
-            leaves=bool(self._array("leaves", "b", ())),
-            border_inside=self._border_inside(voxels, shape),
-        )
-
-    def _border_inside(self, blocks: IntArray, shape: tuple[int, ...]) -> IntArray:
-        voxels = self._voxels("border_inside", shape)
-        at_border = ((voxels == 0) | (voxels == np.array(shape) - 1)).any(1)
-        numbers = (np.ravel_multi_index(tuple(ijk.T), shape) for ijk in (voxels, blocks))
-        if not at_border.all() or np.isin(*numbers).any():
-            raise self._damaged("border_inside", "not all are border voxels without a block")
-        return voxels
-
-    def _grid(self, shape: tuple[int, ...]) -> SdfGrid:
-        spacing, origin = (self._array(key, "f", (3,)) for key in ("spacing", "origin"))
-        direction, samples = self._array("direction", "f", (3, 3)), NoSamples(shape, self.name)
-        ends = -math.inf, math.inf
-        field = Field(on_lattice=True)  # it is on the lattice of the field already
-        return SdfGrid.trusted(
-            samples, spacing, origin, direction=direction, extremes=ends, field=field
-        )
-
-    def _voxels(self, key: str, shape: tuple[int, ...]) -> IntArray:
-        """Return voxels (n, 3), which must lie in the grid, all different, in C order."""
-        voxels = np.asarray(self._array(key, "i", (None, 3)), np.int64)
-        inside = ((voxels >= 0) & (voxels < shape)).all()
-        number = (voxels[:, 0] * shape[1] + voxels[:, 1]) * shape[2] + voxels[:, 2]
-        if not inside or (np.diff(number) <= 0).any():
-            raise self._damaged(key, "its voxels are not in order in the grid")
-        return np.ascontiguousarray(voxels, np.int32)
-
-    def _blocks(self, count: int, factor: int, grid: SdfGrid) -> FloatArray:
-        """Return the values (Q, D) in half voxels, read in pieces."""
-        member = self._open("values", "f", (count, *(factor + 1,) * 3))
-        nodes, dtype = (factor + 1) ** 3, member.header.dtype
-        check_fits(4 * nodes * count, f"{self.name}, as a field,", "read it on a larger machine")
-        blocks = np.empty((nodes, count), np.float32)
-        step = max(CHUNK // nodes, 1)
-        for first in range(0, count, step):
-            rows = slice(first, min(first + step, count))
-            data = member.read((rows.stop - first) * nodes * dtype.itemsize)
-            values = _in_half_voxels(np.frombuffer(data, dtype), grid)
-            blocks[:, rows] = values.reshape(-1, nodes).T
-        if not np.isfinite(blocks).all():
-            raise self._damaged("values", NOT_FINITE)
-        return blocks
-
-    def _no_field(self, why: str) -> FileError:
-        return FileError(f"{self.name} is no refined field: {why}")
-
-    def _damaged(self, key: str, why: str) -> FileError:
-        return FileError(f"{self.name}[{key}] is damaged: {why}")
-
-    def _array(self, key: str, kinds: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
-        """Return an array of one of some kinds and of a shape, in which None is any length."""
-        member = self._open(key, kinds, shape)
-        check_fits(member.header.size, f"{self.name}[{key}]", "read it on a larger machine")
-        array = member.array()
+    shape = tuple(map(int, arrays["shape"]))
+    if not 2 <= min(shape) <= max(shape) <= LONGEST:
+        raise no_field(f"its grid has the shape {shape}")
+    for key, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise self._damaged(key, NOT_FINITE)
-        return array
-
-    def _open(self, key: str, kinds: str, shape: tuple[int | None, ...]) -> Member:
-        """Return the member of a key, whose header must be as expected."""
-        name = f"{self.name}[{key}]"
-        member = Member(self.archive, self.members[key], name)
-        header = member.header
-        fits = len(header.shape) == len(shape) and all(
-            want in (None, have) for want, have in zip(shape, header.shape)
+            raise damaged(key, "not all values are finite")
+        if array.dtype.kind == "i" and array.ndim == 2:
+            number = array.astype(np.int64) @ (shape[1] * shape[2], shape[2], 1)
+            if (array < 0).any() or (array >= shape).any() or (np.diff(number) <= 0).any():
+                raise damaged(key, "its voxels are not in order in the grid")
+            arrays[key] = np.ascontiguousarray(array, np.int32)
+    try:
+        factor = check_factor(int(arrays["factor"]))
+        grid = SdfGrid.trusted(
+            NoSamples(shape, str(path)),
+            *(arrays["spacing"], arrays["origin"]),
+            direction=arrays["direction"],
+            extremes=(-math.inf, math.inf),
+            field=Field(on_lattice=True),  # it is on the lattice of the field already
         )
-        if not fits or header.dtype.kind not in kinds or header.fortran_order:
-            raise FileError(f"{name} is {header}: it belongs to no refined field")
-        if header.size != member.left:
-            raise self._damaged(key, f"its header promises {header}, but {member.left:,} follow")
-        return member
+    except (GridError, OptionError) as error:
+        raise no_field(str(error)) from None
+    voxels, values, border = (arrays[key] for key in ("voxels", "values", "border_inside"))
+    samples, distances = arrays["sample_voxels"], arrays["sample_distances"]
+    if not len(voxels):
+        raise no_field("it has no blocks")
+    for key, want in (
+        ("values", (len(voxels), *(factor + 1,) * 3)),
+        ("sample_distances", (len(samples),)),
+    ):
+        if arrays[key].shape != want:
+            raise damaged(key, f"it has the shape {arrays[key].shape}, not {want}")
+    half = _in_half_voxels(values.reshape(len(voxels), -1), grid)
+    blocks, parts = np.ascontiguousarray(half.T), share_parts(neighbour_table(voxels, shape))
+    if not copies_agree(blocks, parts, factor):
+        raise damaged("values", "blocks differ at nodes that they share")
+    at_border = ((border == 0) | (border == np.array(shape) - 1)).any(1)
+    numbers = (np.ravel_multi_index(tuple(ijk.T), shape) for ijk in (border, voxels))
+    if not at_border.all() or np.isin(*numbers).any():
+        raise damaged("border_inside", "not all are border voxels without a block")
+    return FineField(
+        (shape[0], shape[1], shape[2]),
+        factor,
+        voxels,
+        blocks,
+        parts,
+        spheres=SampleSpheres(shape, samples, _in_half_voxels(distances, grid)),  # type: ignore[arg-type]
+        grid=grid,
+        offset=float(arrays["offset"]),
+        leaves=bool(arrays["leaves"]),
+        border_inside=border,
+    )
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file by their keys, which have the kinds and shapes of ``ARRAYS``."""
+    arrays: dict[str, NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sizes = {i.filename.removesuffix(".npy"): i.file_size for i in archive.infolist()}
+            missing = [key for key in ARRAYS if key not in sizes]
+            if missing:
+                raise FileError(f"{path} is no refined field: it has no key {missing[0]!r}")
+            way_out = "read it on a larger machine"
+            check_fits(3 * sum(sizes[key] for key in ARRAYS), f"{path}, as a field,", way_out)
+            for key, (kinds, shape) in ARRAYS.items():
+                with archive.open(f"{key}.npy") as member:
+                    array = npy.read_array(member, allow_pickle=False)
+                if key == "version" and array != VERSION:
+                    said = f"has format version {array}, this program reads {VERSION}"
+                    raise FileError(f"{path} {said}: use a newer one")
+                is_like = all(want in (None, n) for want, n in zip(shape, array.shape))
+                if array.dtype.kind not in kinds or array.ndim != len(shape) or not is_like:
+                    said = f"{array.dtype} of shape {array.shape}"
+                    raise FileError(f"{path}[{key}] is {said}: it belongs to no refined field")
+                arrays[key] = array
+    except SuperSdfError:
+        raise
+    except Exception as error:  # zipfile and NumPy raise over ten kinds of error on damaged files
+        reason = str(error).splitlines() or [type(error).__name__]
+        raise FileError(f"{path} cannot be read as a refined field: {reason[0]}") from None
+    return arrays
 
 
 def _in_half_voxels(world: NDArray[Any], grid: SdfGrid) -> FloatArray:

@@ -1,14 +1,20 @@
-"""OpenVDB files: numbers of the format, and writing a level set, as ``readers.vdb`` describes it.
+"""OpenVDB files: numbers of the format, and refined fields as level sets; see ``readers.vdb``.
 
-Of a node the active values are stored, and the signs of the others. Nothing is packed: zlib would
-take long and save about a fifth. OpenVDB 5 and later read the file.
+Node (i, j, k) of the fine lattice is voxel (i, j, k). Active are the voxels nearer to the surface
+than three spacings of the lattice. All others have the background, which is those three spacings,
+or minus the background inside. A level set is closed: a solid that leaves the lattice is cut off at
+its border, so no node is deeper inside than the border is away, and voxels beyond are outside.
+
+Of a node of the tree the active values are stored, and the signs of the others. Nothing is packed:
+zlib would take long and save about a fifth. OpenVDB 5 and later read the file.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import IO, Any
 from uuid import UUID
 
@@ -16,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray
+from ..errors import NoSurfaceError, OptionError
 from ..grid.sdf_grid import SdfGrid
-from .output import little_endian
+from ..refine.field import FineField, FineLattice, fine_grid
 
 MAGIC = 0x56444220
 ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
@@ -30,6 +37,8 @@ OUTSIDE, INSIDE, MIXED = 0, 1, 2  # a cube of voxels: all background, all minus 
 WIDTHS = EDGES[0] // EDGES[1], EDGES[1] // LEAF  # children along an edge of the two inner nodes
 MASK_BYTES = LEAF**3 // 8
 VERSION, LIBRARY = 224, (5, 0)  # of the format, and of the first library with it
+HALF_WIDTH = 3  # voxels of the narrow band to either side of the surface; OpenVDB's tools want 3
+SIZES = 2e-5, 1e30  # of a voxel: OpenVDB refuses transforms with a determinant below 3e-15
 
 Sides = NDArray[np.uint8]  # what each cube is, (x, y, z)
 
@@ -41,31 +50,94 @@ class LevelSet:
     grid: SdfGrid  # where the voxels are
     background: np.float32
     sides: Sides  # of the cubes of 8^3 voxels; the first along each axis is that before voxel 0
-    leaf: Callable[[int], bytes]  # returns the leaf of a mixed cube, which are numbered in C order
+    leaves: list[bytes]  # of the mixed cubes, in C order
     active: int  # voxels
     box: tuple[NDArray[np.int64], NDArray[np.int64]]  # first and last of the active voxels
     key: bytes  # 16 bytes that other files do not have
 
-    def metadata(self) -> bytes:
-        """Return the metadata, by the names that OpenVDB gives them."""
-        entries = (
-            ("class", "string", b"level set"),
-            ("file_bbox_max", "vec3i", struct.pack("<3i", *self.box[1])),
-            ("file_bbox_min", "vec3i", struct.pack("<3i", *self.box[0])),
-            ("file_voxel_count", "int64", struct.pack("<q", self.active)),
-            ("is_saved_as_half_float", "bool", b"\0"),
-            ("name", "string", b"surface"),
+
+def write_level_set(field: FineField, path: Path) -> None:
+    """Write a refined field as a file with one level set, ``surface``.
+
+    OptionError if OpenVDB does not take voxels of this size; NoSurfaceError.
+    """
+    from hashlib import blake2b  # loads OpenSSL, and few fields are written
+
+    grid = fine_grid(field)
+    if not SIZES[0] <= grid.voxel_size <= SIZES[1]:
+        raise OptionError(
+            f"the voxels of the field are {grid.voxel_size:.3g}, and OpenVDB takes {SIZES[0]:g} to "
+            f"{SIZES[1]:g}: multiply distances, spacing and origin of the grid, or write .npz"
         )
-        data = [_text(name) + _text(kind) + _sized(value) for name, kind, value in entries]
-        return struct.pack("<I", len(data)) + b"".join(data)
+    background = np.float32(HALF_WIDTH * grid.voxel_size)
+    digest = blake2b(repr((grid.spacing, grid.origin, grid.direction)).encode(), digest_size=16)
+    sides: list[Sides] = []
+    leaves: list[bytes] = []
+    count, low, high = 0, np.full(3, 1 << 31), np.full(3, -LEAF)
+    for values in _slabs(field, background):
+        cubes = values.reshape(LEAF, values.shape[1] // LEAF, LEAF, -1, LEAF)
+        side = np.full(cubes.shape[1:4:2], MIXED, np.uint8)
+        side[cubes.min((0, 2, 4)) >= background] = OUTSIDE
+        side[cubes.max((0, 2, 4)) <= -background] = INSIDE
+        mixed = np.argwhere(side == MIXED)
+        inner = cubes.transpose(1, 3, 0, 2, 4)[side == MIXED]  # (n, 8, 8, 8)
+        active = np.abs(inner) < background
+        first = LEAF * (np.insert(mixed, 0, len(sides), axis=1) - 1)  # voxel of each leaf
+        for axis, across in enumerate(((2, 3), (1, 3), (1, 2))):
+            at = (first[:, axis, None] + np.arange(LEAF))[active.any(across)]
+            low[axis], high[axis] = at.min(initial=low[axis]), at.max(initial=high[axis])
+        count += int(np.count_nonzero(active))
+        digest.update(inner.astype("<f4").tobytes())
+        flat = inner.reshape(-1, LEAF**3), active.reshape(-1, LEAF**3)
+        leaves += map(leaf_bytes, *flat)
+        sides.append(side)
+    if not count:
+        raise NoSurfaceError("the field has no surface: there is no level set to write")
+    box = low, high
+    tree = LevelSet(grid, background, np.stack(sides), leaves, count, box, digest.digest())
+    with path.open("wb") as file:
+        write_tree(file, tree)
+
+
+def _slabs(field: FineField, background: np.float32) -> Iterator[FloatArray]:
+    """Yield eight planes of voxels after the other, (8, y, z), from voxel (-8, -8, -8) on.
+
+    Beyond the lattice are the distances from a surface of which its border is the nearest part.
+    """
+    lattice = FineLattice(field)
+    # how deep inside nodes may be, by their steps from the border; farther in, all is cut off
+    steps = np.array([*range(HALF_WIDTH), np.inf], np.float32)
+    least = 0 - steps * background / HALF_WIDTH
+    depths, beyond, pads = [], [], []
+    for n in lattice.shape:
+        end = LEAF * -(-(n + HALF_WIDTH - 1) // LEAF)  # what is beyond is all background
+        at = np.arange(-LEAF, end)
+        steps = np.maximum(np.maximum(-at, at - n + 1), 0)
+        beyond.append(np.where(steps < HALF_WIDTH, steps * (background / HALF_WIDTH), np.inf))
+        inner = np.minimum(np.arange(n), n - 1 - np.arange(n))
+        depths.append(np.minimum(inner, HALF_WIDTH).astype(np.uint8))
+        pads.append((LEAF, end - n))
+    depth_across = np.minimum(depths[1][:, None], depths[2])
+    beyond_across = np.hypot(beyond[1][:, None], beyond[2])
+    count = lattice.shape[0]
+    for first in range(-LEAF, count + pads[0][1], LEAF):
+        x = np.arange(first, first + LEAF).clip(0, count - 1)
+        planes = lattice[int(x[0]) : int(x[-1]) + 1]
+        depth = depths[0][x[0] : x[-1] + 1, None, None]
+        planes = np.maximum(planes, least[np.minimum(depth, depth_across)])
+        values = np.pad(planes[x - x[0]], [(0, 0), *pads[1:]], mode="edge")
+        away = np.hypot(beyond[0][first + LEAF : first + 2 * LEAF, None, None], beyond_across)
+        np.hypot(values, away.astype(np.float32), out=values, where=away > 0)
+        yield values
 
 
 def leaf_bytes(values: FloatArray, active: BoolArray) -> bytes:
     """Return a leaf of 512 values, those that are not ``active`` the background or minus it."""
-    return _mask(active) + _inactive(values > 0, ~active) + little_endian(values[active])
+    stored = values[active].astype("<f4", copy=False).tobytes()
+    return _mask(active) + _inactive(values > 0, ~active) + stored
 
 
-def write_level_set(file: IO[bytes], tree: LevelSet) -> None:
+def write_tree(file: IO[bytes], tree: LevelSet) -> None:
     """Write a file with one grid, ``surface``."""
     file.write(struct.pack("<qIII?", MAGIC, VERSION, *LIBRARY, True))
     file.write(str(UUID(bytes=tree.key)).encode() + struct.pack("<II", 0, 1))
@@ -73,11 +145,20 @@ def write_level_set(file: IO[bytes], tree: LevelSet) -> None:
     places = file.tell()
     start = places + struct.calcsize("<qqq")
     file.write(bytes(start - places))  # they follow
-    file.write(struct.pack("<I", ACTIVE_MASK) + tree.metadata() + _transform(tree.grid))
+    entries = (
+        ("class", "string", b"level set"),
+        ("file_bbox_max", "vec3i", struct.pack("<3i", *tree.box[1])),
+        ("file_bbox_min", "vec3i", struct.pack("<3i", *tree.box[0])),
+        ("file_voxel_count", "int64", struct.pack("<q", tree.active)),
+        ("is_saved_as_half_float", "bool", b"\0"),
+        ("name", "string", b"surface"),
+    )
+    file.write(struct.pack("<II", ACTIVE_MASK, len(entries)))
+    file.writelines(_text(name) + _text(kind) + _sized(value) for name, kind, value in entries)
+    file.write(_transform(tree.grid))
     leaves = _write_topology(file, tree)
     values = file.tell()
-    for leaf in leaves:
-        file.write(tree.leaf(leaf))
+    file.writelines(tree.leaves[leaf] for leaf in leaves)
     end = file.tell()
     file.seek(places)
     file.write(struct.pack("<qqq", start, values, end))
@@ -99,7 +180,7 @@ def _write_topology(file: IO[bytes], tree: LevelSet) -> list[int]:
             node = _part(leaves, within, WIDTHS[1])
             held = _part(numbers, within, WIDTHS[1])[node == MIXED].tolist()
             file.write(_node(node))
-            file.write(b"".join(tree.leaf(leaf)[:MASK_BYTES] for leaf in held))
+            file.write(b"".join(tree.leaves[leaf][:MASK_BYTES] for leaf in held))
             order += held
     return order
 
@@ -110,11 +191,10 @@ def _transform(grid: SdfGrid) -> bytes:
     if not grid.is_straight:
         matrix = np.eye(4)
         matrix[:3, :3], matrix[3, :3] = (np.array(grid.direction) * steps).T, origin
-        return _text("AffineMap") + little_endian(matrix)
+        return _text("AffineMap") + matrix.astype("<f8").tobytes()
     name = "ScaleTranslateMap" if np.ptp(steps) else "UniformScaleTranslateMap"
-    return _text(name) + little_endian(
-        np.array([origin, steps, steps, 1 / steps, 1 / steps**2, 0.5 / steps])
-    )
+    numbers = np.array([origin, steps, steps, 1 / steps, 1 / steps**2, 0.5 / steps], "<f8")
+    return _text(name) + numbers.tobytes()
 
 
 def _text(words: str) -> bytes:

@@ -59,23 +59,18 @@ class DistanceFunction:
 
     def __call__(self, points: Points) -> Numbers:
         """Return the distances at points (n, 3), (n,)."""
-        self.evaluations += len(points)
-        starts = range(0, len(points), BATCH)
-        parts = [self._batch(points[start : start + BATCH]) for start in starts]
-        return np.concatenate([np.zeros(0), *parts])
-
-    def _batch(self, points: Points) -> Numbers:
-        values = as_numbers(self.function(points))
-        if values.size != len(points):
-            raise OptionTypeError(
-                f"the function returns an array of shape {values.shape} for {len(points)} points: "
-                "return one number for each"
-            )
-        return values.reshape(-1)
-
-    def _on(self, low: Points, step: Points) -> Callable[[NDArray[Any]], Numbers]:
-        """Return the values at samples (n, 3) of a lattice."""
-        return lambda indices: self(low + step * indices)
+        found = [np.zeros(0)]
+        for start in range(0, len(points), BATCH):
+            batch = points[start : start + BATCH]
+            self.evaluations += len(batch)
+            values = as_numbers(self.function(batch))
+            if values.size != len(batch):
+                raise OptionTypeError(
+                    f"the function returns an array of shape {values.shape} for {len(batch)} "
+                    "points: return one number for each"
+                )
+            found.append(values.reshape(-1))
+        return np.concatenate(found)
 
     def sample(self, bounds: ArrayLike, spacing: ArrayLike, reach: float | None = None) -> SdfGrid:
         """Return the samples on a lattice that covers a box. The surface is where they are 0.
@@ -105,11 +100,27 @@ class DistanceFunction:
         shape = np.ceil((high - low) / step - 1e-9).astype(np.int64) + 1
         if np.prod(shape.astype(float)) > MOST_SAMPLES:
             raise OptionError(f"spacing is {seen(spacing)}: the box takes more than 2^31 samples")
-        reach = REACH * float(step.max()) if reach is None else check_reach(reach)
-        samples, cut = sample_near(self._on(low, step), tuple(shape), step, reach)
+        reach = REACH * float(step.max()) if reach is None else reach
+        if not isinstance(reach, Real) or not reach > 0:
+            raise OptionError(f"reach is {seen(reach)}: give a number greater than 0, or infinity")
+
+        def at(indices: NDArray[Any]) -> Numbers:
+            """Return the values at samples (n, 3) of the lattice."""
+            return self(low + step * indices)
+
+        samples, cut = sample_near(at, tuple(shape), step, float(reach))
         if not ((samples < 0).any() and (samples > 0).any()):  # it may be steeper than seen
-            samples, cut = sample_near(self._on(low, step), tuple(shape), step, np.inf)
-        _check_sides(samples)
+            samples, cut = sample_near(at, tuple(shape), step, np.inf)
+        known = samples[np.isfinite(samples)]
+        if not len(known):
+            raise GridError("the function has no finite value at any sample: give other bounds")
+        least, most = float(known.min()), float(known.max())
+        if not least < 0 < most:
+            raise GridError(
+                f"the function goes from {least:.6g} to {most:.6g} at {len(known):,} samples, and "
+                "its surface is where it is 0: subtract a level, or give a finer spacing or other "
+                "bounds"
+            )
         np.clip(samples, -cut, cut, out=samples)
         make = partial(make_grid, samples, spacing=spacing, origin=low)
         try:
@@ -118,26 +129,6 @@ class DistanceFunction:
             with suppress(GridError):
                 return make(field=SCALED)
             raise
-
-
-def check_reach(reach: Any) -> float:
-    """Return a distance; OptionError unless it is a number above 0."""
-    if not isinstance(reach, Real) or not float(reach) > 0:
-        raise OptionError(f"reach is {seen(reach)}: give a number greater than 0, or infinity")
-    return float(reach)
-
-
-def _check_sides(samples: NDArray[np.float32]) -> None:
-    """Raise GridError unless some samples are below 0 and some above."""
-    known = samples[np.isfinite(samples)]
-    if not len(known):
-        raise GridError("the function has no finite value at any sample: give other bounds")
-    low, high = float(known.min()), float(known.max())
-    if not low < 0 < high:
-        raise GridError(
-            f"the function goes from {low:.6g} to {high:.6g} at {len(known):,} samples, and its "
-            "surface is where it is 0: subtract a level, or give a finer spacing or other bounds"
-        )
 
 
 Function: TypeAlias = DistanceFunction | Callable[[Points], Any]

@@ -4,9 +4,8 @@
 >>> image = pyvista.read("field.vti")                             # doctest: +SKIP
 >>> image.super_sdf.contour(factor=4).plot()                      # doctest: +SKIP
 
-PyVista imports this module when ``super_sdf`` is first used of a dataset, since the package has the
-entry point ``pyvista.accessors``; ``import super_sdf.functions.pyvista`` does so at once. PyVista 0.48 or
-later is needed, and is not imported by ``import super_sdf``.
+PyVista, 0.48 or later, imports this module when ``super_sdf`` is first used of a dataset: it is an
+entry point ``pyvista.accessors`` of the package.
 """
 
 from __future__ import annotations
@@ -16,12 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import pyvista
 
-from ..errors import FileError
+from ..errors import FileError, check_modules, how_to_install
 from ..files.grids import grid_from_image
 from ..grid.sdf_grid import SdfGrid
-from ..machine.extras import check_modules, how_to_install
 from ..network.decoder import Decoder
-from ..options import DEFAULT_MESHER, ConvertOptions, MesherName, Quality, Values
+from ..options import DEFAULT_MESHER, Options, MesherName, Quality, Values
 from ..pipeline import reconstruct
 from ..progress import Progress
 
@@ -87,20 +85,14 @@ class ImageAccessor:
 
         Parameters
         ----------
-        factor, offset, mesher, max_memory, progress
+        factor, quality, network, offset, cap, mesher, max_memory, progress
             See ``reconstruct``.
         scalars, inside, field, label, level, scale
             See ``grid``.
-        quality : str or path, optional
-            "fast", "base" (default) or "best", or an ONNX file; see ``load_network``.
-        network : Network, optional
-            From ``load_network``, to load it only once; instead of ``quality``.
         residuals : bool
             Also return the array "residual" of the points, float32: how far the surface is from
             touching the balls of the nearest samples, in voxels of the image, negative where it
             pierces them, NaN where no exact sample is near. Needs the extra report.
-        cap : bool
-            Close the surface along the border of the image where the solid runs out of it.
 
         Returns
         -------
@@ -131,7 +123,7 @@ class ImageAccessor:
         if residuals:
             from ..check.check import check_mesh
 
-            options = ConvertOptions(offset=offset, max_memory=max_memory)
+            options = Options(offset=offset, max_memory=max_memory)
             found = check_mesh(mesh, grid, options, intersections=False)
             surface.point_data["residual"] = found.residuals_at(found.mesh.vertices)
         return surface

@@ -17,14 +17,13 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray
+from ..arrays import BoolArray, Numbers, Vectors, cross, dot, length, sums_at, unit
 from ..errors import OptionError
-from .function import DistanceFunction
 from ..grid.sdf_grid import SdfGrid
-from ..surface.mesh import Mesh
 from ..options import EXACT
-from ..surface.sharp.patches import Numbers, Vectors, cross, dot, length, sums_at, unit
-from ..surface.sharp.triangle_pairs import intersecting, overlapping_boxes
+from ..surface.mesh import Mesh
+from ..surface.sharp.folds import intersecting, overlapping_boxes
+from .function import DistanceFunction
 
 Value: TypeAlias = Callable[[Vectors], Numbers]
 
@@ -67,7 +66,9 @@ def put_on_zero(
         return ((middle + fine * points).astype(kind) - middle) / fine
 
     start = (mesh.vertices - middle) / fine
-    free = _is_within(grid, mesh.vertices, REACH / factor)
+    index, last = grid.to_index(mesh.vertices), np.array(grid.shape) - 0.5
+    margin = REACH / factor  # from the border of the grid, in spacings
+    free = ((index > margin - 0.5) & (index < last - margin)).all(1)
     with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
         points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.kind == EXACT)
         points = put_on_edges(value, points, mesh.faces, free)
@@ -115,14 +116,6 @@ def put_on_surface(
     reached = np.abs(off) <= REACHED * np.abs(before)
     points[rows[reached]] = found[reached]
     return points
-
-
-def _is_within(grid: SdfGrid, points: NDArray[Any], margin: float) -> BoolArray:
-    """Return which points, (n,), are this far inside the grid's border, in spacings."""
-    index = grid.to_index(points)
-    last = np.array(grid.shape) - 0.5
-    within: BoolArray = np.all((index > margin - 0.5) & (index < last - margin), axis=1)
-    return within
 
 
 def step_along(

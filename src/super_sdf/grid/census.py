@@ -221,12 +221,8 @@ def not_finite(values: SampleArray) -> GridError:
 
 def _small(samples: SampleArray) -> NDArray[Any] | None:
     """Return the samples of a small grid that is read here, None of others."""
-    root: Any = samples
     size = np.prod(samples.shape, dtype=float) * samples.dtype.itemsize
-    while isinstance(getattr(root, "source", None), np.ndarray | SamplePlanes):
-        root = root.source
-    is_read_here = isinstance(root, np.ndarray) or type(root).over is SamplePlanes.over
-    return np.asarray(samples[0 : len(samples)]) if is_read_here and size <= KEPT_BYTES else None
+    return np.asarray(samples[0 : len(samples)]) if size <= KEPT_BYTES else None
 
 
 def _are_layers(values: SampleArray) -> bool:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, Triple
 from ..errors import GridError
-from ..network.neighbourhood import NEIGHBOURHOOD
+from ..arrays import NEIGHBOURHOOD
 from .placement import EQUAL_SPACING
 from .planes import SampleArray, SamplePlanes
 from .sdf_grid import SdfGrid, with_fields
@@ -74,7 +74,12 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         f"the spacing differs between axes: the values are resampled along {coarser} to "
         f"{grid.voxel_size:.6g}, the finest, to {' x '.join(map(str, samples.shape))} samples"
     )
-    return with_fields(grid, samples=samples, spacing=spacing, notes=(*grid.notes, note))
+    known = [np.ones(count, bool) for count in samples.shape]
+    part = samples
+    while isinstance(part, Resampled):
+        known[part.axis], part = part.on_sample, part.source
+    more = {"notes": (*grid.notes, note), "on_sample": tuple(known)}
+    return with_fields(grid, samples=samples, spacing=spacing, **more)
 
 
 def check_has_offsets(grid: SdfGrid, offset: float) -> None:
@@ -91,19 +96,18 @@ def check_has_offsets(grid: SdfGrid, offset: float) -> None:
 
 def sampled_places(grid: SdfGrid) -> NDArray[np.intp]:
     """Return the places of ``NEIGHBOURHOOD`` that hold samples, too: across resampled axes."""
-    samples, across = grid.samples, np.ones(27, bool)
-    while isinstance(samples, Resampled):
-        across &= NEIGHBOURHOOD[:, samples.axis] == 0
-        samples = samples.source
+    across = np.ones(27, bool)
+    for axis, known in enumerate(grid.on_sample or ()):
+        if not known.all():
+            across &= NEIGHBOURHOOD[:, axis] == 0
     return np.flatnonzero(across)
 
 
 def on_samples(grid: SdfGrid, voxel_ijk: NDArray[np.int32]) -> BoolArray:
     """Return which values of a cubic grid, at (n, 3) indices, are samples, not interpolated."""
-    known, samples = np.ones(len(voxel_ijk), bool), grid.samples
-    while isinstance(samples, Resampled):
-        known &= samples.on_sample[voxel_ijk[:, samples.axis]]
-        samples = samples.source
+    known = np.ones(len(voxel_ijk), bool)
+    for axis, sampled in enumerate(grid.on_sample or ()):
+        known &= sampled[voxel_ijk[:, axis]]
     return known
 
 

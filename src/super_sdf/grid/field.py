@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import BoolArray, Triple
-from ..options import EXACT, ReadOptions
+from ..options import EXACT, Options
 from .census import BESIDE, Census, Extremes, Looked
 from .placement import check_spacing, steps_of
 from .planes import SampleArray, changed
@@ -100,7 +100,7 @@ class Case:
 
     samples: SampleArray
     census: Census
-    wanted: ReadOptions
+    wanted: Options
     spacing: Triple | None
     notes: list[str]
 

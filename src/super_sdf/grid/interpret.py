@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
 from ..errors import GridError
-from ..options import AUTO, EXACT, MASK, NOISY, SCALED, ReadOptions
+from ..options import AUTO, EXACT, MASK, NOISY, SCALED, Options
 from . import distances
 from .census import Census, Looked, not_finite
 from .derived import extremes_of_masks, mask_planes
@@ -33,7 +33,7 @@ STEP, STEP_TAIL = 0.85, 0.05
 
 
 def interpret(
-    samples: SampleArray, wanted: ReadOptions, spacing: ArrayLike | None
+    samples: SampleArray, wanted: Options, spacing: ArrayLike | None
 ) -> tuple[Interpreted, list[str]]:
     """Return distances for the values of a grid, and sentences on what was inferred."""
     steps = None if spacing is None else check_spacing(spacing)
@@ -53,7 +53,7 @@ def interpret(
 
 
 def _of_numbers(
-    given: SampleArray, wanted: ReadOptions, spacing: Triple | None, notes: list[str]
+    given: SampleArray, wanted: Options, spacing: Triple | None, notes: list[str]
 ) -> Interpreted:
     samples = given
     if wanted.level is not None:
@@ -82,7 +82,7 @@ def _of_numbers(
     return taken if unseen is None else taken.with_field(unseen=unseen)
 
 
-def _above_is_inside(wanted: ReadOptions) -> ReadOptions:
+def _above_is_inside(wanted: Options) -> Options:
     return replace(wanted, inside="positive") if wanted.inside == AUTO else wanted
 
 

@@ -14,7 +14,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..network.neighbourhood import CORNERS
+from ..arrays import CORNERS
 
 STRIDE = 8  # spacings along the largest cells; a power of two
 AT_ONCE = 1 << 18  # samples

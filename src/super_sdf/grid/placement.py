@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple, without_device
 from ..errors import GridError, seen
-from ..machine.memory import check_fits
-from .planes import SampleArray, SamplePlanes
+from ..threads import check_fits
+from .planes import LazyPlanes, SampleArray, SamplePlanes
 
 # Spacings that differ by less than this ratio count as equal. Coarser axes are resampled to the
 # finest spacing, so a large ratio makes many samples of few.
@@ -220,9 +220,11 @@ def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
 
 
 def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
-    """Return samples as an array; ``SamplePlanes`` are returned as they are."""
+    """Return samples as an array; those that are read by slices are not loaded."""
     if isinstance(values, SamplePlanes):
         return values
+    if hasattr(values, "chunks") and isinstance(getattr(values, "dtype", None), np.dtype):
+        return LazyPlanes(values)  # of h5py, Zarr or Dask
     try:
         samples = np.asanyarray(without_device(values))
     except (TypeError, ValueError, RuntimeError):  # ragged lists

@@ -1,102 +1,31 @@
-"""Arrays in files, read plane by plane.
-
-The files are not memory-mapped: mapped pages count as memory of this process, and if another
-process truncates the file, reading beyond its new end kills this one. Here, data that changed since
-the file was opened is an error.
-"""
+"""Arrays of samples whose planes are read or made when they are needed."""
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property, partial
-from io import FileIO
+from functools import cached_property
 from math import prod
-from pathlib import Path
-from threading import Lock
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import FloatArray
-from ..errors import FileError, GridError, OutOfMemoryError
-from ..machine.memory import advised, check_fits, held_memory, in_words
+from ..errors import GridError
+from ..threads import check_fits
 
 FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 LEAST_AT_ONCE = 4  # planes
 WORKING_BYTES = 1 << 26  # taken at a time when planes are made of others
-LOOKED_AT, LOOKING_BYTES = 12, 40  # planes, and bytes per sample of one, to look at the samples
 EVENLY = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: its multiples, modulo 2^64
 
 Result = TypeVar("Result")
+Index: TypeAlias = Sequence[int] | NDArray[Any]
+"""One index per axis."""
 Ranges: TypeAlias = Sequence[tuple[Any, ...]]
 """Ranges of planes: the first, that after the last, and what else a function gets."""
-
-
-class InputFile:
-    """A file that any thread may read at any offset; it must not change while it is open.
-
-    ``name`` is that in messages, ``size`` its size in bytes when it was opened.
-    """
-
-    def __init__(self, file: FileIO, name: str) -> None:
-        self.file, self.name = file, name
-        self.state = self._stat()
-        self.size = self.state[0]
-        self._lock = Lock()
-
-    @classmethod
-    def open(cls, path: Path) -> InputFile:
-        """Open a file by its path; FileError if that fails."""
-        try:
-            return cls(FileIO(str(path)), str(path))
-        except OSError as error:
-            raise FileError(f"{path} cannot be read: {error.strerror or error}") from None
-
-    def __del__(self) -> None:
-        if hasattr(self, "file"):
-            self.file.close()
-
-    def _stat(self) -> tuple[int, int]:
-        status = os.fstat(self.file.fileno())
-        return status.st_size, status.st_mtime_ns
-
-    def check_unchanged(self) -> None:
-        """Raise FileError if the file was written to since it was opened."""
-        if self._stat() != self.state:
-            raise FileError(f"{self.name} changed while it was read: read it when it is complete")
-
-    def read_into(self, out: NDArray[Any], offset: int) -> None:
-        """Fill a contiguous array with the bytes from ``offset`` on; FileError if that fails."""
-        view = out.view(np.uint8).reshape(-1).data
-        while view:
-            count = self._read_some(view, offset)
-            if not count:
-                break
-            view, offset = view[count:], offset + count
-        self.check_unchanged()
-        if view:
-            raise FileError(f"{self.name} ends {len(view):,} bytes too early")
-
-    def _read_some(self, view: memoryview, offset: int) -> int:
-        """Read at least one byte unless the file ends; return the number of bytes read."""
-        try:
-            if hasattr(os, "preadv"):  # needs no file position, which forked processes share
-                return os.preadv(self.file.fileno(), [view], offset)
-            with self._lock:
-                self.file.seek(offset)
-                return self.file.readinto(view) or 0
-        except OSError as error:
-            raise FileError(f"{self.name} cannot be read: {error.strerror or error}") from None
-
-    def read(self, offset: int, count: int) -> NDArray[np.uint8]:
-        """Return ``count`` bytes from ``offset`` on, or fewer at the end of the file."""
-        out = np.empty(max(min(count, self.size - offset), 0), np.uint8)
-        self.read_into(out, offset)
-        return out
 
 
 class SamplePlanes(ABC):
@@ -106,20 +35,24 @@ class SamplePlanes(ABC):
     """
 
     ndim = 3
-    travels = False  # whether another process can read the samples for itself
-    beside = 0  # planes to either side on which those that are made depend
+    beside = 0  # planes, and rows, to either side on which those that are made depend
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
-    name: str
+    name: str = "the grid"
 
     @abstractmethod
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
 
+    def crop(self, low: Index, high: Index) -> SampleArray:
+        """Return the samples from index ``low`` to before ``high``, read when they are needed."""
+        return CroppedPlanes(self, low, high)
+
     @property
-    def plane_bytes(self) -> int:
-        """Bytes of a plane."""
-        return self.shape[1] * self.shape[2] * self.dtype.itemsize
+    def block(self) -> int:
+        """Planes that are best made at a time when iterating over all."""
+        plane = self.shape[1] * self.shape[2] * self.dtype.itemsize
+        return max(BLOCK_BYTES // plane, 2 * self.beside, 1)
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -133,39 +66,9 @@ class SamplePlanes(ABC):
         plane: NDArray[Any] = self.read(number, number + 1)[0]
         return plane
 
-    @property
-    def block(self) -> int:
-        """Planes that are made at a time when iterating over all."""
-        return max(BLOCK_BYTES // self.plane_bytes, 2 * self.beside, 1)
-
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        for first in range(0, len(self), self.block):
-            yield from self.read(first, min(first + self.block, len(self)))
-
-    def over(
-        self, samples: SamplePlanes, work: Callable[..., Result], ranges: Ranges
-    ) -> Iterator[Result]:
-        """Yield what a function makes of ranges of ``samples``, which are made of these.
-
-        Planes that a range shares with the one before are not read again; they are valid during the
-        call. Samples of which workers read the planes have their own way.
-        """
-        held = max((last - first for first, last, *_ in ranges), default=0)
-        planes = np.empty((held, *samples.shape[1:]), samples.dtype)
-        start = end = 0  # of the planes that are held
-        for first, last, *more in ranges:
-            kept = end - first if start <= first < end else 0
-            if kept and first > start:
-                planes[:kept] = planes[first - start : end - start]
-            for low in range(first + kept, last, samples.block):  # which stay in the cache
-                high = min(low + samples.block, last)
-                planes[low - first : high - first] = samples[low:high]
-            start, end = first, max(last, first + kept)
-            yield work(planes[: last - first], *more)
-
-    def working_bytes(self, planes: int) -> int:
-        """Return about how much memory making that many planes takes."""
-        return planes * self.plane_bytes
+        for first, last in in_blocks(self):
+            yield from self.read(first, last)
 
     @cached_property
     def loaded(self) -> NDArray[Any]:
@@ -182,49 +85,170 @@ class SamplePlanes(ABC):
         return np.asarray, (self.loaded,)
 
 
-class PlaneFile(SamplePlanes):
-    """A 3D array in a file from byte ``offset`` on; if ``swapped``, it is (nx, nz, ny) there."""
+SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
+"""An array of samples in memory, or one whose planes are read or made when they are needed."""
+
+
+class LazyPlanes(SamplePlanes):
+    """An array of h5py, Zarr, Dask or the like, which is read by slices."""
+
+    def __init__(self, source: Any) -> None:
+        self.source, self.shape, self.dtype = source, tuple(source.shape), np.dtype(source.dtype)
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive)."""
+        return np.asarray(self.source[first:last])
+
+    def crop(self, low: Index, high: Index) -> SampleArray:
+        """Return the samples in a box, which alone is read."""
+        return np.asarray(self.source[_box(low, high)])
+
+
+class CroppedPlanes(SamplePlanes):
+    """The samples of another array in a box."""
+
+    def __init__(self, source: SamplePlanes, low: Index, high: Index) -> None:
+        self.source, self.box = source, _box(low, high)
+        self.shape, self.dtype = tuple(s.stop - s.start for s in self.box), source.dtype
+        self.beside = source.beside
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive)."""
+        start = self.box[0].start
+        return self.source.read(start + first, start + last)[:, self.box[1], self.box[2]]
+
+
+class DerivedPlanes(SamplePlanes):
+    """Planes that are made of those of another array, and of some beside them.
+
+    ``make`` takes some planes of ``source`` and returns as many, in ``unit``; it takes ``each``
+    bytes per sample. Values depend on ``beside`` planes, and rows, to either side.
+    """
 
     def __init__(
         self,
-        file: InputFile,
-        offset: int,
-        shape: tuple[int, ...],
-        dtype: np.dtype[Any],
+        source: SampleArray,
+        make: Callable[[NDArray[Any]], NDArray[Any]],
+        beside: int = 0,
+        dtype: DTypeLike = np.float64,
         *,
-        swapped: bool = False,
+        unit: float = 1.0,
+        each: int = 16,
     ) -> None:
-        self.file, self.offset, self.name = file, offset, file.name
-        self.shape, self.dtype, self.swapped = shape, dtype, swapped
+        self.source, self.make, self.beside = source, make, beside
+        self.unit, self.each = unit, each
+        self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
+
+    def crop(self, low: Index, high: Index) -> SampleArray:
+        """Return the samples in a box, made of those of the source in a box around it."""
+        around = [max(n - self.beside, 0) for n in low]
+        beyond = [min(n + self.beside, count) for n, count in zip(high, self.shape)]
+        source = cropped(self.source, around, beyond)
+        made = DerivedPlanes(
+            source, self.make, self.beside, self.dtype, unit=self.unit, each=self.each
+        )
+        inner = ([a - b for a, b in zip(ends, around)] for ends in (low, high))
+        return CroppedPlanes(made, *inner)
 
     def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive); FileError if the file changed."""
-        _, ny, nz = self.shape
-        planes = np.empty(
-            (max(last - first, 0), *((nz, ny) if self.swapped else (ny, nz))), self.dtype
-        )
-        self.file.read_into(planes, self.offset + first * self.plane_bytes)
-        return planes.transpose(0, 2, 1) if self.swapped else planes
+        """Return planes ``first`` to ``last`` (exclusive); some rows at a time, to save memory."""
+        low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
+        if last <= first:
+            return np.empty((0, *self.shape[1:]), self.dtype)
+        source = np.asarray(self.source[low:high])
+        out = np.empty((last - first, *self.shape[1:]), self.dtype)
+        step = WORKING_BYTES // (len(source) * self.shape[2] * self.each)
+        if step < self.shape[1]:
+            step = max(step - 2 * self.beside, 2 * self.beside, 1)
+        for start in range(0, self.shape[1], step):
+            stop, low_row = min(start + step, self.shape[1]), max(start - self.beside, 0)
+            made = self.make(source[:, low_row : stop + self.beside])[first - low : last - low]
+            out[:, start:stop] = made[:, start - low_row : stop - low_row]
+        return out if self.unit == 1 else np.multiply(out, self.unit, out=out)
 
-    @property
-    def is_unpacked(self) -> bool:
-        """Whether the file is a temporary one, of samples that might be in memory."""
-        return isinstance(self.file.file.name, int)  # it has no name, only a number
+
+class NoPlanes(SamplePlanes):
+    """Shape and type of an array whose samples are not at hand."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
+        self.shape, self.dtype = tuple(shape), dtype
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Raise GridError: there are none."""
+        raise GridError("the samples of the grid are not at hand")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what is known."""
+        return NoPlanes, (self.shape, self.dtype)
 
 
-SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
-"""An array of samples in memory, or one whose planes are read or made when they are needed."""
+def cropped(samples: SampleArray, low: Index, high: Index) -> SampleArray:
+    """Return the samples from index ``low`` (3,) to before ``high``."""
+    if isinstance(samples, SamplePlanes):
+        return samples.crop(low, high)
+    return samples[_box(low, high)]
+
+
+def _box(low: Index, high: Index) -> tuple[slice, ...]:
+    return tuple(slice(int(first), int(last)) for first, last in zip(low, high))
+
+
+def changed(
+    samples: SampleArray,
+    change: Callable[[NDArray[Any]], NDArray[Any]],
+    dtype: DTypeLike = np.float64,
+) -> DerivedPlanes:
+    """Return samples changed one by one, each for itself; as float64 they are changed as such."""
+    if dtype is np.float64:
+        return DerivedPlanes(samples, lambda planes: change(planes.astype(np.float64)))
+    return DerivedPlanes(samples, change, dtype=dtype)
 
 
 def over_planes(
     samples: SampleArray, work: Callable[..., Result], ranges: Ranges
 ) -> Iterator[Result]:
-    """Yield what a function makes of ranges of planes, in order; see ``SamplePlanes.over``."""
-    if isinstance(samples, SamplePlanes):
-        yield from samples.over(samples, work, ranges)
+    """Yield what a function makes of ranges of planes, in order.
+
+    Planes that are made, and that a range shares with the one before, are not made again; they are
+    valid during the call.
+    """
+    if not isinstance(samples, SamplePlanes):
+        for first, last, *more in ranges:
+            yield work(samples[first:last], *more)
         return
+    held = max((last - first for first, last, *_ in ranges), default=0)
+    planes = np.empty((held, *samples.shape[1:]), samples.dtype)
+    start = end = 0  # of the planes that are held
     for first, last, *more in ranges:
-        yield work(samples[first:last], *more)
+        kept = end - first if start <= first < end else 0
+        if kept and first > start:
+            planes[:kept] = planes[first - start : end - start]
+        for low in range(first + kept, last, samples.block):  # which stay in the cache
+            high = min(low + samples.block, last)
+            planes[low - first : high - first] = samples[low:high]
+        start, end = first, max(last, first + kept)
+        yield work(planes[: last - first], *more)
+
+
+def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:
+    """Return ranges of all planes, those together that are read together."""
+    step = samples.block if isinstance(samples, SamplePlanes) else 1
+    return [(i, min(i + step, len(samples))) for i in range(0, len(samples), step)]
+
+
+def planes_at_once(samples: SampleArray) -> int:
+    """Return how many planes are best made at a time: not few, if each needs many beside it."""
+    return max(2 * getattr(samples, "beside", 0), LEAST_AT_ONCE)
+
+
+def spread_planes(first: int, last: int, most: int) -> list[int]:
+    """Return evenly spread planes from ``first`` to ``last`` (inclusive), a limited number."""
+    return sorted({int(i) for i in np.linspace(first, last, most)})
+
+
+def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
+    """Return values over a unit as float32; from ``FAR`` on their size does not matter."""
+    return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
 
 
 def ranks_of(numbers: NDArray[np.int64]) -> NDArray[np.uint64]:
@@ -258,155 +282,3 @@ class Few(list[tuple[NDArray[Any], ...]]):
         arrays = [np.concatenate(parts) for parts in zip(*self)]
         some = lowest(arrays[0], self.most)
         return tuple(array[some] for array in arrays)
-
-
-def spread_planes(first: int, last: int, most: int) -> list[int]:
-    """Return evenly spread planes from ``first`` to ``last`` (inclusive), a limited number."""
-    return sorted({int(i) for i in np.linspace(first, last, most)})
-
-
-def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:
-    """Return ranges of all planes, those together that are read together."""
-    step = samples.block if isinstance(samples, SamplePlanes) else 1
-    return [(i, min(i + step, len(samples))) for i in range(0, len(samples), step)]
-
-
-def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
-    """Return values over a unit as float32; from ``FAR`` on their size does not matter."""
-    return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
-
-
-class NoPlanes(SamplePlanes):
-    """Shape and type of an array whose samples are not at hand."""
-
-    name = "the grid"
-
-    def __init__(self, shape: tuple[int, ...], dtype: np.dtype[Any]) -> None:
-        self.shape, self.dtype = tuple(shape), dtype
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Raise GridError: there are none."""
-        raise GridError("the samples of the grid are not at hand")
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle what is known."""
-        return NoPlanes, (self.shape, self.dtype)
-
-
-class DerivedPlanes(SamplePlanes):
-    """Planes that are made of those of another array, and of some beside them.
-
-    ``make`` takes some planes of ``source`` and returns as many, in ``unit``; it takes ``each``
-    bytes per sample. Values depend on ``beside`` planes, and rows, to either side.
-    """
-
-    name = "the grid"
-
-    def __init__(
-        self,
-        source: SampleArray,
-        make: Callable[[NDArray[Any]], NDArray[Any]],
-        beside: int = 0,
-        dtype: DTypeLike = np.float64,
-        *,
-        unit: float = 1.0,
-        each: int = 16,
-    ) -> None:
-        self.source, self.make, self.beside = source, make, beside
-        self.unit, self.each = unit, each
-        self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
-
-    def over(
-        self, samples: SamplePlanes, work: Callable[..., Result], ranges: Ranges
-    ) -> Iterator[Result]:
-        """Yield what a function makes of ranges of ``samples``, as the source of these does it."""
-        if isinstance(self.source, SamplePlanes):
-            return self.source.over(samples, work, ranges)
-        return super().over(samples, work, ranges)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        if not self.travels:
-            return super().__reduce__()
-        make = partial(DerivedPlanes, unit=self.unit, each=self.each)
-        return make, (self.source, self.make, self.beside, self.dtype)
-
-    @property
-    def travels(self) -> bool:  # type: ignore[override]
-        """Whether another process can read the source for itself."""
-        return bool(getattr(self.source, "travels", False))
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive)."""
-        low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
-        if last <= first:
-            return np.empty((0, *self.shape[1:]), self.dtype)
-        source = np.asarray(self.source[low:high])
-        out = np.empty((last - first, *self.shape[1:]), self.dtype)
-        size = self._rows_at_once(len(source))
-        for start in range(0, self.shape[1], size):
-            stop, low_row = min(start + size, self.shape[1]), max(start - self.beside, 0)
-            made = self.make(source[:, low_row : stop + self.beside])[first - low : last - low]
-            out[:, start:stop] = made[:, start - low_row : stop - low_row]
-        return out if self.unit == 1 else np.multiply(out, self.unit, out=out)
-
-    def _rows_at_once(self, planes: int) -> int:
-        """Return how many rows of that many planes are worked on at a time, to save memory."""
-        fitting = WORKING_BYTES // (planes * self.shape[2] * self.each)
-        if fitting >= self.shape[1]:
-            return self.shape[1]
-        return int(max(fitting - 2 * self.beside, 2 * self.beside, 1))
-
-    def working_bytes(self, planes: int) -> int:
-        """Return about how much memory making that many planes takes, those beside included."""
-        read = min(planes + 2 * self.beside, len(self))
-        rows = min(self._rows_at_once(read) + 2 * self.beside, self.shape[1])
-        made = planes * self.plane_bytes + read * rows * self.shape[2] * self.each
-        stored = read * self.shape[1] * self.shape[2] * np.dtype(self.source.dtype).itemsize
-        return made + max(reading_bytes(self.source, read), stored)
-
-
-def unpacked_bytes(samples: SampleArray) -> int:
-    """Return the size of the temporary file that samples are made of, 0 if there is none."""
-    while hasattr(samples, "source"):
-        samples = samples.source
-    if isinstance(samples, PlaneFile) and samples.is_unpacked:
-        return len(samples) * samples.plane_bytes
-    return 0
-
-
-def check_planes(samples: SampleArray, bound: int | None) -> None:
-    """Raise OutOfMemoryError if looking at a few planes at a time exceeds a memory bound."""
-    plane = samples.shape[1] * samples.shape[2]
-    held = held_memory() or 0
-    need = held + plane * (LOOKED_AT * samples.dtype.itemsize + LOOKING_BYTES)
-    if bound is not None and held < bound < need:
-        raise planes_too_large(samples, need, bound)
-
-
-def planes_too_large(samples: SampleArray, need: int, bound: int) -> OutOfMemoryError:
-    """Return the error for samples that cannot be worked on plane by plane."""
-    return OutOfMemoryError(
-        f"planes of {samples.shape[1]:,} x {samples.shape[2]:,} samples need at least "
-        f"{advised(need)} of memory, {in_words(bound)} may be used; allow more (--max-memory)"
-    )
-
-
-def planes_at_once(samples: SampleArray) -> int:
-    """Return how many planes are best made at a time: not few, if each needs many beside it."""
-    return max(2 * samples.beside if isinstance(samples, DerivedPlanes) else 0, LEAST_AT_ONCE)
-
-
-def reading_bytes(samples: SampleArray, planes: int) -> int:
-    """Return about how much memory reading that many planes takes; 0 of an array in memory."""
-    return samples.working_bytes(planes) if isinstance(samples, SamplePlanes) else 0
-
-
-def changed(
-    samples: SampleArray,
-    change: Callable[[NDArray[Any]], NDArray[Any]],
-    dtype: DTypeLike = np.float64,
-) -> DerivedPlanes:
-    """Return samples changed one by one, each for itself; as float64 they are changed as such."""
-    if dtype is np.float64:
-        return DerivedPlanes(samples, lambda planes: change(planes.astype(np.float64)))
-    return DerivedPlanes(samples, change, dtype=dtype)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, Triple
 from ..errors import GridError
 from ..threads import chunks_of
-from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
+from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES
 from .census import CUT_OFF, Census
 from .planes import SampleArray, changed, spread_planes
 

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import Triple
+from ..arrays import BoolArray, Triple
 from ..errors import GridError, OptionTypeError, seen
-from ..options import AUTO, FieldKind, Inside, ReadOptions
+from ..options import AUTO, FieldKind, Inside, Options
 from .census import Census, Extremes, not_finite
 from .distances import check_negative_inside, choose_spacing
 from .field import Field
 from .interpret import interpret
 from .placement import (STRAIGHT, Direction, as_samples, as_triple, check_direction, check_kind, check_spacing, in_rows, is_cubic, placed)
-from .planes import NoPlanes, SampleArray, SamplePlanes
+from .planes import Index, SampleArray, SamplePlanes, cropped
 
 MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
@@ -77,6 +77,7 @@ class SdfGrid:
     high: float
     field: Field
     space: str | None
+    on_sample: tuple[BoolArray, ...] | None  # of each axis, if resampled: which planes are samples
 
     def __init__(
         self,
@@ -133,6 +134,7 @@ class SdfGrid:
             high=-low if positive_inside else high,
             field=field or Field(),
             space=None,
+            on_sample=None,
         )
         return grid
 
@@ -268,7 +270,7 @@ def make_grid(
     OptionError
         If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
-    wanted = ReadOptions(inside=inside, field=field, label=label, level=level, scale=scale)
+    wanted = Options(inside=inside, field=field, label=label, level=level, scale=scale)
     given = placed(values, spacing, origin)
     taken, notes = interpret(as_samples(given.values), wanted, given.spacing)
     origin = given.origin
@@ -314,9 +316,24 @@ def with_fields(grid: SdfGrid, **fields: Any) -> SdfGrid:
     return other
 
 
-def without_samples(grid: SdfGrid) -> SdfGrid:
-    """Return a grid that knows all but its samples: their shape and type, place and field."""
-    return with_fields(grid, samples=NoPlanes(grid.shape, grid.samples.dtype))
+def crop(grid: SdfGrid, low: Index, high: Index) -> SdfGrid:
+    """Return the samples from index ``low`` (3,) to before ``high`` as a grid at their place.
+
+    What the values are stays decided, and so do their extremes.
+    """
+    field = grid.field
+    smooth, unseen = (
+        None if array is None else cropped(array, low, high)
+        for array in (field.smooth, field.unseen)
+    )
+    known = grid.on_sample
+    return with_fields(
+        grid,
+        samples=cropped(grid.samples, low, high),
+        origin=as_triple(grid.to_world(low), "origin"),
+        field=replace(field, smooth=smooth, unseen=unseen),
+        on_sample=known and tuple(axis[a:b] for axis, a, b in zip(known, low, high)),
+    )
 
 
 def negated(values: NDArray[Any]) -> NDArray[Any]:
@@ -324,3 +341,14 @@ def negated(values: NDArray[Any]) -> NDArray[Any]:
     floats: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
     np.negative(floats, out=floats)
     return floats
+
+
+def describe_place(grid: SdfGrid) -> dict[str, Any]:
+    """Return where the samples of a grid lie, for JSON."""
+    return {
+        "shape": list(grid.shape),
+        "spacing": list(grid.spacing),
+        "origin": list(grid.origin),
+        "direction": [list(row) for row in grid.direction],
+        "space": grid.space,
+    }

@@ -21,7 +21,7 @@ from ..arrays import BoolArray
 from ..errors import GridError
 from .census import Census, Extremes, not_finite
 from .planes import SampleArray, SamplePlanes
-from .regions import RUN_BYTES, Ints, Regions, with_the_one_before
+from .regions import Ints, Regions, with_the_one_before
 from .slopes import as_float64, distinct, quantile
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
@@ -54,11 +54,6 @@ class _OfRegions(SamplePlanes):
     ) -> None:
         self.source, self.regions = source, regions
         self.shape, self.dtype = tuple(source.shape), np.dtype(dtype or source.dtype)
-
-    def working_bytes(self, planes: int) -> int:
-        """Return about how much memory making that many planes takes."""
-        read, copies = planes + 2 * self.beside, 10 if self.beside else 2
-        return copies * read * self.plane_bytes + RUN_BYTES * self.shape[1] * self.shape[2]
 
 
 class KnownPlanes(_OfRegions):

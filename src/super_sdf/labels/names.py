@@ -11,7 +11,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -59,7 +58,7 @@ def _of_json(text: str) -> Names:
         if not _is_whole(number) or not isinstance(name, str):
             raise ValueError(f"{seen(key)}: {seen(value)} is no label and name")
         if name.strip():
-            names[int(number)] = _named(name)
+            names[int(number)] = _named(name, [])
     return names
 
 
@@ -67,22 +66,18 @@ def _of_lines(text: str) -> Names:
     """Return the names of lines that begin with a number; others are headings or comments."""
     names = {}
     for line in text.splitlines():
-        fields = _fields(line)
+        mark = next((mark for mark in "\t,;" if mark in line), " ")
+        (fields,) = csv.reader([line.strip()], delimiter=mark, skipinitialspace=True) or [[]]
+        fields = [field.strip() for field in fields]
+        if mark == " ":
+            fields = [*filter(None, fields[:-1]), *fields[-1:]]
         if len(fields) < 2 or not _is_whole(fields[0]) or "" in (fields[1], fields[-1]):
             continue
         if len(fields) >= 5 and all(map(_is_whole, fields[1:4])) and not _is_whole(fields[-1]):
-            names[int(fields[0])] = _named(fields[-1], fields[1:4])
+            names[int(fields[0])] = _named(fields[-1], fields[1:4])  # ITK-SNAP
         else:
             names[int(fields[0])] = _named(fields[1], fields[2:5])
     return names
-
-
-def _fields(line: str) -> list[str]:
-    """Return the fields of a line, between commas, tabs or spaces; quotes hold them together."""
-    mark = next((mark for mark in "\t,;" if mark in line), " ")
-    (fields,) = csv.reader([line.strip()], delimiter=mark, skipinitialspace=True) or [[]]
-    fields = [field.strip() for field in fields]
-    return fields if mark != " " else [*filter(None, fields[:-1]), *fields[-1:]]
 
 
 def _is_whole(value: Any) -> bool:
@@ -90,12 +85,11 @@ def _is_whole(value: Any) -> bool:
     return is_number or (isinstance(value, str) and bool(re.fullmatch(r"[-+]?\d{1,20}", value)))
 
 
-def _named(name: str, colour: list[str] | None = None) -> LabelName:
+def _named(name: str, colour: list[str]) -> LabelName:
     text = "".join(letter if letter.isprintable() else " " for letter in name)[:LONGEST].strip()
-    with suppress(ValueError, TypeError):
-        red, green, blue = (int(each) for each in colour or ())
-        if 0 <= min(red, green, blue) <= max(red, green, blue) <= 255:
-            return LabelName(text, (red, green, blue))
+    if len(colour) == 3 and all(re.fullmatch(r"\d{1,3}", each) for each in colour):
+        red, green, blue = map(int, colour)
+        return LabelName(text, (red, green, blue) if max(red, green, blue) <= 255 else None)
     return LabelName(text)
 
 

@@ -1,7 +1,9 @@
 """All labels of an image in one run: closed meshes whose shared walls coincide.
 
-Each label is refined as the mask of its samples, and so is what is beside all of them; ``walls``
-makes the surfaces of these fields. The work is done in slabs of all labels.
+Each label is refined as the mask of its samples, in a box round them, and so is what is beside all
+labels, where that meets two of them or more; ``walls`` makes the surfaces of these fields. An image
+whose fields do not fit in memory is worked on in ranges of planes, with as many planes to either
+side as the fields depend on; the walls of all ranges are joined by the names of their vertices.
 
 >>> from super_sdf import reconstruct_labels
 >>> meshes = reconstruct_labels(image, spacing=(1, 1, 3))         # doctest: +SKIP
@@ -9,140 +11,48 @@ makes the surfaces of these fields. The work is done in slabs of all labels.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import BoolArray, IntArray
-from ..errors import GridError, OptionError, OutOfMemoryError, seen
-from ..files.grids import read_array
-from ..grid.derived import REACH, extremes_of_masks, mask_planes
-from ..grid.field import NONE_EXACT, Field
-from ..grid.interpret import as_sample, labelled
-from ..grid.placement import as_samples, check_kind, check_spacing, is_cubic, placed
-from ..grid.planes import NoPlanes, SampleArray, SamplePlanes, changed
-from ..grid.refusals import named
-from ..grid.sdf_grid import SdfGrid, with_fields
-from ..machine.memory import advised, give_back, held_memory, in_words
-from ..threads import Resources, allot, check_count
-from ..surface.mesh import Mesh, join_meshes, vertex_type
-from ..network.neighbourhood import CENTRE
+from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
+from ..errors import OutOfMemoryError
+from ..grid.derived import REACH, extremes_of_masks, mask_distances
+from ..grid.interpret import labelled
+from ..grid.sdf_grid import SdfGrid
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import network_for
-from ..options import (ALL, MASK, OPTIONS, AxisOrder, Space, check_factor, check_label, check_labels, check_max_memory, check_network, check_progress)
-from ..pipeline import refine
+from ..options import (
+    ALL,
+    MASK,
+    OPTIONS,
+    AxisOrder,
+    check_factor,
+    check_max_memory,
+    check_network,
+    check_progress,
+)
+from ..pipeline import refine_band
 from ..progress import Progress, StepCounter, part_of
-from ..slabs.cutting import Slab, equal_parts, slab_bytes, slab_of
-from ..refine.nodes import VoxelIndex
-from ..refine.survey import Band, survey
-from .walls import Labels, Part, absent_parts, extract_walls, put_together
+from ..refine import bounds, spheres
+from ..refine.field import FineField
+from ..refine.nodes import SHARING, VoxelIndex, part_of_node
+from ..refine.survey import survey
+from ..surface.mesh import Mesh, vertex_type
+from ..threads import check_count, held_memory, in_words, memory_bound, useful_threads
+from .image import LabelImage, find_image, in_order
 from .volumes import keep_volumes, mean_spacing
+from .walls import Labelled, Walls, extract_walls, join_walls
 
-MOST_LABELS = 1000  # more values than these are densities
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
-BAND_SHARE = 0.05  # of the time
-NO_ROWS = np.empty((0, 27), np.int32)
-# Memory of the walls in bytes: per node of a block and label, per cell of a side of a voxel.
-NODE_BYTES, CELL_BYTES = 14, 250
-
-Box = tuple[slice, slice, slice]
-
-
-class PartOfPlanes(SamplePlanes):
-    """The samples in a box of another array."""
-
-    def __init__(self, source: SampleArray, box: Box) -> None:
-        self.source, self.box, self.name = source, box, "the grid"
-        self.shape, self.dtype = tuple(s.stop - s.start for s in box), np.dtype(source.dtype)
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive)."""
-        start = self.box[0].start
-        planes: NDArray[Any] = np.asarray(self.source[start + first : start + last])
-        return planes[:, self.box[1], self.box[2]]
-
-
-@dataclass(frozen=True, eq=False)
-class LabelImage:
-    """Samples with labels, of which some are to be meshed, and their place, without samples.
-
-    ``labels`` (L,) ascend. ``boxes`` are L + 1 parts of the grid: those on which what is beside all
-    labels depends, and then each label.
-    """
-
-    samples: SampleArray
-    labels: NDArray[Any]
-    boxes: list[Box]
-    grid: SdfGrid
-
-    def mask(self, number: int) -> SdfGrid:
-        """Return distances to label ``labels[number - 1]``, in its box; 0 is beside all labels."""
-        part = PartOfPlanes(self.samples, self.boxes[number])
-        labels, label = self.labels, self.labels[number - 1]
-
-        def chosen(planes: NDArray[Any]) -> BoolArray:
-            return planes == label if number else ~np.isin(planes, labels)
-
-        h = self.grid.voxel_size
-        return SdfGrid.trusted(
-            mask_planes(changed(part, chosen, np.bool_), h),
-            self.grid.spacing,
-            extremes=extremes_of_masks(h),
-            field=self.grid.field,
-        )
-
-    @property
-    def corners(self) -> IntArray:
-        """The lowest indices of each box, (L + 1, 3)."""
-        return np.array([[side.start for side in box] for box in self.boxes], np.int32)
-
-    def names(self) -> list[int]:
-        """Return the labels as whole numbers."""
-        return [int(label) for label in self.labels]
-
-    def missing(self, wanted: str | list[int]) -> list[int]:
-        """Return which of the wanted labels no sample has."""
-        return [] if isinstance(wanted, str) else [n for n in wanted if n not in self.names()]
-
-    def counts(self) -> list[int]:
-        """Return how many samples each label has."""
-        parts = [PartOfPlanes(self.samples, box) for box in self.boxes[1:]]
-        return [
-            sum(int((part[i : i + 1] == label).sum()) for i in range(part.shape[0]))
-            for part, label in zip(parts, self.labels)
-        ]
-
-    def volumes(self) -> list[float]:
-        """Return the volume of each label's samples, each of which counts as a box."""
-        return [count * float(np.prod(self.grid.spacing)) for count in self.counts()]
-
-    def border(self, planes: tuple[int, int]) -> IntArray:
-        """Return indices of border samples in some planes and the number of their mask, (b, 4)."""
-        parts = [np.empty((0, 4), np.int64)]
-        for plane in range(*planes):
-            some = np.ones(self.grid.shape[1:], bool)
-            some[1:-1, 1:-1] = plane in (0, self.grid.shape[0] - 1)
-            values = np.asarray(self.samples[plane])[some]
-            at = np.searchsorted(self.labels, values).clip(max=len(self.labels) - 1)
-            number = np.where(self.labels[at] == values, at + 1, 0)
-            parts.append(np.column_stack([np.full(len(values), plane), np.argwhere(some), number]))
-        return np.concatenate(parts).astype(np.int32)
-
-
-@dataclass(frozen=True, eq=False)
-class LabelPiece:
-    """A piece of the mesh of a label, and its share of the volume that all pieces enclose.
-
-    Faces number the vertices of all pieces of the label so far.
-    """
-
-    label: int
-    mesh: Mesh
-    volume: float
+BLOCK_PLANES = 32  # read at a time, to count voxels
+# Memory in bytes for each voxel at a wall: once, and for each node of its block.
+VOXEL_BYTES, NODE_BYTES = 1500, 22
 
 
 def reconstruct_labels(
@@ -205,290 +115,208 @@ def reconstruct_labels(
     wanted = in_order(labels)
     image = find_image(values, wanted, place, axes, max_memory)
     for label in image.missing(wanted):
-        labelled(image.samples, label)  # raises
+        labelled(image.grid.samples, label)  # raises
     if network is None:
         from ..network.network import load_network
 
         network = load_network()
-    found: dict[int, list[Mesh]] = {label: [] for label in image.names()}
-    for piece in label_slabs(image, network, factor, max_memory=max_memory, progress=progress):
-        found[piece.label].append(piece.mesh)
-    meshes = [join_meshes(pieces) for pieces in found.values()]
+    meshes = label_meshes(image, network, factor, max_memory=max_memory, progress=progress)
     if OPTIONS["keep_volume"].check(keep_volume):
         meshes = keep_volumes(meshes, image.volumes(), mean_spacing(image.grid))
-    return dict(zip(found, meshes))
+    return dict(zip(image.names(), meshes))
 
 
-def find_image(
-    values: Any,
-    wanted: str | list[int],
-    place: dict[str, Any],
-    axes: AxisOrder | None,
-    max_memory: int | None,
-    space: Space | None = None,
-) -> LabelImage:
-    """Return the label image of an array or a file; ``place`` has spacing, origin and direction.
-
-    Of labels ``in_order``, those that no sample has are left out; GridError if none is left.
-    """
-    notes: list[str] = []
-    if isinstance(values, (str, PathLike)):
-        place = read_array(values, place, axes, space, max_memory)
-        values, notes = place["values"], list(place["notes"])
-    elif axes is not None:
-        raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
-    given = placed(values, place["spacing"], place["origin"])
-    samples = as_samples(given.values)
-    check_kind(samples.dtype, samples.shape)
-    boxes = find_labels(samples, None if isinstance(wanted, str) else wanted)
-    if given.spacing is None:
-        notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
-    if given.origin is None:
-        notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
-    ends, shape = np.array(list(boxes.values())), np.array(samples.shape)
-    is_cut = (ends[:, 0] == 0).any(1) | (ends[:, 1] == shape - 1).any(1)
-    cut = [int(label) for label, leaves in zip(boxes, is_cut) if leaves]
-    if cut:
-        notes.append(
-            f"solids of labels run out of the grid: closed along the border ({named(cut)})"
-        )
-    low, high = np.maximum(ends[:, 0] - MARGIN, 0), np.minimum(ends[:, 1] + MARGIN + 1, shape)
-    low, high = np.vstack([low.min(0), low]), np.vstack([high.max(0), high])
-    around = [
-        (slice(a, d), slice(b, e), slice(c, f))
-        for a, b, c, d, e, f in np.hstack([low, high]).tolist()
-    ]
-    steps = check_spacing(1.0 if given.spacing is None else given.spacing)
-    grid = SdfGrid.trusted(
-        NoPlanes(samples.shape, samples.dtype),
-        steps,
-        0.0 if given.origin is None else given.origin,
-        tuple(notes),
-        direction=place["direction"],
-        extremes=extremes_of_masks(min(steps)),
-        field=Field(MASK, True, NONE_EXACT, on_lattice=not is_cubic(steps)),
-    )
-    grid = with_fields(grid, space=place.get("space"))
-    return LabelImage(samples, np.array(list(boxes), samples.dtype), around, grid)
-
-
-def in_order(labels: Any) -> str | list[int]:
-    """Return labels in ascending order, each once; "all" for all."""
-    given = check_labels(labels)
-    if isinstance(given, str):
-        return given
-    chosen = sorted({check_label(label, "labels") for label in given})
-    if not 0 < len(chosen) <= MOST_LABELS:
-        raise OptionError(f"labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
-    return chosen
-
-
-def find_labels(samples: SampleArray, wanted: list[int] | None) -> dict[Any, NDArray[np.int64]]:
-    """Return the box of each label, (2, 3) lowest and highest indices, by its sample, in order.
-
-    ``wanted`` are some labels; None are all but 0. The samples are read once.
-    """
-    keep = [as_sample(label, samples.dtype) for label in wanted or ()]
-    listed = np.array([value for value in keep if value is not None], samples.dtype)
-    boxes: dict[Any, NDArray[np.int64]] = {}
-    others = False
-    for plane, values in enumerate(samples):
-        runs, low, high = _runs(values)
-        if runs.dtype.kind == "f" and len(wrong := runs[(np.rint(runs) != runs) | np.isinf(runs)]):
-            raise GridError(
-                f"a value is {wrong[0]:g}: labels are whole numbers; choose what is above a value "
-                "with --level if they are densities"
-            )
-        some = runs != 0 if wanted is None else np.isin(runs, listed)
-        others |= not some.all()
-        kinds, of_run = np.unique(runs[some], return_inverse=True)
-        low, high = low[some], high[some]
-        for number, value in enumerate(kinds[: MOST_LABELS + 1].tolist()):
-            mine = of_run == number
-            ends = np.array([[plane, *low[mine].min(0)], [plane, *high[mine].max(0)]])
-            box = boxes.setdefault(value, ends)
-            box[0], box[1] = np.minimum(box[0], ends[0]), np.maximum(box[1], ends[1])
-        if len(boxes) > MOST_LABELS:
-            raise GridError(
-                f"the values are more than {MOST_LABELS:,} different whole numbers: choose some of "
-                "them (--labels 1,2,3) if they are labels, or a --level if they are densities"
-            )
-    if wanted and not boxes:
-        labelled(samples, wanted[0])  # raises
-    if not boxes or (len(boxes) == 1 and not others):
-        only = int(next(iter(boxes), 0))
-        raise GridError(f"every sample has the label {only}: there is no surface")
-    return dict(sorted(boxes.items()))
-
-
-def _runs(plane: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.intp], NDArray[np.intp]]:
-    """Return the runs of equal samples in the rows of a plane: values, and both ends (n, 2)."""
-    begins = np.ones(plane.shape, bool)
-    np.not_equal(plane[:, 1:], plane[:, :-1], out=begins[:, 1:])
-    low = np.argwhere(begins)
-    ends = np.ones(plane.shape, bool)
-    ends[:, :-1] = begins[:, 1:]
-    return plane[begins], low, np.argwhere(ends)
-
-
-def label_slabs(
+def label_meshes(
     image: LabelImage,
     network: Decoder,
     factor: int = 4,
     *,
     max_memory: int | None = None,
     progress: Progress | None = None,
-) -> Iterator[LabelPiece]:
-    """Yield the meshes of ``reconstruct_labels`` slab by slab, in as few as fit in memory.
-
-    Joined, the pieces of a label are the same mesh, bit for bit, for any number of slabs.
-    """
+) -> list[Mesh]:
+    """Return the meshes of an image's labels, the same for any memory bound."""
     check_network(network)
     check_progress(progress)
-    factor = check_factor(factor)
+    factor, grid = check_factor(factor), image.grid
     chosen = adapt(network_for(network, MASK))
-    vertex_type(image.grid, factor)  # raises if not even float64 resolves the vertices
-    resources = allot(chosen.threads, check_max_memory(max_memory))
-    work = Work(image, chosen, factor, resources, _bands(image, resources))
-    if progress:
-        progress(round(1000 * BAND_SHARE), 1000)
-    slabs = work.plan()
-    written = np.zeros(len(image.labels) + 1, np.int64)  # vertices of each label so far
-    for nth, planes in enumerate(slabs):
-        give_back()
-        share = [BAND_SHARE + (1 - BAND_SHARE) * (nth + n) / len(slabs) for n in (0, 1)]
-        yield from work.pieces(planes, written, part_of(progress, *share))
+    kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
+    bound = memory_bound(check_max_memory(max_memory))
+    ranges = plan_ranges(image, factor, chosen.receptive_field, bound)
+    walls: list[Walls] = []
+    for nth, planes in enumerate(ranges):
+        share = part_of(progress, nth / len(ranges), (nth + 1) / len(ranges))
+        walls.append(extract_walls(label_fields(image, planes, chosen, factor, share)))
+    places, faces, sides = join_walls(walls)
+    del walls
+    world: NDArray[Any] = grid.to_world(places / factor - 0.5).astype(kind)
+    if grid.is_mirrored:
+        faces = faces[:, ::-1]
+    both, label = np.concatenate([faces, faces[:, ::-1]]), sides.T.ravel()
+    order = np.argsort(label, kind="stable")
+    ends = np.searchsorted(label[order], np.arange(1, len(image.labels) + 2))
+    meshes = []
+    for first, last in pairwise(ends.tolist()):
+        used, own = np.unique(both[order[first:last]], return_inverse=True)
+        check_count(len(used), "vertices")
+        meshes.append(Mesh(world[used], own.reshape(-1, 3).astype(np.int32)))
+    return meshes
 
 
-def _bands(image: LabelImage, resources: Resources) -> list[Band]:
-    """Return the band of each label in its box; first, that of what is beside all of them.
+def plan_ranges(
+    image: LabelImage, factor: int, receptive_field: int | None, bound: int | None
+) -> list[tuple[int, int]]:
+    """Return the ranges of planes to work on at a time, as few as fit in memory."""
+    count = image.grid.shape[0]
+    if bound is None:
+        return [(0, count)]
+    voxels: list[NDArray[np.int64]] = []
+    for first in range(0, count, BLOCK_PLANES):
+        low, last = max(first - 1, 0), min(first + BLOCK_PLANES, count)
+        numbers = image.numbers(low, min(last + 1, count))
+        voxels.append(at_walls(numbers)[first - low : last - low].sum((1, 2)))
+    before = np.concatenate([[0], np.cumsum(np.concatenate(voxels))])
+    beside, need = reach_of(receptive_field or 0), 0
+    most = (count - 1).bit_length() if receptive_field is not None else 0
+    for pieces in (2**n for n in range(most + 1)):
+        inner = np.searchsorted(before, np.arange(1, pieces) / pieces * before[-1])
+        ranges = list(pairwise(sorted({0, *inner.tolist(), count})))
+        seen = [before[min(b + beside, count)] - before[max(a - beside, 0)] for a, b in ranges]
+        need = int(max(seen)) * (VOXEL_BYTES + NODE_BYTES * (factor + 1) ** 3)
+        need += held_memory() or 0
+        if need <= bound:
+            return ranges
+    raise OutOfMemoryError(
+        f"factor {factor} on {int(before[-1]):,} voxels at the walls of {len(image.labels)} labels "
+        f"needs {in_words(need)} of memory, {in_words(bound)} may be used; use a smaller factor, or "
+        "allow more (--max-memory)"
+    )
 
-    Of that, only those voxels are decoded that two labels or more have in their bands, too.
+
+def reach_of(receptive_field: int) -> int:
+    """Return how many planes to either side of a range its walls depend on."""
+    return receptive_field + spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + MARGIN + 1
+
+
+def label_fields(
+    image: LabelImage,
+    planes: tuple[int, int],
+    network: Adapter,
+    factor: int,
+    progress: Progress | None = None,
+) -> Labelled:
+    """Return the fields of labels in some planes: label by label, the one beside all others last.
+
+    The lowest field holds a node, the lower label in a tie.
     """
-    bands = [survey(image.mask(nth), 0.0, resources) for nth in range(len(image.labels) + 1)]
-    keys = [
-        VoxelIndex(band.voxel_ijk + low, image.grid.shape).keys
-        for band, low in zip(bands, image.corners)
-    ]
-    found, times = np.unique(np.concatenate(keys[1:]), return_counts=True)
-    several = np.isin(keys[0], found[times > 1])
-    return [replace(bands[0], decoded=several), *bands[1:]]
-
-
-@dataclass(frozen=True, eq=False)
-class Work:
-    """What the slabs of an image have in common; ``bands`` are those of ``_bands``."""
-
-    image: LabelImage
-    network: Adapter
-    factor: int
-    resources: Resources
-    bands: list[Band]
-
-    def plan(self) -> list[tuple[int, int]]:
-        """Return the planes of each slab, of few slabs that fit in memory."""
-        count = self.image.grid.shape[0]
-        before = np.zeros(count + 1, np.int64)
-        for band, box in zip(self.bands, self.image.boxes):
-            planes = np.clip(np.arange(count + 1) - box[0].start, 0, band.shape[0])
-            before += band.voxels_before[planes]
-        bound, need = self.resources.memory, 0
-        for pieces in (*(2**n for n in range((count - 1).bit_length())), count):
-            slabs = equal_parts(before, pieces)
-            need = (held_memory() or 0) + max(map(self.bytes_of, slabs))
-            if bound is None or need <= bound:
-                return slabs
-        raise OutOfMemoryError(
-            f"factor {self.factor} on {int(before[-1]):,} voxels of {len(self.bands) - 1} labels "
-            f"needs {advised(need)} of memory, {in_words(bound or 0)} may be used; use a smaller "
-            "factor, or allow more (--max-memory)"
+    grid, beside = image.grid, reach_of(network.receptive_field or 0)
+    low, high = max(planes[0] - beside, 0), min(planes[1] + beside, grid.shape[0])
+    numbers = image.numbers(low, high)
+    voxel_ijk = np.argwhere(at_walls(numbers)).astype(np.int32) + np.array([low, 0, 0], np.int32)
+    index = VoxelIndex(voxel_ijk, grid.shape)
+    size = (factor + 1) ** 3, len(voxel_ijk)
+    lowest, holder = np.full(size, np.inf, np.float32), np.zeros(size, np.int16)
+    able = np.zeros(size, np.int8)  # how many labels could hold a node, 2 for more
+    times = np.zeros(len(voxel_ijk), np.int16)  # how many labels have a voxel in their band
+    fields: dict[int, tuple[NDArray[np.int64], FloatArray]] = {}
+    of_block = part_of_node(factor)[0]
+    for turn, label in enumerate((*range(1, len(image.labels) + 1), 0)):
+        box = _box_of(image, label, low, high)
+        mask = numbers[box] == label
+        corner = np.array([low + box[0].start, box[1].start, box[2].start], np.int32)
+        own_ijk = np.argwhere(at_walls(mask)).astype(np.int32)
+        rows = index.find(own_ijk + corner)
+        if not len(rows):
+            continue
+        absent = _absent_parts(mask, own_ijk)
+        blocks = np.full((size[0], len(rows)), np.nan, np.float32)
+        several = None if label else own_ijk[times[rows] > 1]
+        steps = StepCounter(
+            part_of(progress, turn / (len(image.labels) + 1), (turn + 1) / (len(image.labels) + 1)),
+            ["network", "nodes"],
         )
+        field = _refined(mask, grid, several, network, factor, steps)
+        if field is not None:
+            at = VoxelIndex(own_ijk, field.shape).find(field.voxel_ijk)
+            blocks[:, at[at >= 0]] = field.blocks[:, at >= 0]
+        times[rows] += 1
+        for node, part in enumerate(of_block):  # one by one, to save memory
+            value, able_here = blocks[node], able[node, rows]
+            if label == 0:
+                value[able_here < 2] = np.nan
+                value = np.where(np.isnan(value), -lowest[node, rows], value)
+            can = ~absent[part]
+            lower = np.flatnonzero(can & (value < lowest[node, rows]))
+            lowest[node, rows[lower]], holder[node, rows[lower]] = value[lower], label
+            able[node, rows] = np.minimum(able_here + can, 2)
+        fields[label] = rows, blocks
+    if progress:
+        progress(1000, 1000)
+    at_border = numbers > 0
+    at_border[1 - min(low, 1) : grid.shape[0] - 1 - low, 1:-1, 1:-1] = False
+    border = np.argwhere(at_border).astype(np.int32) + np.array([low, 0, 0], np.int32)
+    border = np.column_stack([border, numbers[at_border]])
+    return Labelled(grid.shape, factor, planes, index, voxel_ijk, holder, border, fields)
 
-    def bytes_of(self, planes: tuple[int, int]) -> int:
-        """Return about how much memory the work on some planes takes."""
-        most = count = 0
-        for number, band in enumerate(self.bands):
-            slab, own = self.slab(number, planes)
-            if own.start < own.stop:
-                args = slab.seen, slab.decoded, slab.planes, self.factor, self.network.memory_bytes
-                most = max(most, slab_bytes(band, *args, self.resources.threads))
-                count += own.stop - own.start
-        return most + count * (NODE_BYTES * (self.factor + 1) ** 3 + CELL_BYTES * self.factor**2)
 
-    def slab(self, number: int, planes: tuple[int, int]) -> tuple[Slab, slice]:
-        """Return what some planes need of the band of a label, and which rows are their own."""
-        start, count = self.image.boxes[number][0].start, self.bands[number].shape[0]
-        low, high = (min(max(plane - start, 0), count) for plane in planes)
-        reach = self.network.receptive_field  # all planes if it states none
-        slab = slab_of(self.bands[number], low, high, count if reach is None else reach, 1)
-        return slab, self.bands[number].rows(low, high)
+def _box_of(image: LabelImage, label: int, low: int, high: int) -> tuple[slice, slice, slice]:
+    """Return the box of a label's samples with a margin, in planes ``low`` to before ``high``.
 
-    def pieces(
-        self, planes: tuple[int, int], written: NDArray[np.int64], progress: Progress | None
-    ) -> Iterator[LabelPiece]:
-        """Yield the meshes of labels in some planes, and count the vertices ``written`` of each."""
-        grid = self.image.grid
-        parts = self._parts(planes, progress)
-        field = put_together(parts, next(parts)[1], grid.shape, self.factor, planes)
-        places, faces, sides, before = extract_walls(field, self.image.border(planes))
-        del field
-        world: NDArray[Any] = grid.to_world(places / self.factor - 0.5)
-        world = world.astype(vertex_type(grid, self.factor))
-        middle = grid.to_world((np.array(grid.shape) - 1) / 2)
-        a, b, c = ((world - middle)[corner] for corner in faces.T)
-        volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6  # to the middle, seen from inside
-        if grid.is_mirrored:
-            faces, volume = faces[:, ::-1], -volume
-        yield from self._by_label(world, faces, volume, sides, before, written)
+    That of 0 is round all labels.
+    """
+    boxes = image.boxes[label - 1 : label] if label else image.boxes
+    first = np.maximum(boxes[:, 0].min(0) - MARGIN, [low, 0, 0])
+    last = np.minimum(boxes[:, 1].max(0) + MARGIN + 1, [high, *image.grid.shape[1:]])
+    (a, b, c), (d, e, f) = first.tolist(), np.maximum(first, last).tolist()
+    return slice(a - low, d - low), slice(b, e), slice(c, f)
 
-    def _by_label(
-        self,
-        world: NDArray[Any],
-        faces: IntArray,
-        volume: NDArray[np.float64],
-        sides: Labels,
-        before: int,
-        written: NDArray[np.int64],
-    ) -> Iterator[LabelPiece]:
-        """Yield the mesh of each label: the walls on either side of which it lies.
 
-        The slab before has the first ``before`` vertices (n, 3); see ``extract_walls``.
-        """
-        names = self.image.names()
-        both, label = np.concatenate([faces, faces[:, ::-1]]), sides.T.ravel()
-        rank = label.astype(np.int64) * len(label) + np.tile(np.arange(len(faces)), 2)
-        order = np.argsort(rank)
-        ends = np.searchsorted(label[order], np.arange(1, len(self.bands) + 1))
-        for number, some in enumerate(np.split(order, ends)[1:-1], 1):
-            used, own = np.unique(both[some], return_inverse=True)
-            shared = int(np.searchsorted(used, before))  # the slab before has them
-            own += written[number] - shared
-            written[number] += len(used) - shared
-            check_count(int(written[number]), "vertices")
-            mesh = Mesh(world[used[shared:]], own.reshape(-1, 3).astype(np.int32))
-            if len(some):
-                signs = np.where(some < len(faces), 1.0, -1.0)
-                yield LabelPiece(names[number - 1], mesh, float(signs @ volume[some % len(faces)]))
+def _refined(
+    mask: BoolArray,
+    grid: SdfGrid,
+    only: IntArray | None,
+    network: Adapter,
+    factor: int,
+    steps: StepCounter,
+) -> FineField | None:
+    """Return the field of a mask, with blocks of voxels ``only`` if some are given."""
+    distances = SdfGrid.trusted(
+        mask_distances(mask), 1.0, extremes=extremes_of_masks(1.0), field=grid.field
+    )
+    threads = useful_threads(network.threads)
+    band = survey(distances, 0.0, threads=threads)
+    if only is not None:
+        chosen = VoxelIndex(only, distances.shape).find(band.voxel_ijk) >= 0
+        band = replace(band, decoded=band.decoded & chosen)
+    if not band.decoded.any():
+        return None
+    return refine_band(band, network, factor, threads, steps)
 
-    def _parts(
-        self, planes: tuple[int, int], progress: Progress | None
-    ) -> Iterator[tuple[int, Part]]:
-        """Yield the fields of all labels that have voxels in some planes, in order; always of 0."""
-        for number, band in enumerate(self.bands):
-            slab, own = self.slab(number, planes)
-            if number and own.start == own.stop:
-                continue
-            around = slab.decoded
-            table = band.network_inputs(around)[1] if own.start < own.stop else NO_ROWS
-            table = table[own.start - around.start : own.stop - around.start]
-            voxel_ijk = band.voxel_ijk[own] + self.image.corners[number]
-            inside = band.patches[own, CENTRE] <= 0
-            absent = absent_parts(table.T.copy(), voxel_ijk, inside, self.image.grid.shape)
-            blocks = np.full(((self.factor + 1) ** 3, len(voxel_ijk)), np.nan, np.float32)
-            if band.count_decoded(own):
-                share = number / len(self.bands), (number + 1) / len(self.bands)
-                steps = StepCounter(part_of(progress, *share), ["network", "nodes"])
-                threads = self.resources.threads
-                field = refine(band, self.network, self.factor, slab, threads, steps)
-                blocks[:, band.decoded[own]] = field.blocks[:, field.own_rows]
-            yield number, Part(voxel_ijk, absent, blocks)
+
+def at_walls(values: NDArray[Any]) -> BoolArray:
+    """Return which samples do not have the same value as all that touch them."""
+    least = most = values
+    for axis in range(3):
+        least, most = _over_three(least, np.minimum, axis), _over_three(most, np.maximum, axis)
+    differ: BoolArray = least != most
+    return differ
+
+
+def _over_three(values: NDArray[Any], choose: np.ufunc, axis: int) -> NDArray[Any]:
+    """Return the least or the largest of each sample and its two neighbours along an axis."""
+    source, chosen = np.moveaxis(values, axis, 0), np.moveaxis(values.copy(), axis, 0)
+    choose(chosen[1:], source[:-1], out=chosen[1:])
+    choose(chosen[:-1], source[1:], out=chosen[:-1])
+    return np.moveaxis(chosen, 0, axis)
+
+
+def _absent_parts(mask: BoolArray, voxel_ijk: IntArray) -> BoolArray:
+    """Return which parts of voxels' blocks touch a voxel round which no sample has the label.
+
+    The result is (27, n); beyond the grid no sample is known to be without it.
+    """
+    near = mask
+    for axis in range(3):
+        near = _over_three(near, np.logical_or, axis)
+    near = np.pad(near, 1, constant_values=True)
+    none = ~np.stack([near[tuple((voxel_ijk + 1 + step).T)] for step in NEIGHBOURHOOD])
+    return np.array([none[sharing].any(0) for sharing in SHARING])

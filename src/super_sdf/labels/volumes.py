@@ -12,32 +12,23 @@ shared. It is the mean of the normals near each node of a lattice, and linear be
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import CORNERS, Vectors, dot, length, sums_at
 from ..errors import OptionError
-from ..grid.planes import in_blocks
-from ..grid.sdf_grid import SdfGrid
-from ..surface.mesh import Mesh
-from ..network.neighbourhood import CORNERS
-from ..options import MASK
-from ..surface.sharp.patches import Numbers, Vectors, dot, length, sums_at
 from ..functions.zero import face_normals
+from ..grid.sdf_grid import SdfGrid
+from ..options import MASK
+from ..surface.mesh import Mesh
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
 ROUNDS = 8
 GOOD, NOTED = 1e-6, 1e-3  # of a volume
 Rows = NDArray[np.intp]
-
-
-class Normals(NamedTuple):
-    """The mean normals of a surface at some rows of all places."""
-
-    rows: Rows
-    vectors: Vectors
 
 
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
@@ -56,10 +47,8 @@ def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
 
 def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
     """Return the volume of the samples inside, each of which counts as a box."""
-    inside = sum(
-        int(np.count_nonzero(grid.planes(first, last) <= offset))
-        for first, last in in_blocks(grid.samples)
-    )
+    planes = (grid.planes(nth, nth + 1) for nth in range(grid.shape[0]))
+    inside = sum(int(np.count_nonzero(plane <= offset)) for plane in planes)
     return inside * float(np.prod(grid.spacing))
 
 
@@ -88,7 +77,12 @@ def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: floa
         Mean spacing of the samples, in world units. No surface moves by more than an eighth of it,
         so the volume of a speck may stay another one.
     """
-    kind, places, rows = meshes[0].vertices.dtype, *_joined(meshes)
+    kind = meshes[0].vertices.dtype
+    vertices = np.concatenate([mesh.vertices for mesh in meshes]) + 0  # -0 is 0
+    bits = np.ascontiguousarray(vertices).view(f"V{3 * vertices.itemsize}").ravel()
+    _, first, place = np.unique(bits, return_index=True, return_inverse=True)
+    rows = np.split(place, np.cumsum([len(mesh.vertices) for mesh in meshes])[:-1])
+    places = vertices[first].astype(np.float64)  # (n, 3), each vertex once
     middle = places.mean(0)
     start = points = places - middle
     normals = _mean_normals(start / (CELL * spacing), meshes, rows)
@@ -98,23 +92,20 @@ def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: floa
         off = volumes - np.array([dot(s, points[own]).sum() / 3 for s, own in zip(slopes, rows)])
         if (np.abs(off) <= GOOD * np.abs(volumes)).all():
             break
-        effects = np.stack([_effect(field, slopes, rows, len(start)) for field in normals], 1)
+        effects = np.zeros((len(meshes), len(meshes)))  # on each volume, of each surface
+        for nth, (some, vectors) in enumerate(normals):
+            moves = np.zeros_like(start)
+            moves[some] = vectors
+            effects[:, nth] = [dot(s, moves[own]).sum() for s, own in zip(slopes, rows)]
         free = np.abs(distances) < MOST * spacing  # the others have moved as far as they may
         step = np.linalg.lstsq(effects[np.ix_(free, free)], off[free], rcond=None)[0]
         distances[free] = np.clip(distances[free] + step, -MOST * spacing, MOST * spacing)
-        points = start + _moves(distances, normals, len(start))
+        points = start.copy()
+        for distance, (some, vectors) in zip(distances, normals):
+            points[some] += distance * vectors
     return [
         Mesh((middle + points[own]).astype(kind), mesh.faces) for own, mesh in zip(rows, meshes)
     ]
-
-
-def _joined(meshes: Sequence[Mesh]) -> tuple[Vectors, list[Rows]]:
-    """Return the places of all vertices, (n, 3) each once, and which are each mesh's."""
-    vertices = np.concatenate([mesh.vertices for mesh in meshes]) + 0  # -0 is 0
-    bits = np.ascontiguousarray(vertices).view(f"V{3 * vertices.itemsize}").ravel()
-    _, first, place = np.unique(bits, return_index=True, return_inverse=True)
-    ends = np.cumsum([len(mesh.vertices) for mesh in meshes])[:-1]
-    return vertices[first].astype(np.float64), np.split(place, ends)
 
 
 def _slopes(points: Vectors, faces: NDArray[Any]) -> Vectors:
@@ -123,8 +114,10 @@ def _slopes(points: Vectors, faces: NDArray[Any]) -> Vectors:
     return sums_at(faces.ravel(), normals, len(points)) / 6
 
 
-def _mean_normals(places: Vectors, meshes: Sequence[Mesh], rows: Sequence[Rows]) -> list[Normals]:
-    """Return the mean normals of each mesh at places, in cells of the lattice."""
+def _mean_normals(
+    places: Vectors, meshes: Sequence[Mesh], rows: Sequence[Rows]
+) -> list[tuple[Rows, Vectors]]:
+    """Return the mean normals of each mesh at some rows of places, in cells of the lattice."""
     corners = np.floor(places)[:, None] + CORNERS
     weights = np.prod(1 - np.abs(places[:, None] - corners), axis=2)  # (n, 8)
     _, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
@@ -137,21 +130,5 @@ def _mean_normals(places: Vectors, meshes: Sequence[Mesh], rows: Sequence[Rows])
         areas = np.bincount(at, (parts * length(slopes)[:, None]).ravel(), count)
         means = sums / np.maximum(areas, np.finfo(float).tiny)[:, None]
         some = np.flatnonzero((areas > 0)[nodes].any(1))
-        found.append(Normals(some, (weights[some, :, None] * means[nodes[some]]).sum(1)))
+        found.append((some, (weights[some, :, None] * means[nodes[some]]).sum(1)))
     return found
-
-
-def _moves(distances: Numbers, normals: Sequence[Normals], count: int) -> Vectors:
-    """Return by how much each place moves, (count, 3)."""
-    moves = np.zeros((count, 3))
-    for distance, field in zip(distances, normals):
-        moves[field.rows] += distance * field.vectors
-    return moves
-
-
-def _effect(
-    field: Normals, slopes: Sequence[Vectors], rows: Sequence[Rows], count: int
-) -> NDArray[np.float64]:
-    """Return by how much each volume grows as one surface moves, (L,)."""
-    moves = _moves(np.ones(1), [field], count)
-    return np.array([dot(slope, moves[own]).sum() for slope, own in zip(slopes, rows)])

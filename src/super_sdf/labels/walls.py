@@ -15,29 +15,29 @@ triangles as in ``cell_cases``; all that hang together by points on faces are jo
 the cell.
 
 A vertex is named by its place in the lattice of half the fine spacing, which tells points on edges,
-on faces and in cells apart. They are in the order of these names, and triangles in that of the
-cells, so a surface made slab by slab is the same as one made at once.
+on faces and in cells apart. So the walls of parts of a grid can be joined by the names.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
-from ..surface.mesh import CLEARANCE
-from ..network.neighbourhood import CORNERS, NEIGHBOURHOOD
+from ..arrays import CORNERS, FloatArray, IntArray
+from ..refine.nodes import VoxelIndex, block_ijk
 from ..surface.cap import outer_voxels
-from ..surface.cell_cases import (EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate)
+from ..surface.cell_cases import EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate
 from ..surface.marching import CAP_HEIGHT, cells_low_nodes, strides
-from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
+from ..surface.mesh import CLEARANCE
 
+EDGES = tuple(zip(EDGE_START, EDGE_AXIS))
+STEP = (4, 2, 1)  # from a corner of a cell to the next one along each axis
 FACE_POINTS, CELL_POINT = 12, 18  # the numbers of points, after those of the twelve edges
 # Where the points are in a cell of two steps along each axis, (19, 3).
 PLACES: IntArray = np.concatenate(
@@ -109,128 +109,59 @@ def _triangles(rows: list[Segment]) -> Iterator[tuple[int, ...]]:
 
 Keys = NDArray[np.int64]
 Labels = NDArray[np.int16]
-Cells = tuple[Keys, Labels]
 
 
 @dataclass(frozen=True, eq=False)
 class Labelled:
-    """The fields of some labels at the nodes of voxels in which the walls can be."""
+    """The fields of some labels at the nodes of the voxels in which their walls can be."""
 
-    shape: tuple[int, int, int]  # samples of the coarse grid along each axis
+    shape: tuple[int, int, int]  # samples of the grid along each axis
     factor: int  # K
-    planes: tuple[int, int]  # planes of voxels, from the first to before the second
+    planes: tuple[int, int]  # of voxels whose walls are made, from the first to before the second
+    index: VoxelIndex  # finds the row of a voxel
     voxel_ijk: IntArray  # (D, 3), the voxels, in C order
-    # (Q, S), their blocks, label by label; NaN where that of label 0 is minus that of any other
-    values: FloatArray
-    # (S,), ``voxel * labels + label``, in ascending order, of each column ``order`` of the values
-    column: Keys
-    order: NDArray[np.intp]  # (S,)
-    labels: int  # number of labels, 0 included, which is beside all others
     holder: Labels  # (Q, D), the label of each node
-
-    @cached_property
-    def index(self) -> VoxelIndex:
-        """Finds the row of a voxel."""
-        return VoxelIndex(self.voxel_ijk, self.shape)
+    border: IntArray  # (b, 4), voxels on the border of the grid and their labels: closed there
+    # for each label voxels, as ascending rows (n,), and their blocks, (Q, n); of label 0 values are
+    # NaN, or missing, where they are minus those of any other
+    fields: dict[int, tuple[NDArray[np.int64], FloatArray]]
 
     def apart(self, low: Keys, node: Keys, between: Labels, holder: Labels) -> NDArray[np.float64]:
-        """Return by how much the field of a node's holder is lower than that of another, (n,)."""
+        """Return by how much the field of a node's holder is lower than that of another, (n,).
+
+        ``between`` (2, n) are both labels, the lower one first; ``low`` are the cells of the nodes.
+        """
         voxel = np.clip(low // self.factor, 0, np.array(self.shape) - 1)
         row, place = self.index.find(voxel), (node - self.factor * voxel) @ strides(self.factor)
-        values = []
-        for label in between:
-            at = np.searchsorted(self.column, row * self.labels + label)
-            values.append(self.values[place, self.order[at]].astype(np.float64))
-        values[0] = np.where(np.isnan(values[0]), -values[1], values[0])  # of label 0, the lower
-        apart = np.where(holder == between[0], values[1] - values[0], values[0] - values[1])
+        values = np.full(between.shape, np.nan)
+        for label, (rows, blocks) in self.fields.items():
+            for side in (0, 1):
+                some = np.flatnonzero(between[side] == label)
+                at = np.searchsorted(rows, row[some])
+                known = np.flatnonzero(np.append(rows, -1)[at] == row[some])
+                values[side, some[known]] = blocks[place[some[known]], at[known]]
+        lower = np.where(np.isnan(values[0]), -values[1], values[0])
+        apart = np.where(holder == between[0], values[1] - lower, lower - values[1])
         least: NDArray[np.float64] = np.maximum(apart, 0)
         return least  # the other may be lower where it cannot hold the node
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
-    """The field of one label in some planes."""
+class Walls:
+    """Walls in a part of a grid: points in the order of their names, and triangles of names."""
 
-    # (n, 3), the voxels round which some samples have the label, and others do not, in C order
-    voxel_ijk: IntArray
-    # (27, n), which parts of their blocks touch a voxel round which no sample has the label
-    absent: BoolArray
-    blocks: FloatArray  # (Q, n), their values; NaN where they are not known
-
-
-def absent_parts(
-    table: IntArray, voxel_ijk: IntArray, inside: BoolArray, shape: tuple[int, int, int]
-) -> BoolArray:
-    """Return ``Part.absent``."""
-    none = table < 0
-    for place, step in enumerate(NEIGHBOURHOOD):
-        beside = voxel_ijk + step
-        none[place] &= ((beside >= 0) & (beside < shape)).all(1) & ~inside
-    return np.array([none[sharing].any(0) for sharing in SHARING])
+    keys: Keys  # (n,), names, see ``Halves``
+    places: NDArray[np.float64]  # (n, 3), in fine spacings from node (0, 0, 0)
+    faces: Keys  # (m, 3), counter-clockwise seen from the second label beside it
+    sides: Labels  # (m, 2), the labels beside it, the higher one first
 
 
-def put_together(
-    parts: Iterable[tuple[int, Part]],
-    ground: Part,
-    shape: tuple[int, int, int],
-    factor: int,
-    planes: tuple[int, int],
-) -> Labelled:
-    """Return the fields of labels in some planes."""
-    number, every = zip((0, ground), *parts)
-    counts = [len(part.voxel_ijk) for part in every]
-    places = np.concatenate([part.voxel_ijk for part in every])
-    keys, row = np.unique(VoxelIndex(places, shape).keys, return_inverse=True)
-    voxel_ijk = np.stack(np.unravel_index(keys, shape), 1).astype(np.int32)
-    rows = np.split(row, np.cumsum(counts)[:-1])
-    holder = _holders(number, every, rows, len(voxel_ijk))
-    labels = max(number) + 1
-    column = row * labels + np.repeat(number, counts)
-    order = np.argsort(column)
-    values = np.concatenate([part.blocks for part in every], axis=1)
-    return Labelled(shape, factor, planes, voxel_ijk, values, column[order], order, labels, holder)
-
-
-def _holders(
-    number: tuple[int, ...], parts: tuple[Part, ...], rows: list[NDArray[np.intp]], count: int
-) -> Labels:
-    """Return the label that holds each node of ``count`` voxels, (Q, D); forget unused values."""
-    size = len(parts[0].blocks)
-    lowest, able = np.full((size, count), np.inf, np.float32), np.zeros((size, count), np.int8)
-    holder = np.zeros(lowest.shape, np.int16)
-    of_block = part_of_node(round(size ** (1 / 3)) - 1)[0]
-    for nth in (*range(1, len(parts)), 0):
-        label, part, row = number[nth], parts[nth], rows[nth]
-        for node, place in enumerate(of_block):
-            value, able_here = part.blocks[node], able[node, row]
-            if label == 0:
-                value[able_here < 2] = np.nan
-                value = np.where(np.isnan(value), -lowest[node, row], value)
-            can = ~part.absent[place]
-            lower = np.flatnonzero(can & (value < lowest[node, row]))
-            lowest[node, row[lower]], holder[node, row[lower]] = value[lower], label
-            able[node, row] = np.minimum(able_here + can, 2)
-    return holder
-
-
-def extract_walls(
-    field: Labelled, border: IntArray
-) -> tuple[NDArray[np.float64], IntArray, Labels, int]:
-    """Return the walls in the planes of fields: vertices, triangles, labels on both sides.
-
-    Triangles are counter-clockwise seen from the second label, which is lower. ``border``, (b, 4),
-    are the voxels on the border of the grid and the label of each, which is closed there. The last
-    number is that of vertices on the first face of the planes: they come first.
-    """
-    cells = low, _ = _cells(field, border)
-    lattice = Halves(field.shape, field.factor)
-    base = lattice.keys(2 * low)
-    faces, sides, inner = _connect(field, cells, base, lattice)
-    keys, places = _edge_points(field, cells, base, lattice)
-    keys, places = _inner_points(keys, places, np.unique(faces[inner]), lattice)
-    after = np.array([2 * field.factor * field.planes[0] + 1, -lattice.beyond, -lattice.beyond])
-    before = int(np.searchsorted(keys, lattice.keys(after))) if field.planes[0] else 0
-    return places, np.searchsorted(keys, faces).astype(np.int32), sides, before
+def join_walls(parts: Sequence[Walls]) -> tuple[NDArray[np.float64], IntArray, Labels]:
+    """Return the places of all points, triangles of their numbers, and the labels beside these."""
+    keys, first = np.unique(np.concatenate([part.keys for part in parts]), return_index=True)
+    places = np.concatenate([part.places for part in parts])[first]
+    faces = np.searchsorted(keys, np.concatenate([part.faces for part in parts]))
+    return places, faces.astype(np.int32), np.concatenate([part.sides for part in parts])
 
 
 class Halves:
@@ -242,76 +173,81 @@ class Halves:
         self.strides = np.array([ny * nz, nz, 1], np.int64)
 
     def keys(self, place: NDArray[Any]) -> Keys:
-        """Return a number for each place (..., 3), in C order."""
+        """Return the name of each place (..., 3): its number in C order."""
         keys: Keys = (place.astype(np.int64) + self.beyond) @ self.strides
         return keys
 
 
-def _cells(field: Labelled, border: IntArray) -> Cells:
-    """Return the low nodes, (n, 3), and labels, (n, 8), of the cells in which walls are."""
-    voxel_ijk, holder = _closed(field, border)
-    corners = holder.reshape(*(field.factor + 1,) * 3, -1)
-    low, high = corners, corners
-    for axis in range(3):
-        some, more = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)
-        low, high = np.minimum(low[some], low[more]), np.maximum(high[some], high[more])
-    active = np.flatnonzero(np.moveaxis(low != high, -1, 0))
-    row, cell = np.divmod(active, field.factor**3)
-    node = cells_low_nodes(field.factor)[cell]
-    steps = CORNERS @ strides(field.factor)
-    label = holder[node[:, None] + steps, row[:, None]]
-    low_ijk = field.factor * voxel_ijk[row].astype(np.int64) + block_ijk(field.factor)[node]
-    return low_ijk, label
+def extract_walls(field: Labelled) -> Walls:
+    """Return the walls in the planes of fields."""
+    low, label = _cells(field)
+    lattice = Halves(field.shape, field.factor)
+    base, steps = lattice.keys(2 * low), PLACES.astype(np.int64) @ lattice.strides
 
-
-def _closed(field: Labelled, border: IntArray) -> tuple[IntArray, Labels]:
-    """Return voxels and the labels of their nodes, with those beyond the border: see ``cap``."""
-    shape, factor = np.array(field.shape), field.factor
-    filled = border[(border[:, 3] > 0) & (field.index.find(border[:, :3]) < 0)]
-    of_filled = np.broadcast_to(filled[:, 3].astype(np.int16), (len(field.holder), len(filled)))
-    voxel_ijk = np.concatenate([field.voxel_ijk, filled[:, :3]])
-    holder, order = np.concatenate([field.holder, of_filled], axis=1), np.lexsort(voxel_ijk.T[::-1])
-    outer = outer_voxels(voxel_ijk, field.shape)
-    ends = [-1 if at == 0 else at + (at == field.shape[0]) for at in field.planes]
-    outer = outer[(outer[:, 0] >= ends[0]) & (outer[:, 0] < ends[1])]  # others are of other planes
-    beside = np.clip(outer, 0, shape - 1)
-    row = VoxelIndex(voxel_ijk[order], field.shape).find(beside)
-    of_outer = np.zeros((len(holder), len(outer)), holder.dtype)
-    for nth, step in enumerate(block_ijk(factor)):  # one by one, to save memory
-        node = factor * outer + step
-        some = np.flatnonzero(((node >= 0) & (node <= factor * shape)).all(1) & (row >= 0))
-        place = (node - factor * beside)[some] @ strides(factor)
-        of_outer[nth, some] = holder[place, order[row[some]]]
-    voxel_ijk = np.concatenate([voxel_ijk, outer])
-    order = np.lexsort(voxel_ijk.T[::-1])
-    return voxel_ijk[order], np.concatenate([holder, of_outer], axis=1)[:, order]
-
-
-def _connect(
-    field: Labelled, cells: Cells, base: Keys, lattice: Halves
-) -> tuple[Keys, Labels, BoolArray]:
-    """Return the triangles as names of points, the labels beside, and which are not on edges."""
-    case, of_cell = np.unique(_cases(field, cells), return_inverse=True)
+    # the triangles of each cell's case
+    case, of_cell = np.unique(_cases(field, low, label), return_inverse=True)
     tables = [walls(int(number) & (1 << 24) - 1, int(number) >> 24) for number in case]
     counts = np.array([len(table) for table in tables], np.int64)
     first, times = (np.cumsum(counts) - counts)[of_cell], counts[of_cell]
     cell = np.repeat(np.arange(len(base)), times)
     nth = np.arange(len(cell)) - np.repeat(np.cumsum(times) - times, times) + first[cell]
     table = np.concatenate([np.empty((0, 5), np.int32), *tables])[nth]
-    steps = PLACES.astype(np.int64) @ lattice.strides
-    points = table[:, :3]
-    label = cells[1][cell[:, None], table[:, 3:]]
-    return base[cell, None] + steps[points], label, points >= FACE_POINTS
+    faces, sides = base[cell, None] + steps[table[:, :3]], label[cell[:, None], table[:, 3:]]
+
+    # a point on each crossed edge, and means of these on faces and in cells
+    edges = [np.flatnonzero(label[:, at] != label[:, at + STEP[axis]]) for at, axis in EDGES]
+    keys, one = np.unique(
+        np.concatenate([base[some] + step for some, step in zip(edges, steps)]), return_index=True
+    )
+    edge = np.repeat(np.arange(12), [len(some) for some in edges])[one]
+    places = _on_edges(field, low, label, np.concatenate(edges)[one], edge)
+    inner = np.unique(faces[table[:, :3] >= FACE_POINTS])
+    return Walls(*_with_inner_points(keys, places, inner, lattice), faces, sides)
 
 
-def _cases(field: Labelled, cells: Cells) -> Keys:
+def _cells(field: Labelled) -> tuple[Keys, Labels]:
+    """Return the low nodes, (n, 3), and labels, (n, 8), of the cells in which walls are."""
+    voxel_ijk, holder = _closed(field)
+    corners = holder.reshape(*(field.factor + 1,) * 3, -1)
+    least, most = corners, corners
+    for axis in range(3):
+        some, more = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)
+        least, most = np.minimum(least[some], least[more]), np.maximum(most[some], most[more])
+    plane = np.clip(voxel_ijk[:, 0], 0, field.shape[0] - 1)
+    crossed = (least != most) & (plane >= field.planes[0]) & (plane < field.planes[1])
+    row, cell = np.divmod(np.flatnonzero(np.moveaxis(crossed, -1, 0)), field.factor**3)
+    node = cells_low_nodes(field.factor)[cell]
+    label = holder[node[:, None] + CORNERS @ strides(field.factor), row[:, None]]
+    return field.factor * voxel_ijk[row].astype(np.int64) + block_ijk(field.factor)[node], label
+
+
+def _closed(field: Labelled) -> tuple[IntArray, Labels]:
+    """Return voxels and the labels of their nodes, with those beyond the border: see ``cap``."""
+    shape, factor, size = np.array(field.shape), field.factor, len(field.holder)
+    filled = field.border[field.index.find(field.border[:, :3]) < 0]
+    voxel_ijk = np.concatenate([field.voxel_ijk, filled[:, :3]])
+    order = np.lexsort(voxel_ijk.T[::-1])
+    of_filled = np.broadcast_to(filled[:, 3].astype(np.int16), (size, len(filled)))
+    voxel_ijk = voxel_ijk[order]
+    holder = np.concatenate([field.holder, of_filled], axis=1)[:, order]
+    outer = outer_voxels(voxel_ijk, np.array([(0, 0, 0), field.shape]))
+    beside = np.clip(outer, 0, shape - 1)
+    row = VoxelIndex(voxel_ijk, field.shape).find(beside)
+    of_outer = np.zeros((size, len(outer)), np.int16)
+    for nth, step in enumerate(block_ijk(factor)):  # one by one, to save memory
+        node = factor * outer + step
+        some = np.flatnonzero(((node >= 0) & (node <= factor * shape)).all(1) & (row >= 0))
+        of_outer[nth, some] = holder[(node - factor * beside)[some] @ strides(factor), row[some]]
+    return np.concatenate([voxel_ijk, outer]), np.concatenate([holder, of_outer], axis=1)
+
+
+def _cases(field: Labelled, low: Keys, label: Labels) -> Keys:
     """Return the case of each cell: the ranks of its labels, and which faces join (``walls``).
 
     A face joins its corners with the higher label where the difference of the labels' fields,
     interpolated bilinearly, is so at its saddle: see ``marching.choose_cases``.
     """
-    label, ordered = cells[1], np.sort(cells[1], axis=1)
-    rank = np.zeros(label.shape, np.int64)
+    ordered, rank = np.sort(label, axis=1), np.zeros(label.shape, np.int64)
     for nth in range(1, 8):
         is_next = ordered[:, nth] > ordered[:, nth - 1]
         rank += is_next[:, None] & (label >= ordered[:, nth, None])
@@ -319,10 +255,10 @@ def _cases(field: Labelled, cells: Cells) -> Keys:
     for n, face in enumerate(FACES):
         a, b, c, d = label[:, face].T
         unsure = np.flatnonzero((a == c) & (b == d) & (a != b))
-        low, holder = cells[0][unsure], np.stack([a, b])[:, unsure]
+        start, holder = low[unsure], np.stack([a, b])[:, unsure]
         between = np.sort(holder, axis=0)
         one, other = (
-            np.prod([field.apart(low, low + CORNERS[at], between, own) for at in corners], axis=0)
+            np.prod([field.apart(start, start + CORNERS[at], between, own) for at in corners], 0)
             for corners, own in zip((face[::2], face[1::2]), holder)
         )
         joined = np.where(holder[0] > holder[1], one > other, other > one)
@@ -330,37 +266,30 @@ def _cases(field: Labelled, cells: Cells) -> Keys:
     return case
 
 
-def _edge_points(
-    field: Labelled, cells: Cells, base: Keys, lattice: Halves
-) -> tuple[Keys, NDArray[np.float64]]:
-    """Return the points on crossed edges of cells: names, in order, and places in fine spacings."""
-    keys, found = [np.empty(0, np.int64)], [np.empty((0, 3), np.int64)]
-    for edge, (start, axis) in enumerate(zip(EDGE_START, EDGE_AXIS)):
-        end = start + (4, 2, 1)[axis]
-        cell = np.flatnonzero(cells[1][:, start] != cells[1][:, end])
-        keys.append(base[cell] + PLACES[edge].astype(np.int64) @ lattice.strides)
-        found.append(np.stack([cell, np.full_like(cell, start), np.full_like(cell, end)], 1))
-    names, first = np.unique(np.concatenate(keys), return_index=True)
-    cell, *corners = np.concatenate(found)[first].T
-    low = cells[0][cell]
-    ends = [low + CORNERS[corner] for corner in corners]
-    labels = [cells[1][cell, corner] for corner in corners]
+def _on_edges(
+    field: Labelled, low: Keys, label: Labels, cell: NDArray[np.intp], edge: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """Return the points on crossed edges of cells, (n, 3), in fine spacings."""
+    start, axis = np.array(EDGES)[edge].T
+    corners = start, start + np.array(STEP)[axis]
+    ends = [low[cell] + CORNERS[corner] for corner in corners]
+    labels = np.stack([label[cell, corner] for corner in corners])
     last = field.factor * np.array(field.shape)
     share = np.full(len(cell), 0.5)  # half-way, if an end is beyond the border
     within = np.flatnonzero(((np.minimum(*ends) >= 0) & (np.maximum(*ends) <= last)).all(1))
-    between = np.sort(np.stack(labels)[:, within], axis=0)
+    between = np.sort(labels[:, within], axis=0)
     one, other = (
-        field.apart(low[within], end[within], between, label[within])
-        for end, label in zip(ends, labels)
+        field.apart(low[cell[within]], end[within], between, own[within])
+        for end, own in zip(ends, labels)
     )
     none = one + other == 0
     share[within] = np.where(none, 0.5, one / np.where(none, 1, one + other))
     share = np.clip(share, CLEARANCE, 1 - CLEARANCE)
     begin, stop = (np.clip(end.astype(float), -CAP_HEIGHT, last + CAP_HEIGHT) for end in ends)
-    return names, begin + share[:, None] * (stop - begin)
+    return begin + share[:, None] * (stop - begin)
 
 
-def _inner_points(
+def _with_inner_points(
     keys: Keys, places: NDArray[np.float64], used: Keys, lattice: Halves
 ) -> tuple[Keys, NDArray[np.float64]]:
     """Return points with those on faces, and then those in cells: means of the ones beside them."""

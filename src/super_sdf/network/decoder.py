@@ -9,8 +9,8 @@ import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..errors import ModelError
-from ..threads import map_chunks
 from ..progress import ShareCallback
+from ..threads import map_chunks
 
 # In half voxels; squares of sums of such values are still finite in single precision.
 MAX_VALUE = np.float32(1e15)

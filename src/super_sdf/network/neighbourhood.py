@@ -12,16 +12,9 @@ from math import prod
 
 import numpy as np
 
-from ..arrays import FloatArray, IntArray
-
-NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
-"""Steps from the centre voxel, (27, 3)."""
-CORNERS: IntArray = np.indices((2, 2, 2)).reshape(3, 8).T.astype(np.int32)
-"""Steps from the lowest corner of a cell to all of them, (8, 3)."""
-CENTRE = 13
-"""Index of the centre voxel itself."""
-STRIDES = np.array([9, 3, 1])
-"""Difference of the indices of two places next to each other along each axis."""
+from ..arrays import CENTRE as CENTRE
+from ..arrays import CORNERS as CORNERS
+from ..arrays import NEIGHBOURHOOD, STRIDES, FloatArray, IntArray
 
 
 def cube_symmetries() -> IntArray:

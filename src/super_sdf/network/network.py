@@ -12,21 +12,34 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
-from ..files.regular import check_regular_file
-from ..threads import cores_of_system, useful_threads
-from ..machine.system import lacks_avx2, processor_name
-from .neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
-from ..options import (AUTO, AUTO_PRECISION, DEFAULT_QUALITY, FLOAT32, INT8, MASK, NOISY, OPTIONS, QUALITIES, Device, Precision, Quality, check_path, check_threads)
+from ..options import (
+    AUTO,
+    AUTO_PRECISION,
+    DEFAULT_QUALITY,
+    FLOAT32,
+    INT8,
+    MASK,
+    NOISY,
+    OPTIONS,
+    QUALITIES,
+    Device,
+    Precision,
+    Quality,
+    check_path,
+    check_threads,
+)
 from ..progress import ShareCallback
+from ..threads import cores_of_system, described_processor, useful_threads
 from .contract import EXACT_DISTANCES, INPUTS, MASKS, one_voxel, read_card
 from .decoder import Decoder
 from .device import open_session
+from .neighbourhood import cube_symmetries, turn
 from .onnx import CUDA_CHUNK, LONG_RUN, Pace, Poll, ort, run_bound, run_on_cpu, work_of
 
 MODELS = Path(__file__).parent.parent / "models"
@@ -212,7 +225,8 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
     if str(model) in QUALITIES and name not in shipped_models():
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped_models().get(name, Path(model))
-    if precision == AUTO_PRECISION and not lacks_avx2():
+    flags = described_processor().get("flags", "").split()
+    if precision == AUTO_PRECISION and not ("avx" in flags and "avx2" not in flags):
         path = shipped_models().get(int8_name(name), path)
     if precision == INT8:
         path = path.with_name(f"{int8_name(path.stem)}.onnx")  # beside the float32 file
@@ -222,7 +236,9 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
     if not os.path.lexists(path):
         names = ", ".join(QUALITIES)
         raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
-    return check_regular_file(path), symmetries
+    if not path.is_file():
+        raise FileError(f"{path} is no file: give an ONNX file or one of: {', '.join(QUALITIES)}")
+    return path, symmetries
 
 
 def load_network(
@@ -325,42 +341,3 @@ def _load_once(
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     loaded = load_network(name, device=device, threads=threads, precision=precision)
     return loaded.averaged(symmetries)
-
-
-# Of a ball, in index units; the centre is not on a sample.
-BALL_SIDE, BALL_CENTRE, BALL_RADIUS = 12, 5.63, 4.0
-
-
-class Fingerprint(NamedTuple):
-    """What a network computes, and where."""
-
-    digest: str  # SHA-256 of its values on a small ball
-    device: Device  # "cpu" or "cuda"
-    processor: str
-    precision: str  # "float32" or "int8"
-
-
-def fingerprint_of(model: str, precision: Precision, device: Device) -> Fingerprint:
-    """Return the fingerprint of a network, named as for ``load_network``; its errors, too."""
-    network = load_network(model, precision=precision, device=device, threads=1)
-    digest = hashlib.sha256(network(*small_ball()).tobytes()).hexdigest()
-    return Fingerprint(digest, network.device, processor_name(), network.precision)
-
-
-def small_ball() -> tuple[Any, Any, Any, Any]:
-    """Return the inputs of a network for a ball: the 624 voxels of its band, and 125 offsets."""
-    ijk = np.indices((BALL_SIDE,) * 3).reshape(3, -1).T
-    band = ijk[np.abs(_distances(ijk)) < 3]  # 1.5 voxels
-    around = band[:, None] + NEIGHBOURHOOD
-    row_of = np.full((BALL_SIDE + 2,) * 3, -1, np.int32)
-    row_of[tuple(band.T + 1)] = np.arange(len(band))
-    table = row_of[tuple(np.moveaxis(around + 1, -1, 0))]
-    offsets = np.indices((5,) * 3).reshape(3, -1).T / 2 - 1
-    voxels = np.arange(len(band), dtype=np.int32)
-    return _distances(around), table, voxels, offsets.astype(np.float32)
-
-
-def _distances(ijk: Any) -> Any:
-    """Return the signed distances of the ball at indices (..., 3), in half voxels."""
-    x, y, z = np.moveaxis(ijk - BALL_CENTRE, -1, 0)
-    return (2 * (np.sqrt(x * x + y * y + z * z) - BALL_RADIUS)).astype(np.float32)

@@ -25,8 +25,8 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import DeviceError
-from ..threads import count_cores
 from ..progress import ShareCallback
+from ..threads import count_cores
 
 SWITCH = "ORT_DISABLE_TELEMETRY"  # a variable that onnxruntime reads once, when it is imported
 

@@ -1,29 +1,23 @@
-"""The band of voxels near the surface: its samples and what they can be used for (Eqs. 2 and 4).
+"""The band of voxels near the surface: which they are, their patches, and what these tell.
 
 Everything here is in index space with values in half voxels: a voxel has side 2, a distance of
-one spacing h is 2, and the band is ``abs(value) < 3``.
+one spacing h is 2, and the band is ``abs(value) < 3`` (Eqs. 2 and 4).
 
-Samples of the band can be taken as exact distances if they contradict no neighbour, are near the
-surface, and were not cut off. If too many contradict others, the field is noisy, and none is.
-
-Distances must reach far enough to both sides of an offset: a surface too near where they are
-truncated, or where fill values begin, would come out in loose pieces.
+A sample of the band is taken as an exact distance if it contradicts no neighbour, is near the
+surface, and was not cut off. If too many contradict others, the field is noisy, and none is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError
 from ..grid.sdf_grid import SdfGrid
 from ..threads import chunks_of
-from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
 # Patch values are clipped to this (3 h): samples that are farther from the surface do not matter to
@@ -34,18 +28,12 @@ PATCH_LIMIT = 6.0
 DECODE_LIMIT = 3**0.5 + 0.5
 # Two distances differ by no more than their samples are apart (Lipschitz); slack for rounding.
 LIPSCHITZ_SLACK = 0.1
-
 JUMP = 0.2  # by which values differ more than noise makes distances differ
-
 MAX_DISTANCE = 2.8  # of exact samples: those near the band's edge, 3, may have been truncated there
 MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
-MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
-
-# Planes are worked on in blocks of about this many samples, to save memory, but of at least this
-# many planes, since a block also reads one plane more on either side.
-BLOCK_SAMPLES = 1 << 18
-BLOCK_PLANES = 4
-
+# Planes are worked on in blocks of about this many samples, but of a few planes at least, since a
+# block also reads one plane more on either side.
+BLOCK_SAMPLES, BLOCK_PLANES = 1 << 18, 4
 # The largest difference between a voxel's sample and that at each place of its patch, (27,).
 MAX_STEP = 2 + LIPSCHITZ_SLACK  # between neighbours along an axis
 MAX_DIFFERENCE = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
@@ -60,11 +48,7 @@ def rescale(
     distance in world units, positive outwards, of the surface that becomes the zero level (Sec.
     5.3). Read are planes ``first`` to before ``last``, all by default.
     """
-    return rescale_planes(grid.planes(first, grid.shape[0] if last is None else last), grid, offset)
-
-
-def rescale_planes(planes: NDArray[Any], grid: SdfGrid, offset: float) -> FloatArray:
-    """Return planes of a grid's samples, negative inside, in half voxels: see ``rescale``."""
+    planes = grid.planes(first, grid.shape[0] if last is None else last)
     rescaled = np.empty(planes.shape, np.float32)
     scale = 2.0 / grid.voxel_size
     limit = float(np.finfo(np.float32).max) / 4 / scale
@@ -90,8 +74,8 @@ def is_active(rescaled: FloatArray) -> BoolArray:
     A distance cannot jump over the band, from beyond it on one side to beyond it on the other.
     Where the input does, both voxels are added: a surface must pass between them.
     """
-    active = np.abs(rescaled) < HALF_BAND
     above, below = rescaled >= HALF_BAND, rescaled <= -HALF_BAND
+    active = ~(above | below)
     corners = above.view(np.uint8) | below.view(np.uint8) << 1
     for axis in range(3):  # of a cell
         lines = np.moveaxis(corners, axis, 0)
@@ -112,8 +96,11 @@ def _dilate(mask: BoolArray) -> BoolArray:
     return grown
 
 
-def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
-    """Return the grid padded by one, extrapolated linearly but at jumps, clipped to 3 h."""
+def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
+    """Return the 27 samples round each voxel (V, 3), in the order of ``NEIGHBOURHOOD``, (V, 27).
+
+    The grid is extrapolated linearly by one sample, but at jumps, and clipped to 3 h.
+    """
     padded = np.pad(np.clip(rescaled, -2 * PATCH_LIMIT, 2 * PATCH_LIMIT), 1)
     for axis in range(3):
         planes = np.moveaxis(padded, axis, 0)
@@ -121,21 +108,12 @@ def pad_by_extrapolation(rescaled: FloatArray) -> FloatArray:
             planes[outer] = 2 * planes[border] - planes[inner]
             steep = np.abs(planes[border] - planes[inner]) > MAX_STEP
             planes[outer][steep] = planes[border][steep]
-    return np.clip(padded, -PATCH_LIMIT, PATCH_LIMIT, out=padded)
-
-
-def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
-    """Return the 27 samples round each voxel (V, 3), in the order of ``NEIGHBOURHOOD``, (V, 27)."""
-    return take_patches(pad_by_extrapolation(rescaled), voxel_ijk)
-
-
-def take_patches(padded: FloatArray, voxel_ijk: IntArray) -> FloatArray:
-    """Return the same of samples from ``pad_by_extrapolation``."""
-    nx, ny, nz = padded.shape
-    centre, steps = _flat_steps(voxel_ijk, (nx - 2, ny - 2, nz - 2))
+    np.clip(padded, -PATCH_LIMIT, PATCH_LIMIT, out=padded)
+    centre, steps = _flat_steps(voxel_ijk, rescaled.shape)
     patches = np.empty((len(voxel_ijk), 27), np.float32)
-    for column, step in enumerate(steps):
-        np.take(padded.ravel(), centre + step, out=patches[:, column])
+    for rows in chunks_of(len(voxel_ijk), 27):
+        for column, step in enumerate(steps):
+            patches[rows, column] = padded.ravel().take(centre[rows] + step)
     return patches
 
 
@@ -207,11 +185,14 @@ def is_filled_in(patches: FloatArray) -> BoolArray:
     They are small, so that the surface should be near, but the field falls to none of the samples
     around, and rises to one by more than distances and noise do.
     """
-    size = np.abs(patches)
-    rise = size - size[:, CENTRE, None]
-    found: BoolArray = (rise > MAX_DIFFERENCE + JUMP).any(1)
-    at = np.flatnonzero(found)
-    found[at] = (rise[at] > -JUMP / 2).all(1) & ~has_both_sides(patches[at])
+    found = np.zeros(len(patches), bool)
+    for rows in chunks_of(len(patches), 27):
+        size = np.abs(patches[rows])
+        size -= size[:, CENTRE, None].copy()
+        at = np.flatnonzero((size > MAX_DIFFERENCE + JUMP).any(1))
+        if len(at):
+            some = (size[at] > -JUMP / 2).all(1) & ~has_both_sides(patches[rows][at])
+            found[rows.start + at] = some
     return found
 
 
@@ -226,39 +207,18 @@ def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
     return near | ~lipschitz
 
 
-@dataclass(frozen=True)
-class BandSummary:
-    """What the band of a whole grid says of its samples, whichever part of it is worked on."""
+def exact_samples(
+    patches: FloatArray, lipschitz: BoolArray, limits: tuple[float, float]
+) -> BoolArray:
+    """Return which samples of a band that is not noisy can be taken as exact distances, (V,) bool.
 
-    voxels: int  # they tell by their samples whether the field is noisy
-    noisy: int  # those round which samples differ by more than distances can
-    low: float  # the lowest and the highest sample, in half voxels
-    high: float
-    leaves: bool = False  # whether a sample on the border of the grid is inside
-
-    @property
-    def is_noisy(self) -> bool:
-        """Whether no sample can be taken as exact."""
-        return not self.voxels or self.noisy / self.voxels > MAX_NOISY_SHARE
-
-
-def summarise(sample: FloatArray, lipschitz: BoolArray, leaves: bool = False) -> BandSummary:
-    """Return the summary of samples, some of which tell by ``lipschitz`` how noisy they are."""
-    noisy = len(lipschitz) - int(np.count_nonzero(lipschitz))
-    low, high = float(sample.min(initial=np.inf)), float(sample.max(initial=-np.inf))
-    return BandSummary(len(lipschitz), noisy, low, high, leaves)
-
-
-def exact_samples(patches: FloatArray, lipschitz: BoolArray, whole: BandSummary) -> BoolArray:
-    """Return which samples of a band can be taken as exact distances, (V,) bool.
-
-    A truncated sample has the largest value of its sign in the whole band, and no neighbour towards
-    which the field is as steep as a distance.
+    A truncated sample is one of the ``limits``, the lowest and the highest sample of the whole
+    band, and has no neighbour towards which the field is as steep as a distance.
     """
     sample = patches[:, CENTRE]
-    exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE) & (not whole.is_noisy)
-    limits = np.float32(whole.low), np.float32(whole.high)
-    at_limit = np.flatnonzero(exact & (sample == np.where(sample > 0, limits[1], limits[0])))
+    exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE)
+    low, high = np.float32(limits)
+    at_limit = np.flatnonzero(exact & (sample == np.where(sample > 0, high, low)))
     for rows in chunks_of(len(at_limit), 27):
         some = at_limit[rows]
         slope = np.abs(patches[some] - sample[some, None]) / np.maximum(MAX_DIFFERENCE, 1)
@@ -266,6 +226,8 @@ def exact_samples(patches: FloatArray, lipschitz: BoolArray, whole: BandSummary)
     return exact
 
 
+# Distances must reach far enough to both sides of an offset: a surface too near where they are
+# truncated, or where fill values begin, would come out in loose pieces.
 # Neighbouring samples of noisy distances differ by up to twice the spacing (4 half voxels); a
 # distance and a fill value differ by more, a jump. A small share of jumps is tolerated as outliers.
 MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
@@ -298,10 +260,10 @@ def check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> 
         raise _too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
 
 
-def find_jumps(rescaled: FloatArray, own: tuple[slice, ...]) -> tuple[Jumps, Jumps]:
+def find_jumps(rescaled: FloatArray, own: slice) -> tuple[Jumps, Jumps]:
     """Return the jumps upwards and downwards in planes (n, ny, nz), in half voxels.
 
-    Samples are counted in ``own``; those beside them only show whether there is a jump.
+    Samples are counted in planes ``own``; those beside them only show whether there is a jump.
     """
 
     def jumps_up(rescaled: FloatArray) -> Jumps:

@@ -3,11 +3,8 @@
 Two distances differ by no more than their places are apart. So the field at x is at least
 s - |x - y| if a sample outside, at y, has distance s, and at most s + |x - y| if the sample is
 inside: no surface reaches into a sample's sphere. The network sees the samples nearest the surface
-only, and its values exceed the bounds of farther ones at a tenth of the nodes. Those beyond the
-band are kept as a list, since the grid is read once and most of it is far from the surface.
-
-Bounds need less than the fit to the spheres (``spheres``), for they hold wherever a sphere is: they
-do not say where it touches. A sample that was cut off sets a weaker bound, no wrong one.
+only, and its values exceed the bounds of farther ones at a tenth of the nodes. A sample that was
+cut off sets a weaker bound, no wrong one.
 
 Some blocks are left as they are. Where samples contradict each other the field is no distance.
 Where bounds would take a good part of a block's inside away, there is a wall thinner than the fine
@@ -21,15 +18,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import CENTRE, STRIDES, BoolArray, FloatArray, IntArray
 from ..threads import CHUNK, chunks_of, map_chunks
-from ..network.neighbourhood import CENTRE, STRIDES
 from .band import HALF_BAND
 from .nodes import SharedParts, average_shared, block_ijk, block_offsets
 
@@ -48,8 +42,7 @@ LEAST_FACTOR = 4
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
 BOX_ROWS = 4096  # blocks at most that are worked on with one box of samples ...
 BOX_SAMPLES = 1 << 21  # ... of at most this size: far fewer blocks along a diagonal
-SPHERES = 4  # blocks in a chunk have room for so many spheres each ...
-TEMPORARIES = 512  # ... and at least for these numbers
+TEMPORARIES = 512  # numbers of each block in a chunk: four spheres at its nodes
 
 # A block depends on those beside it, which may have a thin wall, and shared nodes are averaged.
 REACH_IN_VOXELS = 2
@@ -57,28 +50,20 @@ REACH_IN_VOXELS = 2
 Rows = NDArray[np.intp]
 
 
-class SamplesBeyond(NamedTuple):
-    """Samples between the band and ``FARTHEST`` that can be exact."""
+def samples_beyond(
+    rescaled: FloatArray, first: int, limits: tuple[float, float]
+) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return numbers and values of samples beyond the band, up to ``FARTHEST``, between limits.
 
-    number: NDArray[np.int64]  # (n,), in C order of the grid, ascending
-    value: FloatArray  # (n,)
-
-
-NONE_BEYOND = SamplesBeyond(np.zeros(0, np.int64), np.zeros(0, np.float32))
-
-
-def samples_beyond(rescaled: FloatArray, first: int, limits: tuple[float, float]) -> SamplesBeyond:
-    """Return those beyond the band among samples that follow each other, from number ``first`` on.
-
-    They are those that can be exact: between ``limits``. Where a field is cut off, as most are that
-    were truncated, all of the rest of the grid is not.
+    The samples follow each other in C order from number ``first`` on. Where a field is cut off, as
+    most are that were truncated, there are none.
     """
     if not reach_beyond(limits):
-        return NONE_BEYOND
+        return np.zeros(0, np.int64), np.zeros(0, np.float32)
     low, high = np.asarray(limits, np.float32).clip(-FARTHEST, FARTHEST)
     found = (rescaled > low) & (rescaled < high)
     found &= np.abs(rescaled) >= HALF_BAND
-    return SamplesBeyond(np.flatnonzero(found) + first, rescaled[found])
+    return np.flatnonzero(found) + first, rescaled[found]
 
 
 def reach_beyond(limits: tuple[float, float]) -> bool:
@@ -91,26 +76,34 @@ class TrustedSamples:
     """All samples whose spheres can be trusted: exact ones of the band, and some beyond it."""
 
     shape: tuple[int, int, int]  # samples of the grid along each axis
-    voxel_ijk: IntArray  # (V, 3), the samples of the band, in C order
-    value: FloatArray  # (V,)
-    exact: BoolArray  # (V,)
-    beyond: SamplesBeyond
-    limits: tuple[float, float]  # between these, samples beyond the band can be exact
+    number: NDArray[np.int64]  # (n,), of each sample, in C order of the grid, ascending
+    value: FloatArray  # (n,)
+
+    @classmethod
+    def of(
+        cls,
+        shape: tuple[int, int, int],
+        voxel_ijk: IntArray,
+        sample: FloatArray,
+        number: NDArray[np.int64],
+        value: FloatArray,
+        limits: tuple[float, float],
+    ) -> TrustedSamples:
+        """Return exact samples of the band, at (n, 3), with those beyond; none if none can be."""
+        if not len(sample) or not reach_beyond(limits):
+            return cls(shape, number[:0], value[:0])
+        number = np.append(np.ravel_multi_index(tuple(voxel_ijk.T), shape), number)
+        order = np.argsort(number, kind="stable")
+        return cls(shape, number[order], np.append(sample, value)[order])
 
     def box(self, low: IntArray, high: IntArray) -> FloatArray:
         """Return the samples from index ``low`` (3,) to before ``high``, NaN where none is."""
         box = np.full(high - low, np.nan, np.float32)
-        planes = slice(*np.searchsorted(self.voxel_ijk[:, 0], [low[0], high[0]]))
-        exact = np.flatnonzero(self.exact[planes]) + planes.start
         ends = np.array([low[0], high[0]], np.int64) * self.shape[1] * self.shape[2]
-        rows = slice(*np.searchsorted(self.beyond.number, ends))
-        ijk = np.stack(np.unravel_index(self.beyond.number[rows], self.shape), 1)
-        for at, value in (
-            (self.voxel_ijk[exact] - low, self.value[exact]),
-            (ijk - low, self.beyond.value[rows]),
-        ):
-            within = np.asarray(((at >= 0) & (at < box.shape)).all(1))
-            box[tuple(at[within].T)] = value[within]
+        rows = slice(*np.searchsorted(self.number, ends))
+        at = np.stack(np.unravel_index(self.number[rows], self.shape), 1) - low
+        within = np.asarray(((at >= 0) & (at < box.shape)).all(1))
+        box[tuple(at[within].T)] = self.value[rows][within]
         return box
 
 
@@ -125,35 +118,38 @@ def keep_within_bounds(
     """Move values that clearly exceed the samples' bounds to the nearest that these allow.
 
     Samples keep their values, and so do blocks whose own sample is not trusted, but for the nodes
-    that they share with others, which are averaged again. Where no sample beyond the band can be
-    trusted, and with a factor of 2, nothing is changed. ``blocks`` (Q, D + 1) of voxels (D, 3), in
-    C order, are changed in place; the last column is 0.
+    that they share with others, which are averaged again. ``blocks`` (Q, D + 1) of voxels (D, 3),
+    in C order, are changed in place; the last column is 0.
     """
-    if factor < LEAST_FACTOR or not reach_beyond(samples.limits) or not samples.exact.any():
+    if factor < LEAST_FACTOR or not len(samples.number):
         return
     thin = np.zeros(blocks.shape[1], bool)
+    steps, _ = sample_places()
 
     def work(rows: slice) -> list[tuple[Rows, FloatArray]]:
         moves = []
         for group in cut_to_boxes(voxel_ijk, rows):
-            flat, start, steps = samples_around(voxel_ijk[group], samples)
-            for some in chunks_of(len(start), max(SPHERES * len(blocks), TEMPORARIES)):
+            low = voxel_ijk[group].min(0) - REACH_OF_SAMPLES
+            box = samples.box(low, voxel_ijk[group].max(0) + REACH_OF_SAMPLES + 1)
+            strides = np.array([box.shape[1] * box.shape[2], box.shape[2], 1])
+            start, around = (voxel_ijk[group] - low) @ strides, steps @ strides
+            for some in chunks_of(len(start), max(4 * len(blocks), TEMPORARIES)):
                 here = slice(group.start + some.start, group.start + some.stop)
                 values = np.ascontiguousarray(blocks[:, here].T)
-                moved = bounded_values(values, factor, flat.take(start[some, None] + steps))
+                moved = bounded_values(values, factor, box.take(start[some, None] + around))
                 changed = np.flatnonzero((moved != values).any(1))
-                moved = moved[changed]
-                thin[here.start + changed] = loses_wall(values[changed], moved)
+                inside, moved = values[changed] <= 0, moved[changed]
+                lost = (inside & (moved > 0)).sum(1) > MOST_LOST * inside.sum(1)
+                thin[here.start + changed] = lost
                 moves.append((here.start + changed, moved))
         return moves
 
-    moves = map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
+    every = map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
     kept = thin.copy()  # and the blocks that share a face with a thin wall
-    for stride in STRIDES:
-        for place in (CENTRE - int(stride), CENTRE + int(stride)):
-            kept[:-1] |= thin[parts.table[place]]
+    for place in (CENTRE - STRIDES, CENTRE + STRIDES):
+        kept[:-1] |= thin[parts.table[place]].any(0)
     touched = np.zeros(blocks.shape[1], bool)
-    for rows, moved in chain.from_iterable(moves):
+    for rows, moved in (move for moves in every for move in moves):
         free = ~kept[rows]
         blocks[:, rows[free]] = moved[free].T
         touched[parts.table[:, rows[free]]] = True
@@ -169,16 +165,6 @@ def cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
     middle = (rows.start + rows.stop) // 2
     yield from cut_to_boxes(voxel_ijk, slice(rows.start, middle))
     yield from cut_to_boxes(voxel_ijk, slice(middle, rows.stop))
-
-
-def samples_around(
-    voxel_ijk: IntArray, samples: TrustedSamples
-) -> tuple[FloatArray, NDArray[np.int64], NDArray[np.int64]]:
-    """Return a box of samples (l,), the places of voxels' (n,), and steps to those around, (m,)."""
-    low = voxel_ijk.min(0) - REACH_OF_SAMPLES
-    box = samples.box(low, voxel_ijk.max(0) + REACH_OF_SAMPLES + 1)
-    strides = np.array([box.shape[1] * box.shape[2], box.shape[2], 1])
-    return box.reshape(-1), (voxel_ijk - low) @ strides, sample_places()[0] @ strides
 
 
 def bounded_values(values: FloatArray, factor: int, around: FloatArray) -> FloatArray:
@@ -267,10 +253,3 @@ def node_distances(factor: int) -> FloatArray:
     apart = 2 * steps[:, None] - block_offsets(factor).astype(np.float64)
     distance: FloatArray = np.linalg.norm(apart, axis=2).astype(np.float32)
     return distance
-
-
-def loses_wall(values: FloatArray, moved: FloatArray) -> BoolArray:
-    """Return in which blocks a good part of the nodes inside is outside after a move, (n,)."""
-    inside = values <= 0
-    lost: BoolArray = (inside & (moved > 0)).sum(1) > MOST_LOST * inside.sum(1)
-    return lost

@@ -8,8 +8,9 @@ the outermost ones), with the sign of the sample whose voxel the node lies in.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +20,22 @@ from ..errors import OptionError
 from ..grid.field import NONE_EXACT, Field
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..threads import chunks_of
 from ..options import EXACT, NOISY
+from ..threads import chunks_of
 from .band import rescale
-from .nodes import (BARELY_INSIDE, BARELY_OUTSIDE, SharedParts, VoxelIndex, block_ijk, number_parts, part_of_node, part_sizes)
+from .nodes import (
+    BARELY_INSIDE,
+    BARELY_OUTSIDE,
+    SharedParts,
+    VoxelIndex,
+    block_ijk,
+    number_parts,
+    part_of_node,
+    part_sizes,
+)
 
-CHUNK = 1 << 20  # values of the lattice at a time, but at least a plane
+COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "pinned_nodes")
+AT_ONCE = 1 << 20  # values of the lattice at a time, but at least a plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +54,7 @@ class SampleSpheres:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FineField:
-    """Values at the nodes of the decoded voxels' blocks, in a whole grid or in a slab of it.
+    """Values at the nodes of the decoded voxels' blocks.
 
     ``positions`` and ``distances`` are the nodes in world units, each once; ``block_positions`` and
     ``block_distances`` are those of voxels, block by block. The arrays below are in index space.
@@ -61,28 +72,12 @@ class FineField:
         Q = (K+1)^3 nodes are in C order; blocks that share a node have equal values there.
     parts : SharedParts
         Which voxels share which nodes.
-    planes : two ints
-        The slab's planes of voxels, from the first to before the second. Values are final in these
-        and in as many planes on either side as the mesher needs; those of other voxels are
-        intermediate.
-    band_voxels : int
-        Voxels in the band of the whole grid.
-    noisy_voxels : int
-        Those of them round which samples differ by more than distances can.
-    pinned : int
-        Nodes in ``planes`` whose sign had to be changed to that of a voxel that holds no surface.
-        If there are any, the input is not a distance field there, or the network failed.
-    dropped, lone : int
-        Small pieces that begin in ``planes``: dropped since nothing supports them (``debris``), and
-        kept since a sample lies in them.
-    spheres : SampleSpheres, optional
-        The exact samples in and beside the slab, for a mesher that leans on them.
-    decoded_voxels : int
-        Voxels with a block in the whole grid.
     grid : SdfGrid, optional
         The coarse grid, for positions and units. That of a field from a file has no samples.
     offset : float
         The distance from the solid, in world units, of the surface at which the values are 0.
+    spheres : SampleSpheres, optional
+        The exact samples near the surface, for a mesher that leans on them.
     leaves : bool
         Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
         that crosses the border all the same is closed there.
@@ -92,6 +87,11 @@ class FineField:
     octants : (D,) uint8, optional
         A bit for each octant of each voxel: whether all eight samples round it are known. Where
         one is not, the surface ends. None if all are known.
+    counts : dict
+        ``band_voxels``; ``noisy_voxels``, those round which samples differ by more than distances
+        can; ``decoded_voxels``; ``nodes``; ``pinned_nodes``, whose sign had to be changed to that
+        of a voxel that holds no surface: if there are any, the input is not a distance field there,
+        or the network failed.
     """
 
     shape: tuple[int, int, int]
@@ -99,26 +99,19 @@ class FineField:
     voxel_ijk: IntArray
     blocks: FloatArray
     parts: SharedParts
-    planes: tuple[int, int]
-    band_voxels: int = 0
-    noisy_voxels: int = 0
-    pinned: int = 0
-    dropped: int = 0
-    lone: int = 0
-    spheres: SampleSpheres | None = None
-    decoded_voxels: int = 0
     grid: SdfGrid | None = None
     offset: float = 0.0
+    spheres: SampleSpheres | None = None
     leaves: bool = True
     border_inside: IntArray | None = None
     octants: NDArray[np.uint8] | None = None
+    counts: dict[str, int] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
-        first, last = self.planes
         return (
             f"FineField(factor {self.factor}, {self.parts.count_nodes(self.factor):,} nodes of "
-            f"{len(self.voxel_ijk):,} voxels in planes {first} to {last - 1} of {shape})"
+            f"{len(self.voxel_ijk):,} voxels of {shape})"
         )
 
     @cached_property
@@ -187,50 +180,37 @@ class FineField:
             raise OptionError("the field has no grid: make it with upsample(grid, network)")
         return self.grid
 
+    @property
+    def has_surface(self) -> bool:
+        """Whether nodes have both signs; 0 counts as inside."""
+        return bool(self.blocks.size and self.blocks.min() <= 0 < self.blocks.max())
+
     def _block_node_ijk(self, rows: slice) -> IntArray:
         """Return the indices of the nodes of voxels' blocks in the fine lattice, (m, Q, 3)."""
         return self.factor * self.voxel_ijk[rows][:, None] + block_ijk(self.factor)
 
     def rows(self, first: int, last: int) -> slice:
         """Return the rows of the voxels in planes ``first`` to before ``last``."""
-        ends = np.array([first, last], self._plane.dtype)  # another type would copy the array
-        start, stop = np.searchsorted(self._plane, ends)
-        return slice(int(start), int(stop))
+        return slice(*np.searchsorted(self._plane, np.array([first, last], np.int32)).tolist())
 
     @cached_property
     def _plane(self) -> IntArray:
         """The plane of each voxel, (D,), in one piece."""
         return np.ascontiguousarray(self.voxel_ijk[:, 0])
 
-    @property
-    def own_rows(self) -> slice:
-        """The rows of the voxels in ``planes``."""
-        return self.rows(*self.planes)
 
-    def plane_before(self, rows: slice) -> slice:
-        """Return the rows of the voxels in the plane before that of the first of ``rows``."""
-        plane = int(self.voxel_ijk[rows.start, 0])
-        return self.rows(plane - 1, plane)
-
-    def signs(self) -> set[bool]:
-        """Return which signs occur in ``planes``: True if a node is outside, False if inside."""
-        values = self.blocks[:, self.own_rows]
-        if not values.size:
-            return set()
-        return {bool(values.min() > 0), bool(values.max() > 0)}
-
-
-def border_is_crossed(field: FineField, beside: int = 0) -> bool:
-    """Return whether the surface crosses the border of the grid, in the field's planes.
+def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> bool:
+    """Return whether the surface crosses the border of the grid.
 
     The border is that of the fine lattice, half a voxel beyond the outermost samples. So it may be
-    crossed though all samples on it are outside. ``beside`` further planes are looked at, too.
+    crossed though all samples on it are outside. Of a part of a grid, ``border`` (2, 3) are the
+    whole grid's first voxels and those after its last ones, counted from the first of the part.
     """
-    rows = field.rows(field.planes[0] - beside, field.planes[1] + beside)
     side = block_ijk(field.factor)
-    for axis, samples in enumerate(field.shape):
-        for voxel, node in ((0, 0), (samples - 1, field.factor)):
-            at_face = np.flatnonzero(field.voxel_ijk[rows, axis] == voxel) + rows.start
+    for axis in range(3):
+        first, after = (0, field.shape[axis]) if border is None else border[:, axis]
+        for voxel, node in ((first, 0), (after - 1, field.factor)):
+            at_face = np.flatnonzero(field.voxel_ijk[:, axis] == voxel)
             outer = np.flatnonzero(side[:, axis] == node)
             for chunk in chunks_of(len(at_face), len(outer)):
                 inside = field.blocks[outer[:, None], at_face[chunk]] <= 0
@@ -243,7 +223,7 @@ class FineLattice(SamplePlanes):
     """The values at all nodes of the fine lattice, in world units, negative inside.
 
     Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``. The field has the coarse grid
-    that it was made from. Of a slab, the planes of nodes in its own planes of voxels are right.
+    that it was made from.
     """
 
     dtype = np.dtype(np.float32)
@@ -299,14 +279,12 @@ class FineLattice(SamplePlanes):
             flat[corner + face[:, None]] = values[:, here]
 
 
-def own_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
-    """Yield planes of a slab and their number; one between two slabs belongs to the second."""
-    lattice, factor = FineLattice(field), field.factor
-    first, last = (factor * plane for plane in field.planes)
-    last += field.planes[1] == field.shape[0]
-    step = max(CHUNK // (lattice.shape[1] * lattice.shape[2]), 1)
-    for start in range(first, last, step):
-        yield start, lattice.read(start, min(start + step, last))
+def lattice_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
+    """Yield blocks of planes of the fine lattice, and the number of the first of each."""
+    lattice = FineLattice(field)
+    step = max(AT_ONCE // (lattice.shape[1] * lattice.shape[2]), 1)
+    for start in range(0, lattice.shape[0], step):
+        yield start, lattice.read(start, min(start + step, lattice.shape[0]))
 
 
 def _places_of_nodes(
@@ -330,7 +308,7 @@ def lattice_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, i
 
 
 def fine_grid(field: FineField) -> SdfGrid:
-    """Return the fine lattice of a whole grid's field, from ``upsample``, as a grid of spacing h/K.
+    """Return the fine lattice of a field, from ``upsample``, as a grid of spacing h/K.
 
     It can be refined again. Its samples are not stored: planes of them are made from the field, and
     from the coarse grid away from the surface, when they are needed. They are relative to the

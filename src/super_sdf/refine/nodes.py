@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray, Signs
+from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray, Signs
 from ..threads import check_count, map_threads, worthwhile_threads
-from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 
 # The value of a node of which only the sign is known, and the least of a mask's sample, in half
 # voxels.
@@ -115,15 +114,14 @@ class SharedParts:
     table: IntArray  # (27, D), neighbour table of the D voxels, -1 where there is no neighbour
     owner: NDArray[np.int8]  # (27, D), of each part, as a place: ``CENTRE`` is the voxel itself
 
-    def owned(self, rows: slice = slice(None)) -> BoolArray:
-        """Return which parts the voxels in ``rows`` own, (27, n) bool."""
+    def owned(self, rows: slice | BoolArray = slice(None)) -> BoolArray:
+        """Return which parts voxels own, (27, n) bool."""
         own: BoolArray = self.owner[:, rows] == CENTRE
         return own
 
-    def count_nodes(self, factor: int, rows: slice = slice(None)) -> int:
-        """Return the number of nodes that the voxels in ``rows`` own."""
-        parts = np.count_nonzero(self.owned(rows), axis=1)
-        return int(parts @ part_sizes(factor))
+    def count_nodes(self, factor: int, rows: slice | BoolArray = slice(None)) -> int:
+        """Return the number of nodes that voxels own."""
+        return int(np.count_nonzero(self.owned(rows), axis=1) @ part_sizes(factor))
 
 
 def share_parts(table: IntArray) -> SharedParts:
@@ -232,8 +230,8 @@ def _nodes_of_group(
     return places, nodes_at
 
 
-def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: IntArray) -> int:
-    """Give every sample of a mask its side, whatever the network says; return how many it raised.
+def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: IntArray) -> None:
+    """Give every sample of a mask its side, whatever the network says.
 
     A block's value at its sample is raised by adding a pyramid that is 0 on the faces of the block,
     so that neighbouring blocks still agree. The lines between samples are the network's: it joins
@@ -245,7 +243,6 @@ def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: Int
     wrong = np.flatnonzero(missing)
     pyramid = (1 - np.abs(block_offsets(factor))).prod(1).astype(np.float32)
     blocks[:, wrong] += pyramid[:, None] * (sign * missing)[wrong]
-    return len(wrong)
 
 
 def signs_of_skipped(
@@ -271,16 +268,14 @@ def signs_of_skipped(
     return signs
 
 
-def pin_to_skipped(
-    blocks: FloatArray, parts: SharedParts, factor: int, skipped: Signs
-) -> NDArray[np.int64]:
+def pin_to_skipped(blocks: FloatArray, parts: SharedParts, factor: int, skipped: Signs) -> int:
     """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
 
     A skipped voxel holds no surface, so all its nodes have its sign. Once they do, no sign change
     reaches the boundary of the decoded voxels, and the isosurface has no hole there. Returned is
-    how many nodes that each voxel owns were changed, (D,).
+    how many nodes were changed.
     """
-    changed = np.zeros(skipped.shape[1], np.int64)
+    changed = 0
     for part, nodes in enumerate(nodes_of_part(factor)):
         sign = np.zeros(skipped.shape[1], np.int8)
         for place in SHARING[part]:
@@ -290,5 +285,5 @@ def pin_to_skipped(
             wrong = known & ((blocks[node] > 0) != outside)
             if wrong.any():
                 blocks[node, wrong] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
-                changed += wrong & (parts.owner[part] == CENTRE)
+                changed += int(np.count_nonzero(wrong & (parts.owner[part] == CENTRE)))
     return changed

@@ -23,14 +23,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
 from ..threads import map_chunks
-from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD, STRIDES
 from .band import MAX_DISTANCE, MIN_SLOPE
 from .nodes import SharedParts, VoxelIndex, nodes_of_part, number_parts
 
@@ -323,49 +321,55 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     numbers, count = number_parts(parts, np.ones(27, np.int64))
     left, correction = feet.values, np.zeros(numbers.shape, np.float32)
     for cells, turns in MEANS.items():
-        at, shares = _nodes_round(feet, numbers, cells)
+        at, upper = _nodes_round(feet, numbers, cells)
         own = numbers[CORNER_PARTS] if cells == 1 else numbers
         for _ in range(turns):
-            mean = _mean_at_nodes(left, at, shares * feet.weights, count)
+            mean = _mean_at_nodes(left, feet.weights, at, upper, count)
             correction += prolong(mean.take(own), cells, 2)
-            left = left - (mean.take(at) * shares).sum(0)
-        del at, shares
+            there = np.zeros_like(left)
+            for corner, nodes in zip(CELL, at):  # one by one, to save memory
+                there += mean.take(nodes) * _share(upper, corner)
+            left = left - there
     return correction
 
 
-def _nodes_round(
-    feet: FootPoints, numbers: IntArray, cells: int
-) -> tuple[NDArray[np.intp], FloatArray]:
-    """Return the 8 nodes round each foot point, (8, n), and its trilinear weights there, (8, n).
+def _nodes_round(feet: FootPoints, numbers: IntArray, cells: int) -> tuple[IntArray, FloatArray]:
+    """Return the 8 nodes round each foot point, (8, n), and what ``_share`` takes, (2, 3, n).
 
     The nodes have ``numbers`` (27, D) by the part of each block; with 1 cell along a block they are
     the corners of blocks, with 2 all parts.
     """
     low, within = _find_cell(feet.place, cells)
     step = STRIDES * (2 // cells)
-    at = step @ low + (CELL @ step)[:, None]
-    upper = np.stack([1 - within, within])  # (2, 3, n)
-    shares: FloatArray = upper[CELL[:, 0], 0] * upper[CELL[:, 1], 1] * upper[CELL[:, 2], 2]
-    at *= numbers.shape[1]  # in place: these arrays are the largest of the fit
-    at += feet.rows
-    at[:] = numbers.ravel().take(at)
-    return at, shares
+    first = (step @ low) * numbers.shape[1] + feet.rows
+    at = np.empty((len(CELL), len(first)), np.int32)
+    for corner, nodes in zip(CELL, at):
+        np.take(numbers.ravel(), first + (corner @ step) * numbers.shape[1], out=nodes)
+    return at, np.stack([1 - within, within])
+
+
+def _share(upper: FloatArray, corner: IntArray) -> FloatArray:
+    """Return the trilinear weights of one corner of the cells round n places, (n,)."""
+    x, y, z = corner
+    share: FloatArray = upper[x, 0] * upper[y, 1] * upper[z, 2]
+    return share
 
 
 def _mean_at_nodes(
-    values: FloatArray, at: NDArray[np.intp], weights: FloatArray, count: int
+    values: FloatArray, weights: FloatArray, at: IntArray, upper: FloatArray, count: int
 ) -> FloatArray:
-    """Return the mean at each of ``count`` nodes, (count,), of values (n,).
+    """Return the mean at each of ``count`` nodes, (count,), of values (n,) with weights (n,).
 
-    The ``weights`` (8, n) are of each value for the 8 nodes ``at``, (8, n).
+    The values count for the 8 nodes ``at``, (8, n), with trilinear shares.
     """
-    weight = weights.astype(np.float64)
-    sums: list[NDArray[np.float64]] = []
-    for _ in range(3):  # of weights, values and squares
-        total: NDArray[Any] = np.bincount(at.ravel(), weight.ravel(), count)
-        sums.append(total)
-        weight *= values
-    means = map_chunks(lambda some: _shrunk_mean(*(s[some] for s in sums)), count, 8)
+    sums = np.zeros((3, count))  # of weights, values and squares
+    for corner, nodes in zip(CELL, at):
+        weight = (_share(upper, corner) * weights).astype(np.float64)
+        index = nodes.astype(np.intp)
+        for total in sums:
+            np.add.at(total, index, weight)
+            weight *= values
+    means = map_chunks(lambda some: _shrunk_mean(*sums[:, some]), count, 8)
     return np.concatenate(means)
 
 

@@ -26,7 +26,7 @@ from .survey import Band
 POLE = 3**0.5 - 2
 TAIL = 12  # samples after which the prefilter has fallen to 1e-7
 BEYOND = TAIL + 2  # samples to either side on which the spline in a voxel depends
-STRIP_SAMPLES, STRIP_BYTES = 1 << 20, 60  # worked on at a time, and bytes of each, measured
+STRIP_SAMPLES = 1 << 20  # worked on at a time: they take 60 bytes each
 SIDE = 5  # coefficients along an axis on which the spline within half a voxel of a sample depends
 # Sums of fourth differences, in voxels, up to which a field is smooth, and from which it is not.
 SMOOTH, KINKED = 0.6, 1.3
@@ -105,14 +105,6 @@ def _strips(shape: tuple[int, ...]) -> Iterator[tuple[int, int]]:
     size = max(STRIP_SAMPLES // (shape[0] * shape[2]) - 2 * BEYOND, 2 * BEYOND)
     for start in range(0, shape[1], size):
         yield start, min(start + size, shape[1])
-
-
-def spline_bytes(shape: tuple[int, ...]) -> int:
-    """Return about how much memory ``spline_blocks`` takes, beyond the blocks."""
-    start, stop = next(plane_blocks(shape, least=2 * BEYOND))
-    planes = min(stop - start + 2 * BEYOND, shape[0])
-    size = max(STRIP_SAMPLES // (planes * shape[2]), 4 * BEYOND)
-    return 4 * planes * shape[1] * shape[2] + STRIP_BYTES * planes * min(size, shape[1]) * shape[2]
 
 
 def prefilter(values: FloatArray) -> FloatArray:

@@ -19,10 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pyfqmr import Simplify
 
-from ..arrays import BoolArray, IntArray
-from ..surface.mesh import Mesh
-from ..progress import ShareCallback
-from ..surface.topology import OpenEdges, irregular_places, row_keys, vertex_components
+from ..arrays import BoolArray
+from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid
 from .measuring import Original, mean_side
 
@@ -36,24 +34,18 @@ LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly 
 FEW_ROUNDS, STEEP_RISE = 8, 5.0
 MOST_REPEATS = 16  # of passes, before smaller distances are tried
 HALVINGS = 3
-LEFT = 0.85  # share of the work that is left after passes: a guess
+# A number of triangles is sought by the error that leaves as many.
+MOST_ERRORS = 12  # that are tried
+FIRST_ERROR = 0.006  # in sides of a triangle, over the share of the triangles that is wanted
+STRIDE, CLOSE = 4.0, 1.02  # largest ratio of an error to the next, and smallest of two in the end
+FARTHEST = 0.05  # over the diagonal of the box: larger errors leave no fewer
+NEAR_END = 1.2  # ratio of the largest error that is of use to one that need not rise any more
+# Simplified once more within the same error, meshes have fewer triangles, by about this factor.
+MARGIN = 1.06
 ANYWHERE: Points = np.zeros((0, 3))
 
 Collapse = Callable[[Mesh, BoolArray], Mesh]
 """Collapses edges of a mesh, but those of the triangles in a mask, (m,)."""
-
-
-class Rounds:
-    """Counts rounds of collapsing and measuring, whose number is not known before."""
-
-    def __init__(self, progress: ShareCallback | None = None) -> None:
-        self.progress, self.left = progress, 1.0
-
-    def count(self) -> None:
-        """Report that a round begins."""
-        if self.progress:
-            self.progress(1 - self.left)
-        self.left *= LEFT
 
 
 class Passes:
@@ -74,11 +66,11 @@ class Passes:
         self.kept: list[BoolArray] = []  # triangles of each mesh but the last
         self.places, self.since = ANYWHERE, np.zeros(0, np.intp)  # and the first pass to keep them
 
-    def result(self, rounds: Rounds) -> Mesh | None:
+    def result(self, count_round: Callable[[], None]) -> Mesh | None:
         """Return what the last pass makes once nothing is wrong with it, None if that fails."""
         first = 0
         for _ in range(MOST_REPEATS):
-            rounds.count()
+            count_round()
             self._collapse_from(first)
             result = self.meshes[-1]
             if not len(result.faces):
@@ -119,55 +111,116 @@ class Passes:
             first -= 1
             distance, face, _ = self.solids[first].nearest(wrong)
             before = self.kept[first][face] | ((distance > self.error) & (first > 0))
-            self.places = np.concatenate([self.places, wrong[~before]])
-            self.since = np.append(self.since, np.full(np.count_nonzero(~before), first))
+            self._keep_from(first, wrong[~before])
             wrong = wrong[before]
         return -1 if len(wrong) else first
 
     def _keep_lost(self, result: Mesh) -> int:
         """Keep the components of which nothing is left, in all passes; -1 if there are none."""
         base = self.meshes[0]
-        component = vertex_components(base.faces, len(base.vertices))[base.faces[:, 0]]
-        first = np.unique(vertex_components(result.faces, len(result.vertices))[result.faces[:, 0]])
+        component = base.components()[1][base.faces[:, 0]]
+        first = np.unique(result.components()[1][result.faces[:, 0]])
         found = component[self.solids[0].nearest_face(result.vertices[first])]
         lost = base.vertices[np.unique(base.faces[~np.isin(component, found)])]
-        self.places = np.concatenate([self.places, lost])
-        self.since = np.append(self.since, np.zeros(len(lost), np.intp))
+        self._keep_from(0, lost)
         return 0 if len(lost) else -1
+
+    def _keep_from(self, first: int, places: Points) -> None:
+        self.places = np.concatenate([self.places, places])
+        self.since = np.append(self.since, np.full(len(places), first))
 
     def _faults(self, result: Mesh) -> Points:
         """Return points, (n, 3), where a mesh is no manifold and the first one is, or is open."""
         places = irregular_places(result)
-        if not len(places) and self._is_closed:
+        if not len(places) and self.meshes[0].is_closed():
             return ANYWHERE
-        made = places[~np.isin(row_keys(places), row_keys(self._before))]
-        lost = self._before[~np.isin(row_keys(self._before), row_keys(places))]
+        before = self._irregular
+        made = places[~np.isin(row_keys(places), row_keys(before))]
+        lost = before[~np.isin(row_keys(before), row_keys(places))]
         lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
         return np.concatenate([made, lost]).reshape(-1, 3)
 
     @cached_property
-    def _is_closed(self) -> bool:
-        edges = OpenEdges()  # much faster than ``irregular_places``
-        edges.add(self.meshes[0].faces)
-        return not len(edges)
-
-    @cached_property
-    def _before(self) -> NDArray[np.float64]:
+    def _irregular(self) -> NDArray[np.float64]:
         return irregular_places(self.meshes[0])
 
 
 def within(
-    mesh: Mesh, original: Original, error: float, rounds: Rounds
+    mesh: Mesh, original: Original, error: float, count_round: Callable[[], None]
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh within a distance of the original one, and a warning if it is not simpler."""
     for halving in range(HALVINGS):
         distances = error / 2**halving * np.array(PLANE_DISTANCES)
         passes = [partial(collapse_within, distance=distance) for distance in distances]
-        result = Passes(mesh, passes, original, error).result(rounds)
+        result = Passes(mesh, passes, original, error).result(count_round)
         if result and len(result.faces) < len(mesh.faces):
             return result, ()
-    return mesh, ("the mesh was not simplified: none of its triangles can be spared within the "
-                  "error",)  # fmt: skip
+    return mesh, (
+        "the mesh was not simplified: none of its triangles can be spared within the error",
+    )
+
+
+def down_to(
+    mesh: Mesh, original: Original, triangles: int, count_round: Callable[[], None]
+) -> tuple[Mesh, tuple[str, ...]]:
+    """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning.
+
+    The error is sought that leaves somewhat more. Each error that is tried is a whole
+    simplification, so that the mesh is as good as that of the error.
+    """
+    everything, wanted = len(mesh.faces), MARGIN * triangles
+    if everything <= triangles:
+        return mesh, ()
+    farthest = FARTHEST * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
+    error = min(FIRST_ERROR * mean_side(mesh) * everything / triangles, farthest)
+    # an error and the triangles that it leaves at first: too many, and few enough
+    (low, more), (high, fewer) = (0.0, everything), (np.inf, 0)
+    reached, least, least_error, is_near = None, mesh, 0.0, False
+    for _ in range(MOST_ERRORS):
+        result, _ = within(mesh, original, error, count_round)
+        once = len(result.faces)
+        if triangles < once < MARGIN * wanted:
+            result, _ = within(result, original, error, count_round)
+        left = len(result.faces)
+        if left <= triangles:
+            reached = result
+        elif left < len(least.faces):
+            least, least_error = result, error
+        all_alike = not low and once == fewer  # as on planes
+        if once == everything > more and not fewer:  # the error is too large
+            farthest = min(farthest, error)
+        elif left > triangles:
+            low, more = error, once
+        else:  # ``is_near`` if it leaves hardly fewer
+            high, fewer, is_near = error, once, triangles < MARGIN * left
+        found = is_near and left <= triangles < once
+        if found or all_alike or (not fewer and farthest < NEAR_END * low):
+            break
+        if high < CLOSE * low:
+            if is_near:
+                break
+            low = 0.0  # smaller errors may leave few enough, too
+        # what is left falls about as a power of the error
+        if high == np.inf:
+            rise = float(np.clip(more / wanted, 1.1, STRIDE))
+            error = low * min(rise, max(1.1, float(np.sqrt(farthest / low))))
+        elif not low:
+            error = high * float(np.clip(fewer / wanted, 1 / STRIDE, 0.9))
+        else:
+            share = np.log(more / wanted) / np.log(more / fewer)
+            error = float(low * (high / low) ** np.clip(share, 0.15, 0.85))
+    if reached:
+        return reached, ()
+    if least_error:
+        least, _ = within(least, original, least_error, count_round)
+    passes = [partial(collapse_to, triangles=triangles)] * len(PLANE_DISTANCES)
+    exact = Passes(least, passes).result(count_round)  # whatever the distance
+    if exact and len(exact.faces) <= triangles:
+        return exact, ()
+    return least, (
+        f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of the same "
+        f"topology: it has {len(least.faces):,}",
+    )
 
 
 def same_topology(one: Mesh, other: Mesh) -> bool:
@@ -177,7 +230,7 @@ def same_topology(one: Mesh, other: Mesh) -> bool:
     """
 
     def euler_numbers(mesh: Mesh) -> NDArray[np.int64]:
-        component = vertex_components(mesh.faces, len(mesh.vertices))
+        _, component = mesh.components()
         used = np.bincount(mesh.faces.ravel(), minlength=len(component)) > 0
         triangles = np.bincount(component[mesh.faces[:, 0]])
         vertices = np.bincount(component[used])
@@ -215,8 +268,9 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
     """
     middle = mesh.vertices.mean(0, dtype=np.float64)
     scaled = (mesh.vertices - middle) / unit
-    used, collapsed = _renumbered(mesh.faces[~kept], len(scaled))
-    moved = scaled[used]
+    is_used = np.bincount(mesh.faces[~kept].ravel(), minlength=len(scaled)) > 0
+    collapsed = (np.cumsum(is_used, dtype=np.int32) - 1)[mesh.faces[~kept]]
+    moved = scaled[is_used]
     if len(collapsed):
         with ONE_AT_A_TIME:
             library = Simplify()
@@ -238,7 +292,26 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
     return Mesh(np.concatenate([vertices, mesh.vertices[extra]]), faces)
 
 
-def _renumbered(faces: IntArray, count: int) -> tuple[NDArray[np.intp], IntArray]:
-    """Return which of ``count`` vertices faces (m, 3) use, and the faces with these numbered."""
-    used = np.bincount(faces.ravel(), minlength=count) > 0
-    return np.flatnonzero(used), (np.cumsum(used, dtype=np.int32) - 1)[faces]
+def irregular_places(mesh: Mesh) -> NDArray[np.float64]:
+    """Return where a mesh is no closed manifold, (n, 6): the two ends of an edge, or a point twice.
+
+    These are the edges, in the direction of their triangle, without exactly one triangle that
+    passes them in the other direction, and the vertices at which several fans of triangles meet, or
+    that are at the position of another one, or at which two triangles have the same three corners.
+    """
+    positions, faces = mesh.vertices.astype(np.float64), mesh.faces
+    opposite, _, _ = mesh.pair_edges()
+    fans = mesh.count_fans(opposite)
+    unpaired = np.flatnonzero(opposite < 0)
+    start, end = faces.ravel()[unpaired], np.roll(faces, -1, axis=1).ravel()[unpaired]
+    pinched = np.flatnonzero(fans > 1)
+    doubled = _doubled(np.sort(faces, axis=1).astype(np.float64))
+    both = np.concatenate([pinched, _doubled(positions), faces[doubled].astype(np.intp).ravel()])
+    ends = np.concatenate([start, both]), np.concatenate([end, both])
+    return np.concatenate([positions[ends[0]], positions[ends[1]]], axis=1)
+
+
+def _doubled(rows: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the rows that are equal to another row."""
+    _, inverse, uses = np.unique(row_keys(rows), return_inverse=True, return_counts=True)
+    return np.flatnonzero(uses[inverse] > 1)

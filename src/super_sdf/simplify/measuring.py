@@ -12,8 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.mesh import Mesh
-from ..surface.topology import row_keys
+from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Distances, Points, Solid
 
 POINTS_AT_ONCE = 1 << 18
@@ -41,15 +40,18 @@ class Original:
         They are its vertices, or if these are near enough, the middles of its triangles, or else
         what is nearest to points of the other.
         """
-        self._forget_all_but(result)
-        tree, vertices = Solid(result), self.solid.mesh.vertices
+        self._keep_what_stays(result)
+        tree, vertices, faces = Solid(result), self.solid.mesh.vertices, self.mesh.faces
         stale = np.flatnonzero(self.near < 0)
         self.distance[stale], self.near[stale], _ = tree.nearest(vertices[stale])
         far = self.distance > distance
         self.near[far] = -1
         if far.any():
             return vertices[far]
-        middles = vertices[self.mesh.faces[self._is_across()]].mean(1)
+        # Triangles are convex: one whose corners are near the same triangle of the other mesh is
+        # nowhere farther from it than its corners.
+        near = self.near[faces]
+        middles = vertices[faces[(near[:, :1] != near[:, 1:]).any(1)]].mean(1)
         off = tree.distance(middles)
         self.largest_middle = float(off.max(initial=0))
         if self.largest_middle > distance:
@@ -61,33 +63,23 @@ class Original:
         self.beyond(result, np.inf)
         area = areas(self.mesh)
         around = self.distance[self.mesh.faces].mean(1)
-        mean_back = self.back[1].sum() / areas(Solid(result).mesh).sum()
         return (
             max(float(self.distance.max()), self.largest_middle),
             float(around @ area / area.sum()),
             float(self.back[0].max()),
-            float(mean_back),
+            float(self.back[1].sum() / areas(Solid(result).mesh).sum()),
         )
 
-    def _is_across(self) -> NDArray[np.bool_]:
-        """Return which triangles are near several triangles of the other mesh, (m,).
-
-        All others are nowhere farther from it than their corners, as triangles are convex.
-        """
-        near = self.near[self.mesh.faces]
-        return (near[:, :1] != near[:, 1:]).any(1)
-
-    def _forget_all_but(self, result: Mesh) -> None:
+    def _keep_what_stays(self, result: Mesh) -> None:
         """Keep what was measured at triangles that a mesh still has."""
         keys = row_keys(result.vertices.astype(np.float64)[result.faces].reshape(-1, 9))
         order = np.argsort(keys)
         at = np.searchsorted(keys, self.keys, sorter=order) if len(keys) else self.keys
         same = order[np.minimum(at, len(keys) - 1)]
         stays = keys[same] == self.keys
-        there = np.where(stays, same, -1)
         back = np.full((2, len(keys)), np.nan)
         back[:, same[stays]] = self.back[:, stays]
-        self.near = np.append(there, -1)[self.near]
+        self.near = np.append(np.where(stays, same, -1), -1)[self.near]
         self.keys, self.back = keys, back
 
     def _measure_back(self, result: Mesh, distance: float) -> Iterator[Points]:

@@ -2,23 +2,36 @@
 
 It ends where samples are unknown. As in marching cubes of the samples, a cell has a surface only if
 all its eight samples are known. Such a cell holds one octant of each of eight voxels.
+
+``border``, (2, 3), is the first voxel of the whole grid along each axis and the one after its last,
+counted from the first voxel of the field: (0, 0, 0) and the field's shape, unless the field is of a
+part of the grid. A part is closed only where its border is that of the grid.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import CORNERS, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError
-from ..grid.planes import SampleArray
 from ..grid.sdf_grid import SdfGrid
-from ..network.neighbourhood import CORNERS, NEIGHBOURHOOD
-from ..refine.band import neighbour_table, plane_blocks, rescale
-from ..refine.field import FineField, border_is_crossed
-from ..refine.nodes import (BARELY_INSIDE, BARELY_OUTSIDE, SHARING, SharedParts, block_ijk, nodes_of_part, seen_from, share_parts)
+from ..refine.band import neighbour_table, rescale
+from ..refine.field import FineField
+from ..refine.nodes import (
+    BARELY_INSIDE,
+    BARELY_OUTSIDE,
+    SHARING,
+    SharedParts,
+    block_ijk,
+    nodes_of_part,
+    seen_from,
+    share_parts,
+)
+from ..threads import chunks_of
 
 WAY_OUT = (
     "end the surface there (--open), or replace each by a distance of the right sign (the cut-off "
@@ -26,75 +39,70 @@ WAY_OUT = (
 )
 
 
-def close(field: FineField, *, cap: bool, beside: int = 1) -> FineField:
-    """Return the field closed where it should be; where the solid leaves the grid, with ``cap``."""
-    if field.octants is not None:  # it ends where samples are unknown, and cannot be closed
-        return field
-    if field.leaves:
-        return close_at_border(field, beside) if cap else field
-    # A tip that ends just before the border may cross it though all samples there are outside: the
-    # fine lattice reaches half a voxel farther than the samples. Such a solid does not leave.
-    if border_is_crossed(field, beside + 1):
-        return _close(field, np.empty((0, 3), np.int32), beside)
-    return field
+def close(field: FineField, *, cap: bool, border: IntArray | None = None) -> FineField:
+    """Return the field with voxels beyond the border of the grid, where it should be closed there.
 
-
-def close_at_border(field: FineField, beside: int = 1) -> FineField:
-    """Surround the grid with outside voxels, so that the surface is closed along the border.
+    That is where the solid leaves the grid, with ``cap``. A tip that ends just before the border
+    may also cross it, though all samples there are outside: the fine lattice reaches half a voxel
+    farther than the samples. Such a solid does not leave, and is closed in any case.
 
     Added are the border voxels inside the solid that were not decoded, and a layer beyond, whose
-    nodes are placed on the border (see ``marching``), so the cap is flat. A slab is closed in its
-    own planes, in those ``beside`` on which its mesh depends, and in one more before, which owns
-    vertices of those.
+    nodes are placed on the border (see ``marching``), so the cap is flat.
     """
-    return _close(field, find_border_inside(field, *_planes_beside(field, beside)), beside)
-
-
-def find_border_inside(field: FineField, first: int, last: int) -> IntArray:
-    """Return the border voxels (n, 3) of some planes that are inside and have no block.
-
-    The planes must be some whose voxels the field has.
-    """
-    if field.border_inside is not None:
-        plane = field.border_inside[:, 0]
-        return field.border_inside[(plane >= first) & (plane < last)]
-    grid, found = field.placed, [np.empty((0, 3), np.int64)]
-    for low, high in plane_blocks(grid.shape, first, last):
-        inside = rescale(grid, field.offset, low, high) <= 0
-        inner = slice(max(1 - low, 0), min(grid.shape[0] - 1, high) - low)
-        inside[inner, 1:-1, 1:-1] = False
-        known = field.voxel_ijk[field.rows(low, high)]
-        inside[known[:, 0] - low, known[:, 1], known[:, 2]] = False
-        found.append(np.argwhere(inside) + np.array([low, 0, 0]))
-    return np.concatenate(found).astype(np.int32)
-
-
-def _planes_beside(field: FineField, beside: int) -> tuple[int, int]:
-    return max(field.planes[0] - beside - 1, 0), min(field.planes[1] + beside, field.shape[0])
-
-
-def _close(field: FineField, filled: IntArray, beside: int) -> FineField:
-    """Return the field with the border voxels ``filled`` inside, and outside ones beyond."""
-    rows = field.rows(*_planes_beside(field, beside))
-    known = field.voxel_ijk[rows]
-    border = np.concatenate([known, filled])
-    voxel_ijk = np.concatenate([border, outer_voxels(border, field.shape)])
+    if field.octants is not None or (field.leaves and not cap):
+        return field
+    border = np.array([(0, 0, 0), field.shape]) if border is None else border
+    known = field.voxel_ijk
+    filled = find_border_inside(field, border) if field.leaves else known[:0]
+    solid = np.concatenate([known[_reaches_border(field, border)], filled])
+    if not len(solid):
+        return field
+    voxel_ijk = np.concatenate([known, filled, outer_voxels(solid, border)])
     order = np.lexsort(voxel_ijk.T[::-1])
     voxel_ijk = voxel_ijk[order]
-
-    padded = tuple(n + 2 for n in field.shape)
-    parts = share_parts(neighbour_table(voxel_ijk + 1, padded))
+    nx, ny, nz = field.shape
+    parts = share_parts(neighbour_table(voxel_ijk + 1, (nx + 2, ny + 2, nz + 2)))
     column_of = np.empty(len(order), np.int32)  # of each voxel before sorting
     column_of[order] = np.arange(len(order))
-    known_at, solid_at, _ = np.split(column_of, [len(known), len(border)])
+    known_at, filled_at = column_of[: len(known)], column_of[len(known) :][: len(filled)]
     blocks = np.full((len(field.blocks), len(voxel_ijk)), BARELY_OUTSIDE, np.float32)
-    _set_blocks(BARELY_INSIDE, solid_at, blocks, parts, field.factor)
-    _set_blocks(field.blocks[:, rows], known_at, blocks, parts, field.factor)  # last: these win
-    ends = (-1, field.shape[0] + 1)  # the outer layers belong to the first slab and the last
-    planes = [ends[n] if at in (0, field.shape[0]) else at for n, at in enumerate(field.planes)]
-    return replace(
-        field, voxel_ijk=voxel_ijk, blocks=blocks, parts=parts, planes=(planes[0], planes[1])
-    )
+    _set_blocks(BARELY_INSIDE, filled_at, blocks, parts, field.factor)
+    near = ((known <= border[0] + 1) | (known >= border[1] - 2)).any(1)  # others have no new voxel
+    blocks[:, known_at[~near]] = field.blocks[:, ~near]  # beside them
+    _set_blocks(field.blocks[:, near], known_at[near], blocks, parts, field.factor)
+    return replace(field, voxel_ijk=voxel_ijk, blocks=blocks, parts=parts)
+
+
+def _reaches_border(field: FineField, border: IntArray) -> BoolArray:
+    """Return which voxels have a node on the border of the grid that is inside, (D,)."""
+    found = np.zeros(len(field.voxel_ijk), bool)
+    node_ijk = block_ijk(field.factor)
+    for axis in range(3):
+        for voxel, end in ((border[0, axis], 0), (border[1, axis] - 1, field.factor)):
+            rows = np.flatnonzero(field.voxel_ijk[:, axis] == voxel)
+            nodes = np.flatnonzero(node_ijk[:, axis] == end)
+            found[rows] |= (field.blocks[nodes[:, None], rows] <= 0).any(0)
+    return found
+
+
+def find_border_inside(field: FineField, border: IntArray | None = None) -> IntArray:
+    """Return the border voxels (n, 3) that are inside and have no block."""
+    if field.border_inside is not None:
+        return field.border_inside
+    border = np.array([(0, 0, 0), field.shape]) if border is None else border
+    grid, found = field.placed, [np.empty((0, 3), np.int64)]
+    ends = [
+        np.isin(np.arange(n), (low, high - 1))
+        for n, low, high in zip(field.shape, *border.tolist())
+    ]
+    for planes in chunks_of(field.shape[0], field.shape[1] * field.shape[2]):
+        inside = rescale(grid, field.offset, planes.start, planes.stop) <= 0
+        inside &= ends[0][planes, None, None] | ends[1][:, None] | ends[2]
+        low, high = np.searchsorted(field.voxel_ijk[:, 0], [planes.start, planes.stop])
+        i, j, k = field.voxel_ijk[low:high].T
+        inside[i - planes.start, j, k] = False
+        found.append(np.argwhere(inside) + np.array([planes.start, 0, 0]))
+    return np.concatenate(found).astype(np.int32)
 
 
 def _set_blocks(
@@ -115,12 +123,11 @@ def _set_blocks(
             blocks[seen[:, None], neighbour[there]] = values[nodes[part][:, None], there]
 
 
-def outer_voxels(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:
+def outer_voxels(voxel_ijk: IntArray, border: NDArray[Any]) -> IntArray:
     """Return the neighbours (n, 3) of these voxels that lie beyond the grid."""
-    last = np.array(shape, np.int32) - 1
-    border = voxel_ijk[((voxel_ijk == 0) | (voxel_ijk == last)).any(1)]
-    around = (border[:, None] + NEIGHBOURHOOD).reshape(-1, 3)
-    beyond = around[((around < 0) | (around > last)).any(1)]
+    outermost = voxel_ijk[((voxel_ijk == border[0]) | (voxel_ijk == border[1] - 1)).any(1)]
+    around = (outermost[:, None] + NEIGHBOURHOOD).reshape(-1, 3)
+    beyond = around[((around < border[0]) | (around >= border[1])).any(1)]
     return np.unique(beyond, axis=0).astype(np.int32)
 
 
@@ -138,14 +145,16 @@ def check_all_seen(grid: SdfGrid, what: str) -> None:
         raise GridError(f"samples beside the surface are unknown, so it is open there: {what}")
 
 
-def seen_octants(unseen: SampleArray, voxel_ijk: IntArray) -> NDArray[np.uint8]:
-    """Return a bit for each octant of voxels (D, 3), (D,): whether no sample round it is unseen."""
+def seen_octants(unseen: Any, voxel_ijk: IntArray) -> NDArray[np.uint8]:
+    """Return a bit for each octant of voxels (D, 3), (D,): whether no sample round it is unseen.
+
+    ``unseen`` is an array of the grid's shape, sliced by planes: which samples are unknown.
+    """
     seen = np.empty(len(voxel_ijk), np.uint8)
-    for first, last in plane_blocks(tuple(unseen.shape)):
-        rows = slice(*np.searchsorted(voxel_ijk[:, 0], [first, last]).tolist())
-        low, high = max(first - 1, 0), min(last + 1, unseen.shape[0])
-        marked = np.pad(np.asarray(unseen[low:high]), 1, mode="edge")
-        any_of = marked
+    for planes in chunks_of(unseen.shape[0], unseen.shape[1] * unseen.shape[2]):
+        rows = slice(*np.searchsorted(voxel_ijk[:, 0], [planes.start, planes.stop]).tolist())
+        low = max(planes.start - 1, 0)
+        any_of = np.pad(np.asarray(unseen[low : planes.stop + 1]), 1, mode="edge")
         for axis in range(3):
             lines = np.moveaxis(any_of, axis, 0)
             any_of = np.moveaxis(lines[1:] | lines[:-1], 0, axis)
@@ -153,11 +162,3 @@ def seen_octants(unseen: SampleArray, voxel_ijk: IntArray) -> NDArray[np.uint8]:
         octants = [any_of[tuple((cell + corner).T)] for corner in CORNERS]
         seen[rows] = np.packbits(~np.stack(octants, 1), axis=1, bitorder="little")[:, 0]
     return seen
-
-
-def octant_of_cells(factor: int) -> NDArray[np.uint8]:
-    """Return the octant of the voxel, 0 to 7, in which each cell of a block lies, (K^3,)."""
-    low = block_ijk(factor)
-    low = low[(low < factor).all(1)]
-    octant: NDArray[np.uint8] = ((low >= factor // 2) @ np.array([4, 2, 1])).astype(np.uint8)
-    return octant

@@ -6,11 +6,11 @@ by distance. Cells that share a face see the same edges on it, so the mesh is a 
 2-manifold, except where the blocks end. In steps:
 
 1. ``find_crossings`` lists the lattice edges and cells of each block that the surface crosses.
-2. ``place_vertices`` makes a vertex on each crossed edge, in the voxel that owns the edge.
+2. ``lattice_positions`` are those of the vertices, one on each crossed edge, in the voxel that owns
+   the edge.
 3. ``connect`` looks up the vertices on the edges of each crossed cell, and makes its triangles.
 
-Vertices and triangles are in the order of the voxels, so a surface made slab by slab is the same as
-one made at once.
+Vertices and triangles are in the order of the voxels.
 
 The edge from node q of a block along axis a has the number ``a Q + q`` in the block, Q = (K+1)^3.
 Its number in another block that shares it, or relative to a cell, therefore differs by a constant.
@@ -21,52 +21,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, IntArray
-from ..grid.sdf_grid import SdfGrid
-from ..threads import check_count, map_chunks, map_threads, rows_in_chunk
-from .mesh import CLEARANCE, Mesh, vertex_type
-from ..network.neighbourhood import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES
-from .cap import octant_of_cells
-from .cell_cases import EDGE_AXIS, EDGE_START, FACES, choices, triangle_table
+from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, IntArray
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, part_of_node
+from ..threads import map_chunks, map_threads, rows_in_chunk, worthwhile_threads
+from .cell_cases import EDGE_AXIS, EDGE_START, FACES, tables
+from .mesh import CLEARANCE
 
-# Bytes per node of a block in the vertex lookup table: three edges, four bytes each.
-LOOKUP_BYTES = 12
-# Nodes beyond the grid's border (of a cap, see cap.close_at_border) are placed this far outside it,
+# Nodes beyond the grid's border (of a cap, see ``cap.close``) are placed this far outside it,
 # in fine spacings: enough for distinct vertices.
 CAP_HEIGHT = 0.02
-NO_FACES = np.empty((0, 3), np.int32)
-
-
-def extract_pieces(
-    field: FineField, grid: SdfGrid, first_vertex: int = 0, threads: int = 1
-) -> list[Mesh]:
-    """Return the zero level of a field, in one or more pieces: see ``meshers.extract_mesh``."""
-    core = field.own_rows
-    before = field.plane_before(core).start if core.start < core.stop else core.start
-    rows = slice(before, core.stop)
-    crossings = find_crossings(field, rows, threads)
-    first = first_vertex - crossings.own(core).start
-    check_count(first + len(crossings.own_row), "vertices")
-    groups = groups_of_planes(field)
-    widest = max((rows.stop - field.plane_before(rows).start for rows in groups), default=0)
-    at_once = lookups_at_once(len(field.voxel_ijk), widest, threads)
-
-    def mesh_of(group: slice) -> Mesh:
-        own = crossings.own(group)
-        edges = crossings.own_row[own], crossings.own_edge[own]
-        vertices = to_world(lattice_positions(field, *edges), field, grid)
-        return Mesh(vertices, connect(field, crossings, group, first))
-
-    meshes = map_threads(mesh_of, groups, at_once)
-    return meshes or [Mesh(np.empty((0, 3), vertex_type(grid, field.factor)), NO_FACES)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,27 +50,16 @@ class Crossings:
     cell: NDArray[np.int16]  # (c,), ... crossed cells of their blocks ...
     case: NDArray[np.int16]  # (c,), ... and the cases of these cells (``cell_cases``)
 
-    def own(self, rows: slice) -> slice:
-        """Return which of the own edges belong to some voxels."""
-        return _between(self.own_row, rows)
 
-
-def _between(sorted_rows: IntArray, rows: slice) -> slice:
-    """Return the places of some rows; bounds of another type would copy the array."""
-    ends = np.array([rows.start, rows.stop], sorted_rows.dtype)
-    start, stop = np.searchsorted(sorted_rows, ends)
-    return slice(int(start), int(stop))
-
-
-def find_crossings(field: FineField, rows: slice, threads: int = 1) -> Crossings:
-    """Return the edges and cells that the surface crosses in the blocks of some voxels."""
+def find_crossings(field: FineField, threads: int = 1) -> Crossings:
+    """Return the edges and cells that the surface crosses."""
     chunks = map_chunks(
-        lambda some: _crossings_of_chunk(field, rows.start + some.start, rows.start + some.stop),
-        rows.stop - rows.start,
+        lambda rows: _crossings_of_chunk(field, rows.start, rows.stop),
+        len(field.voxel_ijk),
         4 * len(field.blocks),
         threads,
     )
-    empty = _crossings_of_chunk(field, rows.start, rows.start)
+    empty = _crossings_of_chunk(field, 0, 0)
     return Crossings(*(np.concatenate(arrays) for arrays in zip(empty, *chunks)))
 
 
@@ -173,7 +131,7 @@ def choose_cases(
     The inside corners of an ambiguous face are joined where bilinear interpolation on it is
     negative at its saddle (Nielson and Hamann 1991).
     """
-    table = choices()
+    table = tables()
     case: NDArray[np.int16] = corners.astype(np.int16)
     unsure = np.flatnonzero(table.ambiguous[corners])
     low, row = cells_low_nodes(field.factor)[cell[unsure]], row[unsure]
@@ -197,57 +155,27 @@ def part_of_edge(factor: int) -> IntArray:
     return part
 
 
-def groups_of_planes(field: FineField) -> list[slice]:
-    """Return the rows of the field's own planes, cut into runs of planes of about a chunk each."""
-    core = field.own_rows
-    plane = field.voxel_ijk[core, 0]
-    starts = core.start + np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1))
-    step = rows_in_chunk(len(field.blocks))
-    found = np.searchsorted(starts, np.arange(core.start, core.stop, step))
-    chosen = found[np.diff(found, prepend=-1) > 0]  # np.unique would load masked arrays
-    bounds = [*starts[chosen[chosen < len(starts)]].tolist(), core.stop]
-    return [slice(a, b) for a, b in pairwise(bounds)]
-
-
-def lookups_at_once(voxels: int, widest: int, threads: int) -> int:
-    """Return how many threads may hold a vertex lookup table at the same time.
-
-    A table may be large, since one plane may hold the whole surface. All tables, of ``widest``
-    voxels each, take at most twice the memory of the values of all ``voxels``, or there is one.
-    """
-    return max(min(8 * voxels // max(LOOKUP_BYTES * widest, 1), threads), 1)
-
-
 def lattice_positions(
-    field: FineField, row: IntArray, edge: NDArray[np.int16]
+    field: FineField, row: IntArray, edge: NDArray[np.int16], border: IntArray
 ) -> NDArray[np.float64]:
-    """Return where the surface crosses edges of blocks, (3, n), in fine spacings from node 0."""
+    """Return where the surface crosses edges of blocks, (3, n), in fine spacings from node 0.
+
+    ``border`` is that of the grid, see ``cap``.
+    """
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
     low = field.blocks[node, row].astype(np.float64)
     high = field.blocks[edge_ends(field.factor)[edge], row].astype(np.float64)
     share = np.clip(low / (low - high), CLEARANCE, 1 - CLEARANCE)
     positions = np.empty((3, len(row)))
-    for along, samples in enumerate(field.shape):
+    for along, (before, after) in enumerate(border.T.tolist()):
         voxel, runs = field.voxel_ijk[row, along], axis == along
         start = field.factor * voxel + block_ijk(field.factor)[node, along]
         positions[along] = start + np.where(runs, share, 0.0)
-        if ((voxel < 0) | (voxel >= samples)).any():  # voxels of a cap: moved onto the border
-            ends = -CAP_HEIGHT, samples * field.factor + CAP_HEIGHT
+        if ((voxel < before) | (voxel >= after)).any():  # voxels of a cap: moved onto the border
+            ends = before * field.factor - CAP_HEIGHT, after * field.factor + CAP_HEIGHT
             begin, end = (np.clip(x.astype(np.float64), *ends) for x in (start, start + runs))
             positions[along] = begin + share * (end - begin)
     return positions
-
-
-def to_world(positions: NDArray[np.float64], field: FineField, grid: SdfGrid) -> NDArray[Any]:
-    """Return positions (3, n) in fine spacings as vertices (n, 3) in world units."""
-    vertices: NDArray[Any] = np.empty(positions.shape[::-1], vertex_type(grid, field.factor))
-    if not grid.is_straight:
-        vertices[:] = grid.to_world(positions.T / field.factor - 0.5)
-        return vertices
-    for axis, position in enumerate(positions):
-        sample = position / field.factor - 0.5  # the fine index K i + K/2 is sample i
-        vertices[:, axis] = sample * grid.spacing[axis] + grid.origin[axis]
-    return vertices
 
 
 @lru_cache
@@ -256,32 +184,56 @@ def edge_ends(factor: int) -> NDArray[np.intp]:
     return (np.arange((factor + 1) ** 3) + strides(factor)[:, None]).ravel()
 
 
-def connect(field: FineField, crossings: Crossings, rows: slice, first: int) -> IntArray:
-    """Return the triangles (m, 3) in some whole planes, in the order of voxels and cells.
+def connect(field: FineField, crossings: Crossings, threads: int = 1) -> IntArray:
+    """Return the triangles (m, 3) of all crossed cells, in the order of voxels and cells.
 
-    ``first`` is the vertex number of the first of ``crossings``' own edges. The lookup table of
-    vertices begins at the plane before; of that it has only the edges that each voxel owns.
+    A vertex has the number of its edge among the own edges. To look it up, runs of planes of voxels
+    have a table of all edges of their blocks, to which the plane before belongs: voxels in it may
+    own edges of the run.
     """
-    before = np.int64(field.plane_before(rows).start)
-    own = crossings.own(slice(int(before), rows.stop))
-    vertex_at = edge_table(
-        field,
-        crossings,
-        lambda row: row - before,
-        rows.stop - int(before),
-        own,
-        _between(crossings.other_row, rows),
-        np.arange(first + own.start, first + own.stop),
-    )
-    some = _between(crossings.cell_row, rows)
-    case = crossings.case[some]
-    counts, starts, table = _flat_triangles(field.factor)
-    low = (crossings.cell_row[some] - before) * (3 * len(field.blocks))
-    low += cells_low_nodes(field.factor)[crossings.cell[some]]
-    times = counts[case]
-    nth = np.arange(times.sum()) + np.repeat(starts[case] - (np.cumsum(times) - times), times)
-    faces: IntArray = vertex_at.take(table[nth] + np.repeat(low, times)[:, None])
+    table = tables()
+    from_low = edge_steps(field.factor)[table.triangles]
+    times = table.times[crossings.case]
+    end = np.cumsum(times, dtype=np.int64)
+    faces = np.empty((int(end[-1]) if len(end) else 0, 3), np.int32)
+    plane = field.voxel_ijk[:, 0]
+    planes = np.append(np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1)), len(plane))
+    steps = np.arange(0, len(plane), rows_in_chunk(len(field.blocks)))
+    cuts = np.unique(np.append(np.searchsorted(planes, steps), len(planes) - 1))
+
+    def fill(run: tuple[int, int]) -> None:
+        first, last = planes[run[0]], planes[run[1]]
+        before = planes[max(run[0] - 1, 0)]
+        own = _between(crossings.own_row, before, last)
+        vertex_at = edge_table(
+            field,
+            crossings,
+            lambda row: row - before,
+            int(last - before),
+            own,
+            _between(crossings.other_row, first, last),
+            np.arange(own.start, own.stop),
+        )
+        some = _between(crossings.cell_row, first, last)
+        low = (crossings.cell_row[some] - before) * (3 * len(field.blocks))
+        low += cells_low_nodes(field.factor)[crossings.cell[some]]
+        begin = int(end[some.start] - times[some.start]) if some.start < some.stop else 0
+        each = times[some]
+        nth = np.arange(begin, begin + each.sum())
+        nth += np.repeat(table.first[crossings.case[some]] - (end[some] - each), each)
+        corners = from_low[nth] + np.repeat(low, each)[:, None]
+        vertex_at.take(corners, out=faces[begin : begin + len(corners)], mode="clip")
+
+    runs = list(zip(cuts[:-1].tolist(), cuts[1:].tolist()))
+    map_threads(fill, runs, worthwhile_threads(12 * len(faces), threads))
     return faces
+
+
+def _between(sorted_rows: IntArray, first: int, last: int) -> slice:
+    """Return the places of some rows; bounds of another type would copy the array."""
+    ends = np.array([first, last], sorted_rows.dtype)
+    start, stop = np.searchsorted(sorted_rows, ends)
+    return slice(int(start), int(stop))
 
 
 def edge_table(
@@ -330,6 +282,14 @@ def strides(factor: int) -> NDArray[np.int64]:
 
 
 @lru_cache
+def octant_of_cells(factor: int) -> NDArray[np.uint8]:
+    """Return the octant of the voxel, 0 to 7, in which each cell of a block lies, (K^3,)."""
+    low = block_ijk(factor)[cells_low_nodes(factor)]
+    octant: NDArray[np.uint8] = ((low >= factor // 2) @ np.array([4, 2, 1])).astype(np.uint8)
+    return octant
+
+
+@lru_cache
 def cells_low_nodes(factor: int) -> NDArray[np.intp]:
     """Return the node at the low corner of each cell of a block, (K^3,)."""
     return np.flatnonzero((block_ijk(factor) < factor).all(1))
@@ -340,12 +300,3 @@ def edge_steps(factor: int) -> NDArray[np.int64]:
     start = (CORNERS @ strides(factor))[np.array(EDGE_START)]
     steps: NDArray[np.int64] = start + np.array(EDGE_AXIS) * (factor + 1) ** 3
     return steps
-
-
-@lru_cache
-def _flat_triangles(factor: int) -> tuple[IntArray, IntArray, NDArray[np.int64]]:
-    """Return the triangles of all cases: how many, the first, edges from the cell's low node."""
-    counts, table = triangle_table()
-    edge = edge_steps(factor)
-    used = np.arange(table.shape[1]) < counts[:, None]
-    return counts, (np.cumsum(counts) - counts).astype(np.int32), edge[table[used]]

@@ -1,30 +1,21 @@
-"""Reading mesh files: regular files only, and one-line errors.
-
-The plainest of PLY files, as this package and most others write them, are read here: little-endian
-triangles, ``property list uchar int``, after vertices whose properties are numbers. Everything else
-is left to trimesh, which takes twice the time and memory.
-"""
+"""Reading mesh files with trimesh: regular files only, and one-line errors."""
 
 from __future__ import annotations
 
 import logging
 import os
-import re
 import warnings
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, MeshError, OutOfMemoryError, SuperSdfError
 from ..files.regular import check_regular_file
-from ..machine.memory import held_memory, in_words, memory_bound
 from ..surface.mesh import Mesh
-from ..surface.topology import row_keys
+from ..threads import held_memory, in_words, memory_bound
 
 # Products and squares of larger coordinates overflow.
 LARGEST_COORDINATE = 1e30
@@ -42,8 +33,17 @@ def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
     missing vertices, or coordinates that are not finite or larger than ``LARGEST_COORDINATE``.
     """
     path = check_regular_file(path)
-    _check_archive(path, max_memory)
-    vertices, faces = _load(path)
+    try:
+        _check_archive(path, max_memory)
+        vertices, faces = _load(path)
+    except OutOfMemoryError:
+        raise
+    except SuperSdfError as error:  # in a file that this one refers to
+        raise FileError(f"{path} refers to another file: {error}") from error
+    except Exception as error:  # the readers of trimesh raise all kinds of errors
+        reason = str(error).strip().splitlines()
+        first = reason[0][:200] if reason else type(error).__name__
+        raise FileError(f"{path} cannot be read as a mesh: {first}") from error
     if not len(faces):
         raise MeshError(f"{path} holds no triangle: give a surface mesh")
     if faces.min() < 0 or faces.max() >= len(vertices):
@@ -78,16 +78,10 @@ def merged(mesh: Mesh) -> Mesh:
     step = MERGE_DISTANCE * min(1.0, float(np.ptp(vertices, axis=0).max()))
     step = max(step, float(np.abs(vertices).max()) * SMALLEST_STEP) or 1.0
     places = np.round(vertices / step).astype(np.int64)
-    if are_distinct(places):
-        return Mesh(vertices, faces)
     first, place = unique_rows(places, keep_order=True)
+    if len(first) == len(vertices):
+        return Mesh(vertices, faces)
     return Mesh(vertices[first], place.astype(np.int32)[faces])
-
-
-def are_distinct(rows: NDArray[np.int64]) -> bool:
-    """Return whether the rows, (n, 3), are certainly distinct: their hashes differ."""
-    keys = np.sort(row_keys(rows.astype(np.float64)))
-    return not bool((keys[1:] == keys[:-1]).any())
 
 
 def _check_archive(path: Path, max_memory: int | None) -> None:
@@ -95,11 +89,8 @@ def _check_archive(path: Path, max_memory: int | None) -> None:
     bound = memory_bound(max_memory)
     if bound is None or not zipfile.is_zipfile(path):
         return
-    try:
-        with zipfile.ZipFile(path) as archive:
-            size = sum(info.file_size for info in archive.infolist())
-    except Exception as error:  # zipfile raises many kinds of error on damaged fields
-        raise FileError(f"{path} cannot be read as a mesh: {error}") from None
+    with zipfile.ZipFile(path) as archive:
+        size = sum(info.file_size for info in archive.infolist())
     need, left = XML_BYTES * size, max(bound - (held_memory() or 0), 0)
     if need > left:
         raise OutOfMemoryError(
@@ -108,42 +99,22 @@ def _check_archive(path: Path, max_memory: int | None) -> None:
         )
 
 
-def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[Any]]:
-    """Return vertices (n, 3) and faces (m, 3) as they stand."""
-    try:
-        plain = read_plain_ply(path) if path.suffix.lower() == ".ply" else None
-        return plain or _load_with_trimesh(path)
-    except SuperSdfError as error:  # in a file that this one refers to
-        raise FileError(f"{path} refers to another file: {error}") from error
-    except Exception as error:  # the readers of trimesh raise all kinds of errors
-        reason = str(error).strip().splitlines()
-        first = reason[0][:200] if reason else type(error).__name__
-        raise FileError(f"{path} cannot be read as a mesh: {first}") from error
-
-
-def _load_with_trimesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return vertices (n, 3) and faces (m, 3) as they stand, without warnings on the way."""
     import trimesh
 
-    with _quiet():
-        # unprocessed: otherwise faces with non-finite vertices would be dropped silently
-        found = trimesh.load_mesh(path, process=False, resolver=_file_resolver(path))
-        vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
-        faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
-    return vertices, faces
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence warnings of NumPy and trimesh: what matters is checked afterwards."""
-    log = logging.getLogger("trimesh")
-    handler = logging.NullHandler()  # without a handler, Python prints warnings to stderr
-    log.addHandler(handler)
+    log, handler = logging.getLogger("trimesh"), logging.NullHandler()
+    log.addHandler(handler)  # without a handler, Python prints warnings to stderr
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            yield
+            # unprocessed: otherwise faces with non-finite vertices would be dropped silently
+            found = trimesh.load_mesh(path, process=False, resolver=_file_resolver(path))
+            vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
+            faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
     finally:
         log.removeHandler(handler)
+    return vertices, faces
 
 
 def _file_resolver(path: Path) -> Any:
@@ -162,63 +133,3 @@ def _file_resolver(path: Path) -> Any:
             return super().get(name)
 
     return RegularFileResolver(str(path))
-
-
-# PLY
-
-HEADER_LINES = 60  # at most, of a plain file
-LINE_BYTES = 400
-TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"),
-    **dict.fromkeys(("int", "int32"), "<i4"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"),
-    **dict.fromkeys(("float", "float32"), "<f4"),
-    **dict.fromkeys(("double", "float64"), "<f8"),
-}
-FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-HEADER = re.compile(
-    r"ply\nformat binary_little_endian 1.0\n"
-    r"element vertex (\d{1,10})\n((?:property [a-z]+\d* \w+\n)+)"
-    r"element face (\d{1,10})\n"
-    r"property list (?:uchar|uint8) (?:int|int32) vertex_ind(?:ices|ex)\nend_header\n"
-)
-
-
-def read_plain_ply(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32]] | None:
-    """Return vertices, (n, 3), and faces, (m, 3), as they stand; None if the file is not plain."""
-    with path.open("rb") as file:
-        plain = HEADER.fullmatch(_header(file))
-        if not plain:
-            return None
-        words = [line.split()[1:] for line in plain[2].splitlines()]
-        names = [name for _, name in words]
-        if not set("xyz") <= set(names) or len(set(names)) < len(names):
-            return None
-        if not {kind for kind, _ in words} <= TYPES.keys():
-            return None
-        row = np.dtype([(name, TYPES[kind]) for kind, name in words])
-        counts = int(plain[1]), int(plain[3])
-        size = counts[0] * row.itemsize + counts[1] * FACE.itemsize
-        if path.stat().st_size != file.tell() + size:
-            return None
-        vertices = np.fromfile(file, row, counts[0])
-        faces = np.fromfile(file, FACE, counts[1])
-    if not (faces["count"] == 3).all():
-        return None
-    corners = np.ascontiguousarray(faces["corners"])
-    del faces
-    return np.stack([vertices[axis] for axis in "xyz"], axis=1, dtype=np.float64), corners
-
-
-def _header(file: BinaryIO) -> str:
-    """Return the header of a PLY file without comments, or what stands in its place."""
-    lines = []
-    for _ in range(HEADER_LINES):
-        line = file.readline(LINE_BYTES)
-        lines += [] if line.startswith((b"comment ", b"obj_info ")) else [line]
-        if line in (b"end_header\n", b"") or (len(lines) == 1 and line != b"ply\n"):
-            break
-    return b"".join(lines).decode("latin-1")

@@ -18,8 +18,8 @@ from scipy import ndimage
 from ..arrays import FloatArray
 from ..errors import MeshError, OptionError, seen
 from ..grid.sdf_grid import SdfGrid
-from ..machine.memory import check_fits
 from ..surface.mesh import Mesh
+from ..threads import check_fits
 from .solid import Points, Solid
 
 EDGE = 8  # samples along a cube
@@ -101,12 +101,10 @@ def sample_solid(
     voxels from the surface, and the grid's notes say so.
     """
     shape, spacing, origin = layout
-    notes = []
-    if band is None and prod(shape) > EXACT_SAMPLES:
-        band = BIG_GRID_BAND
-    if band is not None and band < np.inf:
-        notes.append(f"distances are exact up to {band:g} voxels and clamped there")
-    values = sample_grid(solid, layout, band=np.inf if band is None else band, progress=progress)
+    if band is None:
+        band = BIG_GRID_BAND if prod(shape) > EXACT_SAMPLES else np.inf
+    values = sample_grid(solid, layout, band=band, progress=progress)
+    notes = [f"distances are exact up to {band:g} voxels and clamped there"] * (band < np.inf)
     return SdfGrid.trusted(values, spacing, origin, tuple(notes))
 
 
@@ -117,11 +115,21 @@ def sample_grid(
 
     ``band`` is the distance in voxels up to which values are exact (to float32); they are clamped
     there. ``progress`` is called with (cubes done, all cubes). OptionError if the band is under 1.5
-    voxels, which the pipeline needs; MeshError from ``check_scale``; OutOfMemoryError.
+    voxels, which the pipeline needs; MeshError if float32 cannot hold the distances, or float64 the
+    positions; OutOfMemoryError.
     """
-    shape, spacing, _ = layout
+    shape, spacing, origin = layout
     check_numbers(band=band)
-    check_scale(layout)
+    reach = spacing * max(shape)
+    if not (spacing > SMALLEST and reach < LARGEST):
+        said = f"a spacing of {spacing:g} and an extent of {reach:g}"
+        raise MeshError(f"{said} are beyond what float32 holds: scale the mesh")
+    away = float(np.abs(origin).max()) + reach
+    if np.spacing(away) > POSITION_ERROR * spacing:
+        raise MeshError(
+            f"the grid reaches to {away:g}, where numbers are {np.spacing(away):.2g} apart: too "
+            f"coarse for a spacing of {spacing:g}; move the mesh to the origin"
+        )
     size = " x ".join(map(str, shape))
     check_fits(prod(shape) * 4 + WORK_BYTES, f"a grid of {size}", "take fewer samples")
     values = np.empty(shape, np.float32)
@@ -137,21 +145,6 @@ def sample_grid(
     return values
 
 
-def check_scale(layout: Layout) -> None:
-    """Raise MeshError if float32 cannot hold the distances, or float64 the positions."""
-    shape, spacing, origin = layout
-    reach = spacing * max(shape)
-    if not (spacing > SMALLEST and reach < LARGEST):
-        said = f"a spacing of {spacing:g} and an extent of {reach:g}"
-        raise MeshError(f"{said} are beyond what float32 holds: scale the mesh")
-    away = float(np.abs(origin).max()) + reach
-    if np.spacing(away) > POSITION_ERROR * spacing:
-        raise MeshError(
-            f"the grid reaches to {away:g}, where numbers are {np.spacing(away):.2g} apart: too "
-            f"coarse for a spacing of {spacing:g}; move the mesh to the origin"
-        )
-
-
 def grid_points(layout: Layout) -> Points:
     """Return the position of every sample of a grid, (n, 3) in C order."""
     shape, spacing, origin = layout
@@ -161,42 +154,33 @@ def grid_points(layout: Layout) -> Points:
 def _sample_cubes(
     solid: Solid, corners: NDArray[np.int64], layout: Layout, limit: float
 ) -> FloatArray:
-    """Return the signed distances in cubes of samples, (c, 8, 8, 8), clamped at the limit."""
-    _, spacing, origin = layout
-    centres = (corners + (EDGE - 1) / 2) * spacing + origin
-    reach = limit + 3**0.5 * (EDGE - 1) / 2 * spacing
-    near = np.ones(len(corners), bool)
-    if np.isfinite(limit) and solid.is_closed:
-        near = solid.distance(centres) <= reach
-    values = np.empty((len(corners), EDGE, EDGE, EDGE), np.float32)
-    outside = np.where(solid.is_inside(centres[~near]), -1, 1)
-    values[~near] = (outside * limit)[:, None, None, None]
-    offsets = np.moveaxis(np.indices((EDGE,) * 3), 0, -1)
-    points = (corners[near][:, None, None, None] + offsets) * spacing + origin
-    if len(points):
-        values[near] = np.clip(_signed(solid, points, spacing), -limit, limit)
-    return values
-
-
-def _signed(solid: Solid, points: Points, spacing: float) -> NDArray[np.float64]:
-    """Return the signed distance in cubes of neighbouring points, (c, 8, 8, 8).
+    """Return the signed distances in cubes of samples, (c, 8, 8, 8), clamped at the limit.
 
     Two neighbours that are both more than half a spacing from the surface are on the same side of
-    it. So the sign is evaluated at one point of each connected region of such points, and at every
-    other point.
+    it. So the sign is evaluated at one sample of each connected region of such samples, and at
+    every other sample.
     """
-    shape = points.shape[:-1]
-    points = points.reshape(-1, 3)
-    found = solid.distance(points).reshape(shape)
+    _, spacing, origin = layout
+    near = np.ones(len(corners), bool)
+    values = np.empty((len(corners), EDGE, EDGE, EDGE), np.float32)
+    if np.isfinite(limit) and solid.is_closed:
+        centres = (corners + (EDGE - 1) / 2) * spacing + origin
+        near = solid.distance(centres) <= limit + 3**0.5 * (EDGE - 1) / 2 * spacing
+        sides = np.where(solid.is_inside(centres[~near]), -1, 1)
+        values[~near] = (sides * limit)[:, None, None, None]
+    ijk = corners[near][:, None, None, None] + np.moveaxis(np.indices((EDGE,) * 3), 0, -1)
+    points = ijk.reshape(-1, 3) * spacing + origin
+    found = solid.distance(points)
     away = (found > 0.5 * spacing * (1 + 1e-9)) & solid.is_closed
     within_cube = np.zeros((3, 3, 3, 3), bool)
     within_cube[1] = ndimage.generate_binary_structure(3, 1)
-    regions, count = ndimage.label(away, within_cube)
-    inside = np.zeros(shape, bool)
-    inside[~away] = solid.is_inside(points[~away.ravel()])
-    if count:
-        _, first = np.unique(regions.ravel(), return_index=True)
-        first = first[-count:]  # the first belongs to label 0, which is no region
-        side = np.concatenate([[False], solid.is_inside(points[first])])
-        inside |= side[regions]
-    return np.where(inside, -found, found)
+    regions = ndimage.label(away.reshape(ijk.shape[:-1]), within_cube)[0].ravel()
+    inside = np.zeros(len(points), bool)
+    inside[~away] = solid.is_inside(points[~away])
+    region, first = np.unique(regions[away], return_index=True)
+    side = np.zeros(len(region) + 1, bool)
+    side[region] = solid.is_inside(points[away][first])
+    inside[away] = side[regions[away]]
+    signed = np.where(inside, -found, found).clip(-limit, limit)
+    values[near] = signed.reshape(-1, EDGE, EDGE, EDGE)
+    return values

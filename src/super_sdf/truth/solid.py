@@ -7,17 +7,19 @@ gives the wrong sign on meshes that intersect themselves, as real ones do.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MeshError
 from ..surface.mesh import Mesh
 from .mesh_files import read_mesh
+
+if TYPE_CHECKING:
+    import igl
 
 Points = NDArray[np.float64]
 Distances = NDArray[np.float64]
@@ -45,20 +47,36 @@ class Solid:
 
     @cached_property
     def _triangles(self) -> igl.AABB:
+        import igl
+
         tree = igl.AABB()
         tree.init(self.mesh.vertices, self.mesh.faces)
         return tree
 
     @cached_property
     def _winding(self) -> igl.FastWindingNumberBVH:
+        import igl
+
         tree = igl.FastWindingNumberBVH()
         tree.init(self.mesh.vertices, self.mesh.faces)
         return tree
 
     @cached_property
+    def unbalanced_edges(self) -> int:
+        """How many edges faces do not use equally often in both directions: 0 if closed.
+
+        An edge of four faces counts as closed: the winding number is an integer on all its sides.
+        """
+        faces = self.mesh.faces
+        start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
+        key = np.minimum(start, end) * (faces.max(initial=0) + 1) + np.maximum(start, end)
+        _, edge = np.unique(key, return_inverse=True)
+        return int(np.count_nonzero(np.bincount(edge, np.sign(end - start))))
+
+    @property
     def is_closed(self) -> bool:
         """Whether the mesh is closed, so that the winding number changes at the surface only."""
-        return count_unbalanced_edges(self.mesh.faces) == 0
+        return self.unbalanced_edges == 0
 
     def distance(self, points: Points) -> Distances:
         """Return the unsigned distance, (n,), of points (n, 3) to the nearest triangle."""
@@ -89,37 +107,22 @@ class Solid:
         found = self.distance(points)
         return np.where(self.is_inside(points), -found, found)
 
+    def count_overlapping(self) -> int:
+        """Count the faces with a winding number of 2 or more, or below 0, on one side.
 
-@dataclass(frozen=True)
-class Findings:
-    """Faults of a mesh that should bound a solid."""
-
-    open_edges: int  # with more faces on one side than on the other
-    inverted: bool  # whether the faces point inward: the volume is negative
-    overlapping: int  # faces with a winding number of 2 or more, or below 0, on one side
-
-
-def examine(solid: Solid) -> Findings:
-    """Examine whether a mesh bounds a solid, with its faces pointing outward."""
-    winding = solid.winding_number(_both_sides(solid.mesh))
-    inverted = solid.mesh.volume() < 0
-    if inverted:
-        winding = -winding
-    wrong = (winding > 1.5) | (winding < -0.5)
-    overlapping = int(wrong.reshape(2, -1).any(0).sum())
-    return Findings(count_unbalanced_edges(solid.mesh.faces), inverted, overlapping)
-
-
-def count_unbalanced_edges(faces: NDArray[np.int32]) -> int:
-    """Count edges that faces do not use equally often in both directions: 0 if closed.
-
-    An edge of four faces counts as closed: the winding number is an integer on all its sides.
-    """
-    start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
-    key = np.minimum(start, end) * (faces.max(initial=0) + 1) + np.maximum(start, end)
-    _, edge = np.unique(key, return_inverse=True)
-    balance = np.bincount(edge, np.sign(end - start))
-    return int(np.count_nonzero(balance))
+        They belong to pieces that overlap, fold over or are inverted.
+        """
+        a, b, c = self.mesh.vertices[self.mesh.faces.T]
+        normals = np.cross(b - a, c - a)
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        whole = lengths[:, 0] > 0
+        size = np.linalg.norm(np.ptp(self.mesh.vertices, axis=0))
+        step = SIDE_STEP * size * normals[whole] / lengths[whole]
+        centres = (a + b + c)[whole] / 3
+        winding = self.winding_number(np.concatenate([centres + step, centres - step]))
+        winding *= np.sign(self.mesh.volume()) or 1
+        wrong = (winding > 1.5) | (winding < -0.5)
+        return int(wrong.reshape(2, -1).any(0).sum())
 
 
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:
@@ -130,36 +133,24 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
     from the generalised winding number, a guess near the holes.
     """
     solid, notes = Solid(read_mesh(path)), []
-    low, high = solid.mesh.vertices.min(0), solid.mesh.vertices.max(0)
-    found = examine(solid)
-    if found.open_edges and not allow_open:
+    mesh, open_edges = solid.mesh, solid.unbalanced_edges
+    if open_edges and not allow_open:
         raise MeshError(
-            f"{path} is open: {found.open_edges:,} edges have no partner, so it has no inside; "
+            f"{path} is open: {open_edges:,} edges have no partner, so it has no inside; "
             "close it, or use --allow-open to guess its inside"
         )
-    if not (high > low).all() or solid.mesh.volume() == 0:
+    volume = mesh.volume()
+    if not np.ptp(mesh.vertices, axis=0).all() or volume == 0:
         raise MeshError(f"{path} is flat: it encloses no volume")
-    if found.open_edges:
-        notes.append(f"open at {found.open_edges:,} edges: inside is guessed across the holes")
-    if found.inverted:
+    if open_edges:
+        notes.append(f"open at {open_edges:,} edges: inside is guessed across the holes")
+    if volume < 0:
         notes.append("inverted: its faces point inward; they were reversed")
-        solid = Solid(Mesh(solid.mesh.vertices, np.ascontiguousarray(solid.mesh.faces[:, ::-1])))
-    if found.overlapping:
+        solid = Solid(Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1])))
+    if overlapping := solid.count_overlapping():
         notes.append(
-            f"pieces overlap, fold over or are inverted at {found.overlapping:,} of "
-            f"{len(solid.mesh.faces):,} faces: inside is by winding number, and distances are to "
+            f"pieces overlap, fold over or are inverted at {overlapping:,} of "
+            f"{len(mesh.faces):,} faces: inside is by winding number, and distances are to "
             "inner walls, too"
         )
     return solid, notes
-
-
-def _both_sides(mesh: Mesh) -> Points:
-    """Return a point close to each side of each face, (2 m, 3); none for degenerate faces."""
-    a, b, c = mesh.vertices[mesh.faces.T]
-    normals = np.cross(b - a, c - a)
-    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-    whole = lengths[:, 0] > 0
-    centres = (a + b + c)[whole] / 3
-    size = np.linalg.norm(mesh.vertices.max(0) - mesh.vertices.min(0))
-    step = SIDE_STEP * size * normals[whole] / lengths[whole]
-    return np.concatenate([centres + step, centres - step])

@@ -11,9 +11,9 @@ In steps:
                 joins them to triangles in the end
     planes      gives each crossing the plane of its face, not rounded off as the field is at edges
     wedges      meets these planes, and moves the point so that it agrees with the samples' spheres
-    features    tells edges from rounded ground, and moves the vertices beside them
+    features    tells edges from rounded ground, and moves the vertices beside them; it calls all
+                the others, in order
     folds       undoes what makes triangles intersect (which do says triangle_pairs)
-    mesher      does all of this, for some planes at a time
 
 Reference: Kobbelt, Botsch, Schwanecke and Seidel, "Feature Sensitive Surface Extraction from Volume
 Data", 2001.

@@ -17,13 +17,13 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ...arrays import BoolArray
-from ...network.neighbourhood import NEIGHBOURHOOD
-from .patches import (Index, Patches, Placed, Triangles, Vectors, cross, dilate, dot, length, middles, sums_at, triangles_of, unit)
-from .triangle_pairs import intersecting, keys_of, overlapping_boxes
+from ...arrays import NEIGHBOURHOOD, BoolArray, Index, Vectors, cross, dot, length, sums_at, unit
+from .patches import Patches, Placed, nth_of_run, triangles_of
 
 # Vertices of triangles that intersect are in cells at most 3 apart: none is more than half a cell
 # outside its own, and a triangle has vertices of two cells.
@@ -36,6 +36,10 @@ REACH = len(ROUNDS) * (APART + 1) + 2
 ONE_WAY = 0.1  # least cosine between normals and their mean where a surface faces one way
 LEAST_MOVE = 0.1  # of the way to the nearest node, from which a crossing may fold the surface
 INSIDE_CELL = 0.02  # fine spacings from its faces that a vertex is pulled into a cell
+FARTHEST = 1 << 20  # more cells than along any axis
+TOUCHING = 1e-5  # fine spacings at which triangles intersect: vertices are rounded in the end ...
+STEEP = 1e-2  # ... if a side rises by this over the other triangle ...
+FLAT = 1e-9  # ... and by which it has to pass through if not: triangles of a plane do not
 
 
 def without_folds(patches: Patches, placed: Placed, lattice: Vectors) -> Placed:
@@ -44,34 +48,27 @@ def without_folds(patches: Patches, placed: Placed, lattice: Vectors) -> Placed:
     ``lattice``, (n, 3), are the crossings where they were on their lattice edges.
     """
     suspect = find_suspects(patches, placed, lattice)
+    keys = keys_of(np.floor(patches.low / APART))
+    order = np.argsort(keys)
+    keys = keys[order]
     for least, drop in ROUNDS:
-        folded = find_folded(patches, placed, suspect, least)
+        close = np.zeros(len(keys), bool)  # patches in cells from which triangles reach suspects
+        cells = np.unique(keys_of(np.floor(patches.low[_having(patches, placed, suspect)] / APART)))
+        around = np.unique(cells[:, None] + keys_of(NEIGHBOURHOOD))
+        start, stop = np.searchsorted(keys, around), np.searchsorted(keys, around, "right")
+        close[order[np.repeat(start, stop - start) + nth_of_run(stop - start)]] = True
+        folded = find_folded(patches, placed, close, suspect, least)
         if not folded.any():
             break
-        suspect = beside(patches, placed, folded)
+        crossings = folded[: len(lattice)]
+        fans = patches.dilate(_having(patches, placed, folded), 1, len(crossings))
+        suspect = np.concatenate([crossings, patches.having(fans)[placed.feature]])
         placed = put_back(patches, placed, lattice, folded)
         if drop:
             left = np.concatenate([np.ones(len(lattice), bool), ~folded[len(lattice) :]])
             suspect, kept = suspect[left], left[len(lattice) :]
             placed = replace(placed, feature=placed.feature[kept], peak=placed.peak[kept])
     return placed
-
-
-def put_back(patches: Patches, placed: Placed, lattice: Vectors, chosen: BoolArray) -> Placed:
-    """Return the vertices, chosen ones on their lattice edges or in their cells.
-
-    Features' vertices are pulled towards the middles of their crossings.
-    """
-    crossings, peaks = np.split(chosen, [len(lattice)])
-    placed = replace(placed, position=np.where(crossings[:, None], lattice, placed.position))
-    low = patches.low[placed.feature] + INSIDE_CELL
-    high = patches.low[placed.feature] + 1 - INSIDE_CELL
-    middle = np.clip(middles(patches, placed), low, high)
-    way = placed.peak - middle
-    room = np.where(way > 0, high - middle, middle - low)
-    share = np.min(room / np.maximum(np.abs(way), 1e-12), axis=1)[:, None]
-    pulled = peaks[:, None] & (share < 1)
-    return replace(placed, peak=np.where(pulled, middle + share * way, placed.peak))
 
 
 def find_suspects(patches: Patches, placed: Placed, lattice: Vectors) -> BoolArray:
@@ -83,62 +80,43 @@ def find_suspects(patches: Patches, placed: Placed, lattice: Vectors) -> BoolArr
     to_node = length(lattice - np.rint(lattice))
     moved = length(placed.position - lattice) > LEAST_MOVE * to_node
     changed = np.concatenate([moved, np.ones(len(placed.feature), bool)])
-    _, triangles = triangles_at(patches, placed, patches_at(patches, placed, changed))
+    _, triangles = triangles_of(patches, placed, _having(patches, placed, changed))
     a, b, c = (placed.points[corner] for corner in triangles.T)
-    normals = np.repeat(unit(cross(b - a, c - a)), 3, axis=0)
-    suspect = turns(triangles.ravel(), normals, len(changed))
+    normals = np.tile(unit(cross(b - a, c - a)), (3, 1))
+    suspect = _turns(triangles.T.ravel(), normals, len(changed))
     nodes, node = np.unique(keys_of(np.rint(lattice)), return_inverse=True)
-    sheets = turns(node, placed.normal, len(nodes))[node]
+    sheets = _turns(node, placed.normal, len(nodes))[node]
     used = np.zeros(len(changed), bool)
     used[triangles] = True
     suspect[: len(lattice)] |= sheets & used[: len(lattice)]
     return suspect
 
 
-def turns(place: Index, normals: Vectors, count: int) -> BoolArray:
+def _turns(place: Index, normals: Vectors, count: int) -> BoolArray:
     """Return which of ``count`` places have normals that do not face one way."""
     mean = unit(sums_at(place, normals, count))
-    least = np.ones(count)
-    np.minimum.at(least, place, dot(normals, mean[place]))
-    found: BoolArray = least < ONE_WAY
+    found: BoolArray = np.zeros(count, bool)
+    found[place[dot(normals, mean[place]) < ONE_WAY]] = True
     return found
 
 
-def patches_at(patches: Patches, placed: Placed, chosen: BoolArray) -> BoolArray:
+def _having(patches: Patches, placed: Placed, chosen: BoolArray) -> BoolArray:
     """Return the patches, (P,), that have some of the vertices, (n + f,)."""
     crossings, peaks = np.split(chosen, [len(placed.position)])
-    found: BoolArray = np.any(crossings[patches.crossing] & patches.there, axis=1)
+    found = patches.having(crossings)
     found[placed.feature[peaks]] = True
     return found
 
 
-def beside(patches: Patches, placed: Placed, chosen: BoolArray) -> BoolArray:
-    """Return vertices, (n + f,): each triangle that changes with chosen ones has one of these."""
-    crossings = chosen[: len(placed.position)]
-    around = dilate(patches, patches_at(patches, placed, chosen), 1, len(crossings))
-    fans = np.any(around[patches.crossing] & patches.there, axis=1)[placed.feature]
-    return np.concatenate([crossings, fans])
-
-
-def triangles_at(patches: Patches, placed: Placed, chosen: BoolArray) -> Triangles:
-    """Return the triangles of chosen patches, (P,), as if there were no others."""
-    known = np.flatnonzero(chosen[placed.feature])
-    feature = (np.cumsum(chosen) - 1)[placed.feature[known]]
-    some = replace(placed, feature=feature, peak=placed.peak[known])
-    rows, count = np.flatnonzero(chosen), len(placed.position)
-    patch, corners = triangles_of(patches.chosen(rows), some)
-    return rows[patch], np.concatenate([np.arange(count), count + known])[corners]
-
-
-def find_folded(patches: Patches, placed: Placed, suspect: BoolArray, least: bool) -> BoolArray:
+def find_folded(
+    patches: Patches, placed: Placed, close: BoolArray, suspect: BoolArray, least: bool
+) -> BoolArray:
     """Return the vertices, (n + f,), of pairs of triangles that intersect, one at a suspect.
 
-    With ``least``, of each pair only the vertex that is least outside its cell.
+    With ``least``, of each pair only the vertex that is least outside its cell. Only triangles of
+    ``close`` patches, (P,), are compared.
     """
-    keys = keys_of(np.floor(patches.low / APART))
-    some = np.unique(keys[patches_at(patches, placed, suspect)])
-    close = np.isin(keys, some[:, None] + keys_of(NEIGHBOURHOOD))
-    _, triangles = triangles_at(patches, placed, close)
+    _, triangles = triangles_of(patches, placed, close)
     one, other = overlapping_boxes(placed.points, triangles, suspect)
     pairs = np.concatenate(intersecting(placed.points, triangles[one], triangles[other]), 1)
     step = np.zeros(len(suspect))
@@ -150,3 +128,100 @@ def find_folded(patches: Patches, placed: Placed, suspect: BoolArray, least: boo
     folded = np.zeros(len(suspect), bool)
     folded[pairs[step[pairs] == step[pairs].min(1, initial=1, keepdims=True)]] = True
     return folded
+
+
+def put_back(patches: Patches, placed: Placed, lattice: Vectors, chosen: BoolArray) -> Placed:
+    """Return the vertices, chosen ones on their lattice edges or in their cells.
+
+    Features' vertices are pulled towards the middles of their crossings.
+    """
+    crossings, peaks = np.split(chosen, [len(lattice)])
+    placed = replace(placed, position=np.where(crossings[:, None], lattice, placed.position))
+    fans = patches.chosen(placed.feature)
+    low, high = fans.low + INSIDE_CELL, fans.low + 1 - INSIDE_CELL
+    middle = np.clip(fans.mean(placed.position), low, high)
+    way = placed.peak - middle
+    room = np.where(way > 0, high - middle, middle - low)
+    share = np.min(room / np.maximum(np.abs(way), 1e-12), axis=1)[:, None]
+    pulled = peaks[:, None] & (share < 1)
+    return replace(placed, peak=np.where(pulled, middle + share * way, placed.peak))
+
+
+def overlapping_boxes(points: Vectors, triangles: Index, suspect: BoolArray) -> tuple[Index, Index]:
+    """Return pairs of triangles whose boxes overlap, one at a suspect; some pairs twice.
+
+    A triangle is listed in the cells from which it reaches into the next, or in its only one.
+    """
+    a, b, c = (points[corner] for corner in triangles.T)
+    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    first, last = np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
+    chosen: BoolArray = np.any(suspect[triangles], axis=1)
+    mine, my_cell = _cells_of(first - 1, last, np.flatnonzero(chosen))
+    listed, cell = _cells_of(first, np.maximum(first, last - 1), np.arange(len(chosen)))
+    order = np.argsort(cell)
+    cell, listed = cell[order], listed[order]
+    start, stop = np.searchsorted(cell, my_cell), np.searchsorted(cell, my_cell, "right")
+    pair = np.repeat(np.arange(len(mine)), stop - start)
+    one, other = mine[pair], listed[start[pair] + nth_of_run(stop - start)]
+    for lower, upper in zip(low.T, high.T):
+        kept = (lower[one] <= upper[other]) & (lower[other] <= upper[one])
+        one, other = one[kept], other[kept]
+    once = (one < other) | ~chosen[other]
+    return one[once], other[once]
+
+
+def _cells_of(first: Index, last: Index, rows: Index) -> tuple[Index, Index]:
+    """Return the cells from the first to the last, (b, 3), of some rows: which row, and key."""
+    size = last[rows] - first[rows] + 1
+    times = size[:, 0] * size[:, 1] * size[:, 2]
+    row = np.repeat(np.arange(len(rows)), times)
+    nth, k = np.divmod(nth_of_run(times), size[row, 2])
+    i, j = np.divmod(nth, size[row, 1])
+    return rows[row], keys_of(first[rows])[row] + (i * FARTHEST + j) * FARTHEST + k
+
+
+def keys_of(ijk: NDArray[Any]) -> Index:
+    """Return a number for each cell, (n,)."""
+    i, j, k = ijk.astype(np.int64).T
+    keys: Index = (i * FARTHEST + j) * FARTHEST + k
+    return keys
+
+
+def intersecting(points: Vectors, first: Index, second: Index) -> tuple[Index, Index]:
+    """Return those of pairs of triangles, corners (m, 3) each, that intersect.
+
+    A side of one of them then pierces the other, off common vertices.
+    """
+    for _ in range(2):
+        heights = _heights_over(points, first, second)
+        low, high = np.fmin.reduce(heights), np.fmax.reduce(heights)
+        kept = (low < TOUCHING) & (high > -TOUCHING) & (low < high)
+        first, second = second[kept], first[kept]
+    found = _pierced(points, first, second) | _pierced(points, second, first)
+    return first[found], second[found]
+
+
+def _heights_over(points: Vectors, first: Index, second: Index) -> Vectors:
+    """Return how far over the first triangles the second's corners are, (3, m); NaN if common."""
+    a, b, c = (points[corner] for corner in first.T)
+    normals = unit(cross(b - a, c - a))
+    heights = np.stack([dot(points[corner] - a, normals) for corner in second.T])
+    heights[np.any(second.T[:, None] == first.T, axis=1)] = np.nan
+    return heights
+
+
+def _pierced(points: Vectors, first: Index, second: Index) -> BoolArray:
+    """Return which of the first triangles are pierced by a side of the second, (m,)."""
+    heights = _heights_over(points, first, second)
+    found: BoolArray = np.zeros(len(first), bool)
+    for k in range(3):
+        low, high = np.minimum(heights[k], heights[k - 1]), np.maximum(heights[k], heights[k - 1])
+        slack = np.where(high - low > STEEP, TOUCHING, -FLAT)
+        rows = np.flatnonzero((low < slack) & (high > -slack))
+        start, end = points[second[rows, k]], points[second[rows, k - 1]]
+        way, slack = unit(end - start), slack[rows]
+        a, b, c = (points[corner] - start for corner in first[rows].T)
+        beyond = [dot(way, cross(p, unit(q - p))) for p, q in ((a, b), (b, c), (c, a))]
+        found[rows] |= np.minimum.reduce(beyond) > -slack
+        found[rows] |= np.maximum.reduce(beyond) < slack
+    return found

@@ -16,7 +16,6 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple, cast
@@ -24,63 +23,40 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import BoolArray, FloatArray, IntArray
-from ...threads import map_chunks
-from ...network.neighbourhood import CENTRE, STRIDES
-from ..cell_cases import loop_table
+from ...arrays import (
+    CENTRE,
+    STRIDES,
+    BoolArray,
+    FloatArray,
+    Index,
+    IntArray,
+    Numbers,
+    Vectors,
+    cross,
+    dot,
+    unit,
+)
 from ...refine.field import FineField
-from ..marching import Crossings, cells_low_nodes, edge_steps, edge_table, owners_of
 from ...refine.nodes import block_ijk
+from ...threads import map_chunks
+from ..cell_cases import tables
+from ..marching import Crossings, cells_low_nodes, edge_steps, edge_table, owners_of
 
-Index = NDArray[np.int64]
-Vectors = NDArray[np.float64]
-Numbers = NDArray[np.float64]
 NEAR_SURFACE = 1.0  # fine spacings: slopes count at nodes that are nearer
 BEND = 0.3  # change of the slopes at a node, 1 for a distance, from which there may be an edge
 TEMPORARIES = 8  # numbers per node of a block
 PULL = 0.5  # share of the way to the middle of its crossings that a vertex which folds its fan goes
 
 
-def dot(a: Vectors, b: Vectors) -> Numbers:
-    """Return the products of vectors, (n,)."""
-    product: Numbers = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-    return product
-
-
-def cross(a: Vectors, b: Vectors) -> Vectors:
-    """Return the cross products of vectors, (n, 3)."""
-    product: Vectors = np.empty_like(a)
-    for k in range(3):
-        product[..., k] = a[..., k - 2] * b[..., k - 1] - a[..., k - 1] * b[..., k - 2]
-    return product
-
-
-def length(vectors: Vectors) -> Numbers:
-    """Return the lengths of vectors, (n,)."""
-    lengths: Numbers = np.sqrt(dot(vectors, vectors))
-    return lengths
-
-
-def unit(vectors: Vectors) -> Vectors:
-    """Return vectors of length 1; 0 stays 0."""
-    units: Vectors = vectors / np.maximum(length(vectors), 1e-12)[..., None]
-    return units
-
-
-def sums_at(place: Index, vectors: Vectors, count: int) -> Vectors:
-    """Return the sums of vectors (m, 3) at each of ``count`` places, (count, 3)."""
-    return np.stack([np.bincount(place, component, count) for component in vectors.T], 1)
-
-
-def voxels_near_kinks(field: FineField, rows: slice, threads: int = 1) -> BoolArray:
-    """Return the voxels, (D,), of some rows in which slopes change at a node as at an edge."""
-    near = np.zeros(len(field.voxel_ijk), bool)
-
-    def look(some: slice) -> None:
-        here = slice(rows.start + some.start, rows.start + some.stop)
-        near[here] = _largest_bends(field, here) > BEND
-
-    map_chunks(look, rows.stop - rows.start, TEMPORARIES * len(field.blocks), threads)
+def voxels_near_kinks(field: FineField, threads: int = 1) -> BoolArray:
+    """Return the voxels, (D,), in which slopes change at a node as at an edge."""
+    bends = map_chunks(
+        lambda rows: _largest_bends(field, rows),
+        len(field.voxel_ijk),
+        TEMPORARIES * len(field.blocks),
+        threads,
+    )
+    near: BoolArray = np.concatenate([np.empty(0, np.float32), *bends]) > BEND
     return near
 
 
@@ -102,8 +78,7 @@ def _largest_bends(field: FineField, rows: slice) -> FloatArray:
             bend *= near[face][..., there]
             largest[there] = np.maximum(largest[there], bend.reshape(side**2, len(there)).max(0))
         squares = squares + (largest / unit_slope) ** 2
-    length_of: FloatArray = np.sqrt(squares)
-    return length_of
+    return np.sqrt(cast(FloatArray, squares))
 
 
 def beside(field: FineField, chosen: BoolArray, rings: int) -> BoolArray:
@@ -120,18 +95,17 @@ def beside(field: FineField, chosen: BoolArray, rings: int) -> BoolArray:
 class Patches:
     """The patches of the surface in the crossed cells of some blocks, in the order of the cells."""
 
-    row: IntArray  # (P,), the voxel of each
+    cell: Index  # (P,), the crossed cell of each, a row of the crossings
+    row: IntArray  # (P,), its voxel
     low: NDArray[np.float64]  # (P, 3), the low corner of its cell, in fine spacings
-    loop: Index  # (P,), which row of ``loop_table`` it is
+    loop: Index  # (P,), which loop of the case tables it is
     sides: Index  # (P,), how many crossings it has
     # (P, S), its crossings in order, counter-clockwise from outside, -1 after the last
     crossing: Index
 
-    def chosen(self, rows: Index | slice) -> Patches:
+    def chosen(self, rows: Any) -> Patches:
         """Return some of the patches."""
-        return Patches(
-            self.row[rows], self.low[rows], self.loop[rows], self.sides[rows], self.crossing[rows]
-        )
+        return Patches(*(values[rows] for values in vars(self).values()))
 
     @property
     def there(self) -> BoolArray:
@@ -143,63 +117,66 @@ class Patches:
         patch, place = np.nonzero(self.there)
         return patch, self.crossing[patch, place]
 
+    def mean(self, vectors: Vectors) -> Vectors:
+        """Return the mean of the vectors (n, 3) at the crossings of each patch, (P, 3)."""
+        total = np.zeros((len(self.sides), 3))
+        for crossing in self.crossing.T:
+            there = np.flatnonzero(crossing >= 0)
+            total[there] += vectors[crossing[there]]
+        return total / self.sides[:, None]
+
+    def having(self, chosen: BoolArray) -> BoolArray:
+        """Return which patches have some of the chosen crossings, (P,)."""
+        found: BoolArray = np.any(np.append(chosen, False)[self.crossing], axis=1)
+        return found
+
+    def dilate(self, chosen: BoolArray | Index, rings: int, count: int) -> BoolArray:
+        """Return which of ``count`` crossings are within some rings of patches of chosen ones."""
+        near: BoolArray = np.zeros(count + 1, bool)  # the last is of entries that are no crossings
+        for _ in range(rings):
+            near[self.crossing[chosen]] = True
+            near[-1] = False
+            chosen = cast(BoolArray, near[self.crossing].any(1))
+        return near[:-1]
+
 
 def find_patches(
     field: FineField, crossings: Crossings, voxels: BoolArray
 ) -> tuple[Patches, Index]:
-    """Return the patches in the crossed cells of some voxels, and the crossings that they use."""
-    table, factor = loop_table(), field.factor
-    slot, edge_at = _edges_of(field, crossings, voxels)
-    some = voxels[crossings.cell_row]
-    case = crossings.case[some]
-    count = table.times[case]
-    cell = np.repeat(np.arange(len(count)), count)
-    loop = table.first[case[cell]] + nth_of_row(cell, count)
-    row = crossings.cell_row[some][cell]
-    low_node = cells_low_nodes(factor)[crossings.cell[some][cell]]
-    first = slot[row] * (3 * len(field.blocks)) + low_node
-    edges = table.edges[loop, : table.sides[loop].max(initial=3)]  # the longest loops are rare
-    at = first[:, None] + edge_steps(factor)[edges]
-    there = edges >= 0
-    crossing = edge_at.take(at, mode="clip")
-    used = np.zeros(len(crossings.own_row), bool)
-    used[crossing[there]] = True
-    new = np.cumsum(used) - 1
-    low = factor * field.voxel_ijk[row] + block_ijk(factor)[low_node]
-    joined = np.where(there, new[np.where(there, crossing, 0)], -1)
-    patches = Patches(row, low.astype(np.float64), loop, table.sides[loop], joined)
-    return patches, np.flatnonzero(used)
+    """Return the patches in the crossed cells of some voxels, and the crossings that they use.
 
-
-def _edges_of(field: FineField, crossings: Crossings, voxels: BoolArray) -> tuple[Index, IntArray]:
-    """Return the voxels' places in a table, (D,), and it: the crossings on their edges."""
+    These are own edges of ``crossings``; patches count among those used.
+    """
+    table, factor = tables(), field.factor
     others = np.flatnonzero(voxels[crossings.other_row])
     listed = voxels.copy()
     listed[owners_of(field, crossings, others)[1]] = True
-    slot: Index = np.cumsum(listed) - 1
+    slot = np.cumsum(listed) - 1
     own = np.flatnonzero(listed[crossings.own_row])
-    return slot, edge_table(field, crossings, slot.take, int(listed.sum()), own, others, own)
+    edge_at = edge_table(field, crossings, slot.take, int(listed.sum()), own, others, own)
+    some = np.flatnonzero(voxels[crossings.cell_row])
+    count = table.loops[crossings.case[some]]
+    cell = np.repeat(some, count)
+    loop = table.first_loop[crossings.case[cell]] + nth_of_run(count)
+    row, low_node = crossings.cell_row[cell], cells_low_nodes(factor)[crossings.cell[cell]]
+    first = slot[row] * (3 * len(field.blocks)) + low_node
+    sides = table.sides[loop].astype(np.int64)
+    edges = table.edges[loop, : sides.max(initial=3)]  # the longest loops are rare
+    there = edges >= 0
+    crossing = edge_at.take(first[:, None] + edge_steps(factor)[edges], mode="clip")
+    used = np.zeros(len(crossings.own_row), bool)
+    used[crossing[there]] = True
+    new = np.cumsum(used) - 1
+    crossing[~there] = 0
+    joined = np.where(there, new[crossing], -1)
+    low = factor * field.voxel_ijk[row] + block_ijk(factor)[low_node]
+    return Patches(cell, row, low.astype(np.float64), loop, sides, joined), np.flatnonzero(used)
 
 
-def dilate(patches: Patches, chosen: BoolArray | Index, rings: int, count: int) -> BoolArray:
-    """Return which of ``count`` crossings lie within some rings of patches round chosen ones."""
-    near: BoolArray = np.zeros(count + 1, bool)  # the last is of entries that are no crossings
-    for _ in range(rings):
-        near[patches.crossing[chosen]] = True
-        near[-1] = False
-        chosen = cast(BoolArray, near[patches.crossing].any(1))
-    return near[:-1]
-
-
-def nth_of_row(row: NDArray[Any], counts: NDArray[Any]) -> Index:
-    """Return the place of each entry among those of its row; rows come in order."""
-    first: Index = np.cumsum(counts) - counts
-    nth: Index = np.arange(len(row)) - first[row]
+def nth_of_run(counts: NDArray[Any]) -> Index:
+    """Return 0, 1, ... for each of runs of so many entries, one run after the other."""
+    nth: Index = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     return nth
-
-
-Triangles = tuple[Index, Index]
-"""Patches (t,), and the corners of a triangle of each, (t, 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,10 +194,16 @@ class Placed:
         """All vertices in the order of their numbers, (n + f, 3)."""
         return np.concatenate([self.position, self.peak])
 
-    def facing(self, corners: tuple[Index, Index, Index], crossing: Index) -> Numbers:
-        """Return the cosine between triangles, corners (t,) each, and the planes of crossings."""
+    def facing(self, corners: tuple[Index, Index, Index], *crossings: Index) -> Numbers:
+        """Return the least cosine between triangles, corners (t,) each, and planes of crossings."""
         a, b, c = (self.points[corner] for corner in corners)
-        return dot(unit(cross(b - a, c - a)), self.normal[crossing])
+        normal = unit(cross(b - a, c - a))
+        least: Numbers = np.min([dot(normal, self.normal[at]) for at in crossings], axis=0)
+        return least
+
+
+Triangles = tuple[Index, Index]
+"""Patches (t,), and the corners of a triangle of each, (t, 3)."""
 
 
 class Sides(NamedTuple):
@@ -235,10 +218,10 @@ class Sides(NamedTuple):
 def _sides_of(patches: Patches, placed: Placed) -> Sides:
     """Return the sides of all patches with a feature, fan by fan."""
     sides = patches.sides[placed.feature]
-    fan = np.repeat(np.arange(len(sides)), sides)
-    patch, nth = placed.feature[fan], nth_of_row(fan, sides)
+    fan, nth = np.repeat(np.arange(len(sides)), sides), nth_of_run(sides)
+    patch = placed.feature[fan]
     start = patches.crossing[patch, nth]
-    end = patches.crossing[patch, (nth + 1) % patches.sides[patch]]
+    end = patches.crossing[patch, np.where(nth + 1 < sides[fan], nth + 1, 0)]
     return Sides(patch, start, end, len(placed.position) + fan)
 
 
@@ -246,65 +229,54 @@ def unfolded(patches: Patches, placed: Placed) -> Placed:
     """Return the vertices, those that lie beyond a side of their fan moved inwards."""
     sides = _sides_of(patches, placed)
     corners = sides.start, sides.end, sides.peak
-    facing = np.maximum(placed.facing(corners, sides.start), placed.facing(corners, sides.end))
+    beyond = (placed.facing(corners, sides.start) < 0) & (placed.facing(corners, sides.end) < 0)
     folded = np.zeros(len(placed.feature), bool)
-    folded[sides.peak[facing < 0] - len(placed.position)] = True
-    inwards = np.where(folded[:, None], PULL * (middles(patches, placed) - placed.peak), 0)
+    folded[sides.peak[beyond] - len(placed.position)] = True
+    middle = patches.chosen(placed.feature).mean(placed.position)
+    inwards = np.where(folded[:, None], PULL * (middle - placed.peak), 0)
     return replace(placed, peak=placed.peak + inwards)
 
 
-def middles(patches: Patches, placed: Placed) -> Vectors:
-    """Return the middles of the crossings of patches with a feature, (f, 3)."""
-    mine, count = patches.crossing[placed.feature], patches.sides[placed.feature]
-    points = np.where((mine >= 0)[..., None], placed.position[mine], 0)
-    middle: Vectors = points.sum(1) / count[:, None]
-    return middle
-
-
-def triangles_of(patches: Patches, placed: Placed) -> Triangles:
-    """Return the triangles of all patches, in their order."""
-    flat = np.ones(len(patches.row), bool)
+def triangles_of(patches: Patches, placed: Placed, chosen: BoolArray) -> Triangles:
+    """Return the triangles of chosen patches, (P,), as if there were no others."""
+    known = np.flatnonzero(chosen[placed.feature])
+    flat = chosen.copy()
     flat[placed.feature] = False
-    parts = [flat_triangles(patches, flat), *fan_triangles(patches, placed)]
-    patch = np.concatenate([rows for rows, _ in parts])
-    corners = np.concatenate([triangles for _, triangles in parts])
-    order = np.argsort(patch, kind="stable")
-    return patch[order], corners[order]
+    rows = np.flatnonzero(flat)
+    times = patches.sides[rows] - 2
+    patch, nth = np.repeat(rows, times), nth_of_run(times)
+    places = tables().places[patches.loop[patch], nth].astype(np.int64)
+    plain = np.take_along_axis(patches.crossing[patch], places, 1)
+    some = replace(placed, feature=placed.feature[known], peak=placed.peak[known])
+    parts = [(patch, plain), *_fan_triangles(patches, some)]
+    number = np.concatenate([np.arange(len(placed.position)), len(placed.position) + known])
+    return (
+        np.concatenate([rows for rows, _ in parts]),
+        np.concatenate([plain, *(number[corners] for _, corners in parts[1:])]),
+    )
 
 
-def flat_triangles(patches: Patches, chosen: BoolArray) -> Triangles:
-    """Return the triangles of patches without a feature: those of marching cubes."""
-    rows = np.flatnonzero(chosen)
-    patch = np.repeat(rows, patches.sides[rows] - 2)
-    nth = nth_of_row(patch, np.bincount(patch, minlength=len(chosen)))
-    corners = loop_table().triangles[patches.loop[patch], nth]
-    return patch, np.take_along_axis(patches.crossing[patch], corners, 1)
-
-
-def fan_triangles(patches: Patches, placed: Placed) -> Iterator[Triangles]:
-    """Yield the triangles of patches with a feature: fans, and pairs across turned sides."""
+def _fan_triangles(patches: Patches, placed: Placed) -> list[Triangles]:
+    """Return the triangles of patches with a feature: fans, and pairs across turned sides."""
     sides = _sides_of(patches, placed)
     one, other = _turned(sides, placed)
     kept = np.ones(len(sides.patch), bool)
     kept[one] = kept[other] = False
-    yield sides.patch[kept], np.stack([sides.start, sides.end, sides.peak], 1)[kept]
     a, b, peak, beyond = sides.start[other], sides.end[other], sides.peak[other], sides.peak[one]
-    yield sides.patch[other], np.stack([a, beyond, peak], 1)
-    yield sides.patch[other], np.stack([b, peak, beyond], 1)
+    return [
+        (sides.patch[kept], np.stack([sides.start, sides.end, sides.peak], 1)[kept]),
+        (sides.patch[other], np.stack([a, beyond, peak], 1)),
+        (sides.patch[other], np.stack([b, peak, beyond], 1)),
+    ]
 
 
 def _turned(sides: Sides, placed: Placed) -> tuple[Index, Index]:
     """Return the sides that are turned, as rows of the earlier fan's and of the later one's."""
-
-    def worst(*pairs: tuple[tuple[Index, Index, Index], Index]) -> Numbers:
-        least: Numbers = np.min([placed.facing(*pair) for pair in pairs], axis=0)
-        return least
-
     one, other = _shared(sides)
     a, b, peak, beyond = sides.start[other], sides.end[other], sides.peak[other], sides.peak[one]
-    turned = worst(((a, beyond, peak), a), ((b, peak, beyond), b))
-    near, far = (a, b, peak), (b, a, beyond)
-    better = turned > np.minimum(worst((near, a), (near, b), (far, a), (far, b)), 0)
+    turned = placed.facing((a, beyond, peak), a), placed.facing((b, peak, beyond), b)
+    kept = placed.facing((a, b, peak), a, b), placed.facing((b, a, beyond), a, b)
+    better = np.minimum(*turned) > np.minimum(np.minimum(*kept), 0)
     return one[better], other[better]
 
 
@@ -315,12 +287,10 @@ def _shared(sides: Sides) -> tuple[Index, Index]:
     be joined twice.
     """
     size = int(max(sides.start.max(initial=0), sides.end.max(initial=0))) + 1
-    key, reverse = sides.start * size + sides.end, sides.end * size + sides.start
-    order = np.argsort(key)
-    last = max(len(key) - 1, 0)
-    partner = order[np.minimum(np.searchsorted(key[order], reverse), last)]
-    one = np.flatnonzero((key[partner] == reverse) & (np.arange(len(key)) < partner))
-    other = partner[one]
+    key = np.minimum(sides.start, sides.end) * size + np.maximum(sides.start, sides.end)
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(np.diff(key[order]) == 0)  # no side is that of three fans
+    one, other = order[same], order[same + 1]
     joined = sides.peak[one] * (int(sides.peak.max(initial=0)) + 1) + sides.peak[other]
     _, index, times = np.unique(joined, return_inverse=True, return_counts=True)
     once = times[index] == 1

@@ -13,21 +13,18 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from typing import Any, cast
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import BoolArray, IntArray
-from ...threads import chunks_of, map_chunks
-from ...network.neighbourhood import CENTRE, STRIDES
+from ...arrays import CENTRE, STRIDES, Index, IntArray, Numbers, Vectors, dot, length, unit
 from ...refine.field import FineField
-from ..marching import Crossings, edge_ends, lattice_positions
 from ...refine.nodes import block_ijk
-from .patches import Index, Numbers, Patches, Vectors, dilate, dot, length, unit
+from ...threads import chunks_of, map_chunks, map_threads, worthwhile_threads
+from ..marching import Crossings, edge_ends, lattice_positions
+from .patches import Patches
 
 ROUNDS = 4  # in each, every crossing looks at those it shares a patch with
 ROUGH = 0.02  # 1 - cosine of normals in a patch from which a crossing is not trusted
@@ -39,12 +36,7 @@ LEAST_TRUST = 1e-4
 SETTLED = 0.3  # trust from which a crossing keeps its own plane, unless ...
 SMOOTHED_RINGS = 1  # ... it lies within these of one that does not
 PAIR_TEMPORARIES = 48  # numbers per crossing of a patch in a round
-TEMPORARIES = 256  # numbers per crossing in the computation of its plane
-
-
-def sums(row: NDArray[np.int64], vectors: Vectors, count: int) -> Vectors:
-    """Return the sums of the vectors of each of ``count`` rows, (count, 3), in their order."""
-    return np.stack([np.bincount(row, component, count) for component in vectors.T], 1)
+TEMPORARIES = 64  # numbers per crossing in the computation of its plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,41 +55,45 @@ class Planes:
         return dot(self.point, self.normal)
 
 
-def planes_at_crossings(field: FineField, crossings: Crossings, chosen: Index) -> Planes:
-    """Return the planes on chosen ones of the crossed edges that voxels own, by the field alone."""
-    parts = map_chunks(
-        lambda some: _planes_of_chunk(
-            field, crossings.own_row[chosen[some]], crossings.own_edge[chosen[some]]
-        ),
-        len(chosen),
-        TEMPORARIES,
-    )
-    empty = np.empty((0, 3)), np.empty((0, 3)), np.empty(0)
-    return Planes(*(np.concatenate(arrays) for arrays in zip(empty, *parts)))
-
-
-def _planes_of_chunk(
-    field: FineField, row: IntArray, edge: NDArray[np.int16]
-) -> tuple[Vectors, Vectors, Numbers]:
-    """Return the arrays of ``Planes`` for some edges of voxels' blocks.
+def planes_at_crossings(
+    field: FineField, crossings: Crossings, chosen: Index, border: IntArray, threads: int = 1
+) -> Planes:
+    """Return the planes on chosen ones of the crossed edges that voxels own, by the field alone.
 
     Normals are between the gradients at both ends, in which they trust if the slope is about 1.
     """
-    axis, node = np.divmod(edge.astype(np.int64), len(field.blocks))
-    low_ijk = block_ijk(field.factor)[node]
-    position = lattice_positions(field, row, edge).T
-    start = (field.factor * field.voxel_ijk[row] + low_ijk)[np.arange(len(row)), axis]
-    share = np.clip(position[np.arange(len(row)), axis] - start, 0, 1)
-    low, high = (_gradient(field, row, end) for end in (node, edge_ends(field.factor)[edge]))
-    trust = [
-        square_falloff((length(gradient) - 1) / SLOPE_ERROR) + LEAST_TRUST
-        for gradient in (low, high)
-    ]
-    weight = (1 - share) * trust[0], share * trust[1]
-    agree = dot(unit(low), unit(high)) > 0.9
-    mean = low * weight[0][:, None] + high * weight[1][:, None]
-    nearer = np.where((weight[0] >= weight[1])[:, None], low, high)
-    return position, unit(np.where(agree[:, None], mean, nearer)), np.maximum(*trust)
+    planes = Planes(np.empty((len(chosen), 3)), np.empty((len(chosen), 3)), np.empty(len(chosen)))
+    size = len(field.blocks)
+
+    def fill(some: slice) -> None:
+        row, edge = crossings.own_row[chosen[some]], crossings.own_edge[chosen[some]]
+        axis, node = np.divmod(edge.astype(np.int64), size)
+        position = lattice_positions(field, row, edge, border).T
+        each = np.arange(len(row))
+        start = field.factor * field.voxel_ijk[row, axis] + block_ijk(field.factor)[node, axis]
+        share = np.clip(position[each, axis] - start, 0, 1)
+        width = int(row[-1] - row[0]) + 1  # a node at the end of many edges is worked on once
+        ends = np.stack([node, edge_ends(field.factor)[edge]]) * width + (row - row[0])
+        number = np.zeros(size * width, np.int32)
+        number[ends] = 1
+        at = np.flatnonzero(number)
+        number[at] = np.arange(len(at))
+        ends = number[ends]
+        node, row = np.divmod(at, width)[0], row[0] + at % width
+        gradient = _gradient(field, row, node)
+        slope_trust = square_falloff((length(gradient) - 1) / SLOPE_ERROR) + LEAST_TRUST
+        low, high = gradient[ends]
+        trust = slope_trust[ends]
+        weight = (1 - share) * trust[0], share * trust[1]
+        agree = dot(*unit(gradient)[ends]) > 0.9
+        mean = low * weight[0][:, None] + high * weight[1][:, None]
+        nearer = np.where((weight[0] >= weight[1])[:, None], low, high)
+        planes.point[some] = position
+        planes.normal[some] = unit(np.where(agree[:, None], mean, nearer))
+        planes.trust[some] = np.maximum(*trust)
+
+    map_chunks(fill, len(chosen), TEMPORARIES, threads)
+    return planes
 
 
 def square_falloff(off: Numbers, other: Numbers | float = 0.0) -> Numbers:
@@ -109,39 +105,33 @@ def square_falloff(off: Numbers, other: Numbers | float = 0.0) -> Numbers:
     return falloff
 
 
-def _gradient(field: FineField, row: IntArray, node: Index) -> Vectors:
+def _gradient(field: FineField, row: NDArray[np.intp], node: NDArray[np.intp]) -> Vectors:
     """Return the field's gradient at nodes of blocks, (n, 3); 1 is the slope of a distance.
 
     Along each axis by the parabola through three of five nodes that bends least: it does not
-    straddle a kink.
+    straddle a kink. It is 0 where all three have missing values.
     """
-
-    def values(row: NDArray[Any], node: NDArray[Any]) -> Numbers:
-        found: Numbers = field.blocks[node, row].astype(np.float64)
-        found[row < 0] = np.nan  # there is no block
-        return found
-
-    gradient, here = np.empty((len(row), 3)), values(row, node)
+    gradient, c = np.empty((len(row), 3)), field.blocks[node, row].astype(np.float64)
     for axis, walk in enumerate(_walks(field.factor)):
-        a, b, d, e = (values(field.parts.table[place[node], row], end[node]) for place, end in walk)
-        gradient[:, axis] = _slope((a, b, here, d, e))
+        found = []
+        for place, end in walk:
+            beside = field.parts.table[place[node], row]
+            value = field.blocks[end[node], beside].astype(np.float64)
+            value[beside < 0] = np.nan  # there is no block
+            found.append(value)
+        a, b, d, e = found
+        least, slope = np.full(len(c), np.inf), np.zeros(len(c))
+        for bend, own in (
+            (c - 2 * b + a, 1.5 * c - 2 * b + 0.5 * a),
+            (d - 2 * c + b, 0.5 * (d - b)),
+            (e - 2 * d + c, 2 * d - 1.5 * c - 0.5 * e),
+        ):
+            bend = np.abs(bend)
+            better = bend < least  # never of NaN
+            np.copyto(least, bend, where=better)
+            np.copyto(slope, own, where=better)
+        gradient[:, axis] = slope
     return gradient * (field.factor / 2)
-
-
-def _slope(values: tuple[Numbers, ...]) -> Numbers:
-    """Return the slope at the third of five nodes, (n,): 0 where values are missing."""
-    a, b, c, d, e = values
-    parabolas = (
-        (c - 2 * b + a, 1.5 * c - 2 * b + 0.5 * a),
-        (d - 2 * c + b, 0.5 * (d - b)),
-        (e - 2 * d + c, 2 * d - 1.5 * c - 0.5 * e),
-    )
-    least, slope = np.full(len(c), np.inf), np.zeros(len(c))
-    for bend, own in parabolas:
-        bend = np.abs(bend)
-        better = bend < least  # never of NaN
-        least, slope = np.where(better, bend, least), np.where(better, own, slope)
-    return slope
 
 
 @lru_cache
@@ -160,51 +150,47 @@ def _walks(factor: int) -> list[list[tuple[Index, Index]]]:
     return [[walk(axis, step) for step in (-2, -1, 1, 2)] for axis in range(3)]
 
 
-def settle_planes(patches: Patches, own: Planes) -> Planes:
+def settle_planes(patches: Patches, own: Planes, threads: int = 1) -> Planes:
     """Return a plane for every crossing: its own, or that of flat ground beside it.
 
     In each round a crossing takes the mean of the planes of those with which it shares a patch,
     weighted by trust, by how alike the normals are, and by how near it lies to the plane. Two that
     share two patches count twice.
     """
-    loops = _loops_of(patches)
-    trust = own.trust * square_falloff(_roughness(own, loops) / ROUGH) + LEAST_TRUST
-    unsettled = np.any((trust < SETTLED)[patches.crossing] & patches.there, axis=1)
-    beside = dilate(patches, cast(BoolArray, unsettled), SMOOTHED_RINGS, len(trust))
-    planes, rows = Planes(own.point, own.normal, trust), np.flatnonzero(beside)
-    chunks = list(_chunks_of_loops([loop[:, beside[loop].any(0)] for loop in loops]))
-    for _ in range(ROUNDS):
-        planes = _settle_once(planes, own, chunks, rows)
-    return planes
-
-
-def _loops_of(patches: Patches) -> list[Index]:
-    """Return the crossings of the patches with 3 sides, with 4, and so on, (S, p) each."""
-    return [
+    loops = [  # the crossings of the patches with 3 sides, with 4, and so on, (S, p) each
         np.ascontiguousarray(patches.crossing[patches.sides == sides, :sides].T)
         for sides in range(3, patches.crossing.shape[1] + 1)
     ]
-
-
-def _roughness(own: Planes, loops: list[Index]) -> Numbers:
-    """Return the largest 1 - cosine of a crossing's normal and another's in a patch, (n,)."""
-    rough: Numbers = np.zeros(len(own.trust))
+    rough: Numbers = np.zeros(len(own.trust))  # the largest 1 - cosine of normals in a patch
     for loop in _chunks_of_loops(loops):
         normal = own.normal.T[:, loop]
-        for turn in range(1, len(loop)):
-            np.maximum.at(rough, loop, 1 - _along(normal, np.roll(normal, turn, axis=1)))
-    return rough
+        for turn in range(1, len(loop) // 2 + 1):  # a pair is met from both sides
+            bend = 1 - _along(normal, np.roll(normal, turn, axis=1))
+            np.maximum.at(rough, loop, np.maximum(bend, np.roll(bend, -turn, axis=0)))
+    trust = own.trust * square_falloff(rough / ROUGH) + LEAST_TRUST
+    unsettled = patches.having(trust < SETTLED)
+    near = patches.dilate(unsettled, SMOOTHED_RINGS, len(trust))
+    planes, rows = Planes(own.point, own.normal, trust), np.flatnonzero(near)
+    chunks = _chunks_of_loops([loop[:, near[loop].any(0)] for loop in loops])
+    threads = worthwhile_threads(PAIR_TEMPORARIES * sum(loop.size for loop in chunks), threads)
+    for _ in range(ROUNDS):
+        parts = map_threads(partial(_sums_in_loops, planes, own), chunks, threads)
+        planes = _settle_once(planes, own, parts, rows)
+    return planes
 
 
-def _chunks_of_loops(loops: list[Index]) -> Iterator[Index]:
-    for loop in loops:
-        for some in chunks_of(loop.shape[1], PAIR_TEMPORARIES * len(loop)):
-            yield loop[:, some]
+def _chunks_of_loops(loops: list[Index]) -> list[Index]:
+    return [
+        loop[:, some]
+        for loop in loops
+        for some in chunks_of(loop.shape[1], PAIR_TEMPORARIES * len(loop))
+    ]
 
 
-def _settle_once(planes: Planes, own: Planes, loops: list[Index], rows: Index) -> Planes:
+def _settle_once(
+    planes: Planes, own: Planes, parts: list[tuple[Index, Vectors]], rows: Index
+) -> Planes:
     """Return the planes after one round; only those of some rows change."""
-    parts = [_sums_in_loops(planes, own, loop) for loop in loops]
     crossing, sums = (np.concatenate(arrays, -1) for arrays in zip(*parts))
     total, off, passed_on, *normal = (
         np.bincount(crossing, each, len(own.trust))[rows] for each in sums
@@ -237,7 +223,7 @@ def _sums_in_loops(planes: Planes, own: Planes, loop: Index) -> tuple[Index, Vec
         sums[1] += weight * off
         sums[2] += weight * trust[here]
         sums[3:] += weight * normal[:, here]
-    return loop.T.ravel(), sums.transpose(0, 2, 1).reshape(6, -1)
+    return loop.ravel(), sums.reshape(6, -1)
 
 
 def _along(a: Vectors, b: Vectors) -> Numbers:

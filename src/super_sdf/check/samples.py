@@ -1,0 +1,244 @@
+"""How far the spheres of samples are from touching the mesh, and which vertices they contradict.
+
+An exact sample is the radius of an empty ball that touches the surface. Its residual is its
+distance to the mesh minus that radius: positive if the mesh does not reach the ball, negative if it
+pierces it. All lengths are in voxels unless they are named otherwise.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import BoolArray, FloatArray, IntArray
+from ..grid.sdf_grid import SdfGrid
+from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD
+from ..refine.band import plane_blocks, rescale
+from ..refine.nodes import VoxelIndex
+from ..refine.survey import Band
+from ..surface.mesh import Mesh
+from ..threads import chunks_of
+from ..truth.mesh_files import without_unused
+from ..truth.solid import Distances, Points, Solid
+
+FACES_IN_SLAB = 1 << 19  # search trees of small meshes are quicker and take less memory
+REACH = 2.0  # how far slabs look: the samples near the surface are within 1.4 of it
+WIDTH = 4  # 2^17 samples at a time
+CLEAR = 0.5  # cosine to the nearest triangle's normal above which that tells the side
+NOTICEABLE = 0.1  # a residual that is counted as large
+STRAY = 0.5  # within a ball, from which on a vertex is counted
+NEAREST_FEET = 8  # foot points that a vertex looks at
+SMOOTHING = 0.02  # distance of a foot point that halves its weight
+FARTHEST = 1.5  # foot points farther away say nothing of a vertex
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Where points are nearest to a mesh."""
+
+    intersections: int | None  # pairs of triangles of the mesh; None if they were not counted
+    distances: Distances  # (k,), to the nearest triangle, in world units
+    feet: Points  # (k, 3), the nearest points of the mesh
+    cosines: Distances  # (k,), between the ways from there and the normals of the triangles
+
+
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """The exact samples of a grid near the surface, and where their balls meet the mesh.
+
+    Samples that promise nothing are counted and left out: cut off at the limit of truncated values
+    or at the band's edge; and noisy ones, which differ from a neighbour by more than distances can,
+    together with the rest if they are many.
+    """
+
+    cut_off: int
+    noisy: int
+    voxel_ijk: IntArray  # (n, 3)
+    points: Points  # (n, 3), in world units
+    values: FloatArray  # (n,), negative inside
+    residuals: FloatArray  # (n,): distance to the mesh minus absolute value
+    feet: Points  # (n, 3): the nearest points of the mesh, in world units
+    wrong_side: BoolArray  # (n,): mesh and sample disagree on it by more than ``NOTICEABLE``
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures as they stand in JSON; None where no sample is exact."""
+        return {
+            "samples": {"exact": len(self.values), "cut_off": self.cut_off, "noisy": self.noisy},
+            "residual": self.summary() if len(self.values) else None,
+            "wrong_side": int(self.wrong_side.sum()) if len(self.values) else None,
+        }
+
+    def summary(self) -> dict[str, Any]:
+        """Return mean, 99th percentile and maximum of the absolute residuals, and where it is."""
+        size = np.abs(self.residuals)
+        worst = int(size.argmax())
+        return {
+            "mean": float(size.mean(dtype=np.float64)),
+            "p99": float(np.quantile(size, 0.99)),
+            "largest": float(size[worst]),
+            "largest_signed": float(self.residuals[worst]),
+            "largest_at": [float(x) for x in self.points[worst]],
+            "share_above_tenth": float((size > NOTICEABLE).mean()),
+            "share_not_touching": float((self.residuals > NOTICEABLE).mean()),
+            "share_pierced": float((self.residuals < -NOTICEABLE).mean()),
+        }
+
+
+@dataclass(frozen=True)
+class Strays:
+    """Vertices that lie where the nearest sample says that no surface is.
+
+    The samples near the surface see nothing of a piece that lies far from it. But every sample,
+    however far away, promises a ball without surface, also if its value was truncated.
+    """
+
+    count: int  # vertices more than ``STRAY`` inside the ball of their nearest sample
+    beyond: int  # vertices more than half a voxel from the outermost samples
+    deepest: float  # of a vertex in the ball of its nearest sample; 0 if there is none
+
+
+def exact_samples(band: Band) -> IntArray:
+    """Return which voxels of a band have exact samples, as rows, (n,)."""
+    values = band.patches[:, CENTRE]
+    # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
+    trusted = band.exact & (values > values.min()) & (values < values.max())
+    if band.sampled is not None:
+        trusted &= band.sampled  # of a resampled grid, what is interpolated promises nothing
+    return np.flatnonzero(trusted).astype(np.int32)
+
+
+def search(mesh: Mesh, points: Points, reach: float, *, intersections: bool) -> Found:
+    """Return the nearest points of a mesh, and the number of its self-intersections.
+
+    The mesh is cut into slabs along its longest axis, in which about equally many triangles begin.
+    In a slab, points are looked up in the triangles within ``reach`` of it; those that are farther
+    away than that in the whole mesh.
+    """
+    import igl.predicates  # here, so that pages are made without it
+
+    counts = intersections and hasattr(igl.predicates, "find_self_intersections")  # in new versions
+    axis = int(np.ptp(mesh.vertices, axis=0).argmax())
+    along = mesh.vertices[:, axis][mesh.faces]
+    low, high, place, n = along.min(1), along.max(1), points[:, axis], len(points)
+    distances, feet, cosines, total = np.empty(n), np.empty((n, 3)), np.empty(n), 0
+    shares = np.linspace(0, 1, len(mesh.faces) // FACES_IN_SLAB + 2)[1:-1]
+    inner = np.unique(np.quantile(low, shares, method="lower"))
+    for first, last in itertools.pairwise([-np.inf, *inner.tolist(), np.inf]):
+        near = (low < last + reach) & (high >= first - reach)
+        part = without_unused(mesh.vertices, mesh.faces[near])
+        part = Mesh(part.vertices.astype(np.float64), part.faces)
+        rows = np.flatnonzero((place >= first) & (place < last))
+        distances[rows], feet[rows], cosines[rows] = _nearest(part, points[rows])
+        if counts:
+            total += _count_intersections(part, axis, first, last)
+    far = np.flatnonzero(distances > reach)
+    if len(far):
+        distances[far], feet[far], cosines[far] = _nearest(mesh, points[far])
+    return Found(total if counts else None, distances, feet, cosines)
+
+
+def _nearest(mesh: Mesh, points: Points) -> tuple[Distances, Points, Distances]:
+    """Return distances, feet and cosines: see ``Found``; the cosine at no triangle's side is 0."""
+    distances, faces, feet = Solid(mesh).nearest(points)
+    a, b, c = mesh.vertices[mesh.faces[faces].T].astype(np.float64)
+    normals, ways = np.cross(b - a, c - a), points - feet
+    sizes = np.linalg.norm(normals, axis=1) * distances
+    dots = np.einsum("ij,ij->i", ways, normals)
+    return distances, feet, np.divide(dots, sizes, out=np.zeros(len(points)), where=sizes > 0)
+
+
+def _count_intersections(mesh: Mesh, axis: int, first: float, last: float) -> int:
+    """Return the number of pairs that intersect, whose common range on an axis begins in a slab."""
+    along = mesh.vertices[:, axis][mesh.faces]
+    low, high = along.min(1), along.max(1)
+    whole = (mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(1)  # with an area
+    rows = np.flatnonzero(whole & (low < last) & (high >= first))
+    faces = mesh.faces[rows].astype(np.int64)
+    import igl.predicates
+
+    pairs = igl.predicates.find_self_intersections(mesh.vertices, faces)[1]
+    begin = low[rows][pairs].max(1, initial=-np.inf)
+    return int(np.count_nonzero((begin >= first) & (begin < last)))
+
+
+def self_intersections(mesh: Mesh) -> int | None:
+    """Return the number of pairs of a mesh's triangles that intersect; None if libigl has no test.
+
+    Vertices at the same position must be one vertex.
+    """
+    return search(mesh, np.empty((0, 3)), 0.0, intersections=True).intersections
+
+
+def touch(
+    mesh: Mesh, band: Band, grid: SdfGrid, rows: IntArray, found: Found, *, simple: bool
+) -> Touching:
+    """Return where the balls of the exact samples of a band, by their rows, meet a mesh.
+
+    ``found`` is by ``search`` for these samples. On which side of the mesh a sample lies is by its
+    winding number; but if the mesh is ``simple``, see ``Surface``, not where the nearest triangle
+    agrees with the sample.
+    """
+    # if none is exact, too many are no distances for any to be taken for one
+    count = len(band.exact) if band.sampled is None else int(np.count_nonzero(band.sampled))
+    noisy = band.count_noisy() if len(rows) else count
+    ijk = band.voxel_ijk[rows]
+    points, values = grid.to_world(ijk), band.patches[rows, CENTRE] * np.float32(0.5)
+    distances, size = found.distances / grid.voxel_size, np.abs(values)
+    residuals = (distances - size).astype(np.float32)
+    solid, wrong = Solid(mesh), np.zeros(len(size), bool)
+    agreed = simple & (np.where(values > 0, 1, -1) * found.cosines > CLEAR)
+    apart = np.flatnonzero((distances + size > NOTICEABLE) & ~agreed)  # where the side matters
+    for chunk in chunks_of(len(apart), WIDTH):
+        some = apart[chunk]
+        wrong[some] = solid.is_inside(points[some]) != (values[some] <= 0)
+    cut_off = count - len(rows) - noisy
+    return Touching(cut_off, noisy, ijk, points, values, residuals, found.feet, wrong)
+
+
+def find_strays(
+    vertices: NDArray[Any], grid: SdfGrid, offset: float = 0.0, slack: float = 0.0
+) -> Strays:
+    """Look up the nearest sample of each vertex, (n, 3) in world units.
+
+    A sample's value may be off by ``slack``, as those of masks are.
+    """
+    position = grid.to_index(vertices)
+    nearest = np.rint(position).astype(np.int64)
+    inside = ((nearest >= 0) & (nearest < grid.shape)).all(1)
+    position, nearest = position[inside], nearest[inside]
+    values = np.zeros(len(nearest))
+    for first, last in plane_blocks(grid.shape):
+        rows = np.flatnonzero((nearest[:, 0] >= first) & (nearest[:, 0] < last))
+        if len(rows):
+            i, j, k = nearest[rows].T
+            values[rows] = rescale(grid, offset, first, last)[i - first, j, k]
+    depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1) - slack
+    count, beyond = np.count_nonzero(depth > STRAY), np.count_nonzero(~inside)
+    return Strays(int(count), int(beyond), float(depth.max(initial=0)))
+
+
+def vertex_residuals(vertices: NDArray[Any], touching: Touching, grid: SdfGrid) -> FloatArray:
+    """Return the residual at each vertex, (n,); NaN where no foot point is near.
+
+    Its size is the mean of the absolute residuals at the nearest foot points of the samples around,
+    each weighted by the inverse of its distance; its sign is that of the mean with signs.
+    """
+    residuals = np.full(len(vertices), np.nan, np.float32)
+    index = VoxelIndex(touching.voxel_ijk, grid.shape)
+    for chunk in chunks_of(len(vertices) if len(touching.values) else 0, 8 * len(NEIGHBOURHOOD)):
+        some = np.asarray(vertices[chunk], np.float64)
+        nearest = np.rint(grid.to_index(some)).astype(np.int64)
+        rows = index.find(nearest[:, None] + NEIGHBOURHOOD)
+        away = np.linalg.norm(some[:, None] - touching.feet[rows], axis=2) / grid.voxel_size
+        away[rows < 0] = np.inf
+        limit = np.partition(away, NEAREST_FEET - 1, axis=1)[:, NEAREST_FEET - 1, None]
+        weight = np.where(away <= np.minimum(limit, FARTHEST), 1 / (away + SMOOTHING), 0)
+        there = touching.residuals[rows]
+        with np.errstate(invalid="ignore"):
+            size = (weight * np.abs(there)).sum(1) / weight.sum(1)
+        residuals[chunk] = np.copysign(size, (weight * there).sum(1))
+    return residuals

@@ -1,1 +1,0 @@
-"""Refined fields as files: sparse ``.npz``, which is read back, dense ``.npy`` and ``.vti``."""

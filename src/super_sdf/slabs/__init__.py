@@ -1,1 +1,0 @@
-"""Cutting a grid into slabs so that the work fits in memory. It may import the steps."""

@@ -1,0 +1,185 @@
+"""From a fine field to its mesh: closed at the border, crossings found, edges kept, joined."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import IntArray
+from ..errors import OptionTypeError, seen
+from ..functions.function import Function, as_function
+from ..grid.cubic import cubic_grid
+from ..grid.sdf_grid import SdfGrid, check_grid
+from ..options import AUTO, DEFAULT_MESHER, MARCHING, SHARP, MesherName, check_cap, check_mesher
+from ..refine.field import FineField
+from ..refine.nodes import block_ijk
+from ..threads import check_count, map_chunks
+from . import marching
+from .cap import check_can_close, close
+from .mesh import Mesh, vertex_type
+
+TEMPORARIES = 16  # numbers per vertex in the computation of its position
+KEYS_PER_NODE = 16  # its three edges, and the features of the cell above it
+FIRST_FEATURE = 3
+
+
+def choose_mesher(name: Any, *, exact: bool) -> MesherName:
+    """Return the mesher with a name; by itself ``sharp`` if samples are exact distances.
+
+    Without such samples it finds no edges, and its mesh is that of marching cubes.
+    """
+    automatic: MesherName = SHARP if exact else MARCHING
+    chosen = check_mesher(name)
+    return automatic if chosen == AUTO else chosen
+
+
+def reach_in_voxels(mesher: MesherName, factor: int) -> int:
+    """Return how many voxels to every side a vertex and its triangles depend on."""
+    if mesher == MARCHING:
+        return 1
+    from .sharp.features import REACH_IN_CELLS, REACH_IN_VOXELS
+
+    return -(-(REACH_IN_CELLS + 1) // factor) + REACH_IN_VOXELS
+
+
+def extract(
+    field: FineField,
+    lattice: SdfGrid,
+    *,
+    mesher: MesherName,
+    cap: bool,
+    threads: int = 1,
+    first: tuple[int, int, int] = (0, 0, 0),
+    shape: tuple[int, int, int] | None = None,
+) -> tuple[Mesh, NDArray[np.int64]]:
+    """Return the zero level of a field as triangles in world coordinates, and the vertices' keys.
+
+    Vertices on lattice edges come first, then those of features.
+
+    Parameters
+    ----------
+    field : FineField
+        Of a grid, or of a part of it.
+    lattice : SdfGrid
+        The field's samples: it is from ``cubic_grid``. Mirrored axes turn triangles inward, so
+        these are turned over.
+    mesher : str
+        From ``choose_mesher``.
+    cap : bool
+        Close a surface that leaves the whole grid.
+    first, shape : three ints
+        Of a part: the index in the whole grid of its first sample, and the shape of the whole.
+
+    Returns
+    -------
+    Mesh, (n,) int64
+        The keys are the same in every part that has the vertex: 16 times the number of a node, in C
+        order on the fine lattice of the whole grid with a voxel more to every side, plus the axis
+        of the lattice edge that begins there, or 3 and more for the features of its cell.
+    """
+    whole = np.array(field.shape if shape is None else shape)
+    border = np.array([(0, 0, 0), whole]) - np.array(first)
+    field = close(field, cap=cap, border=border)
+    crossings = marching.find_crossings(field, threads)
+    features = None
+    if mesher == SHARP and field.spheres is not None and len(field.spheres.distance):
+        from .sharp.features import find_features
+
+        features = find_features(field, crossings, border, threads)
+    count = len(crossings.own_row)
+    total = check_count(count + (len(features.peak) if features else 0), "vertices")
+    vertices = np.empty((total, 3), vertex_type(lattice, field.factor))
+    keys, nodes = np.empty(total, np.int64), block_ijk(field.factor)
+
+    def place(some: slice) -> None:
+        row, edge = crossings.own_row[some], crossings.own_edge[some]
+        positions = marching.lattice_positions(field, row, edge, border)
+        vertices[some] = to_world(positions, field.factor, lattice)
+        axis, node = np.divmod(edge, np.int16(len(field.blocks)))
+        node_ijk = field.factor * (field.voxel_ijk[row] - border[0]) + nodes[node]
+        keys[some] = keys_of(node_ijk, whole, field.factor) + axis
+
+    map_chunks(place, count, TEMPORARIES, threads)
+    if features is None:
+        faces = marching.connect(field, crossings, threads)
+    else:
+        vertices[features.used] = to_world(features.position.T, field.factor, lattice)
+        vertices[count:] = to_world(features.peak.T, field.factor, lattice)
+        cell = features.cell_ijk - field.factor * border[0]
+        keys[count:] = keys_of(cell, whole, field.factor) + FIRST_FEATURE + features.nth
+        plain = marching.connect(field, features.plain, threads)
+        faces = np.concatenate([plain, features.faces])
+    if lattice.is_mirrored:
+        faces = np.ascontiguousarray(faces[:, ::-1])
+    return Mesh(vertices, faces), keys
+
+
+def keys_of(node_ijk: IntArray, shape: NDArray[Any], factor: int) -> NDArray[np.int64]:
+    """Return the keys of nodes (n, 3), counted from the first of the whole: see ``extract``."""
+    _, ny, nz = (factor * (shape + 2) + 1).tolist()
+    i, j, k = node_ijk.T.astype(np.int64) + factor
+    keys: NDArray[np.int64] = KEYS_PER_NODE * ((i * ny + j) * nz + k)
+    return keys
+
+
+def to_world(positions: NDArray[np.float64], factor: int, lattice: SdfGrid) -> NDArray[np.float64]:
+    """Return positions (3, n) in fine spacings from node (0, 0, 0) in world units, (n, 3)."""
+    samples = positions / factor - 0.5  # the fine index K i + K/2 is sample i
+    if not lattice.is_straight:
+        return lattice.to_world(samples.T)
+    world = np.empty(positions.shape[::-1])
+    for axis, sample in enumerate(samples):
+        world[:, axis] = sample * lattice.spacing[axis] + lattice.origin[axis]
+    return world
+
+
+def extract_mesh(
+    field: FineField,
+    grid: SdfGrid | None = None,
+    *,
+    mesher: MesherName = DEFAULT_MESHER,
+    cap: bool = True,
+    function: Function | None = None,
+) -> Mesh:
+    """Return the zero level of a field as triangles in world coordinates.
+
+    A node with value 0 is inside.
+
+    Parameters
+    ----------
+    field : FineField
+        From ``upsample`` or ``read_field``.
+    grid : SdfGrid, optional
+        A coarse grid for spacing, origin and direction. Default: the one that the field was made
+        from.
+    mesher : str
+        As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
+    cap : bool
+        Close a surface that leaves the grid, as in ``reconstruct``. A field that was made without
+        its grid stays open.
+    function : callable or DistanceFunction, optional
+        What the grid has samples of; vertices are then put where it is 0, as in ``reconstruct``.
+
+    Raises
+    ------
+    OptionError
+        If there is no such mesher; if there are more vertices than 32-bit numbers.
+    OptionTypeError
+        If an argument is something else.
+    """
+    if not isinstance(field, FineField):
+        raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
+    grid = field.placed if grid is None else grid
+    check_grid(grid)
+    samples = field.spheres
+    chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
+    cap = check_cap(cap) and field.grid is not None
+    check_can_close(grid, cap=cap)
+    mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
+    if function is None:
+        return mesh
+    from ..functions.zero import put_on_zero  # imported here, as few call it
+
+    return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)
