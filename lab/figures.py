@@ -27,17 +27,17 @@ import numpy as np
 
 from super_sdf.errors import FileError, OptionError
 from super_sdf.files.output import replacing
-from super_sdf.threads import count_cores
 from super_sdf.network.network import find_model
 from super_sdf.options import DEFAULT_QUALITY, QUALITIES
+from super_sdf.threads import count_cores
 
 from . import costs, parser_of, quoted
+from .costs import machine
 from .evaluate import Results, add_jobs, progress_lines, results_of, tasks_of
 from .kinds import KINDS
 from .measuring import Task, digest_of_ours
 from .methods import FLOOR, ON
 from .ndc import add_ndc
-from .costs import describe_machine, machine
 from .rows import Row, Rows
 from .shapes import Setting, find_meshes, spread
 from .tables import GAPS, gap_closed, mean_of, summary
@@ -105,7 +105,7 @@ class Bench:
 
     def timed(self, key: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> Row:
         """Return a row as ``kept`` does; it counts for this machine and its versions only."""
-        return self.kept({**key, "machine": describe_machine()}, measure)
+        return self.kept({**key, "machine": str(machine())}, measure)
 
 
 def name_of(method: str) -> str:

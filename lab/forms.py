@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 
-
 def ball(x, y, z, at: float, radius: float) -> np.ndarray:
     """Return the distance to a ball on the x axis."""
     return np.sqrt((x - at) ** 2 + y**2 + z**2) - radius

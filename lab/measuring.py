@@ -15,10 +15,16 @@ import numpy as np
 
 import super_sdf
 from super_sdf.errors import SuperSdfError
-from super_sdf.surface.mesh import Mesh
 from super_sdf.network.decoder import Decoder
-from super_sdf.network.network import (KIND_MODELS, find_model, float32_name, load_network, shipped_models)
+from super_sdf.network.network import (
+    KIND_MODELS,
+    find_model,
+    float32_name,
+    load_network,
+    shipped_models,
+)
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY
+from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.solid import Solid
 
 from . import edges, metrics

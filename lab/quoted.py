@@ -24,7 +24,6 @@ from .tables import (
     EDGES,
     EF1,
     F1,
-    GAPS,
     NC,
     P2S,
     THERE,
@@ -85,6 +84,7 @@ OPTION_LABELS = {
     "marching": "`--mesher marching`",
     "simplify": "`--simplify 0.02`",
 }
+
 
 def pick(rows: Iterable[Row], **words: Any) -> list[Row]:
     """Return the rows that have some words."""

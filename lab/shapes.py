@@ -20,9 +20,9 @@ from super_sdf.arrays import BoolArray, FloatArray, IntArray
 from super_sdf.errors import FileError, OptionError, seen
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
-from super_sdf.surface.mesh import Mesh
 from super_sdf.options import check_factor
 from super_sdf.refine.band import find_band, rescale
+from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import sample_grid, unit_layout
 from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
 

@@ -6,10 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from solids import cube, joined, sphere
+from solids import cube
 
-from lab import kinds as field_methods
-from lab.figures import kind_rows
 from lab.kinds import (
     AXES,
     BY_METHOD,
@@ -17,13 +15,10 @@ from lab.kinds import (
     KINDS,
     level_set,
     samples_of,
-    without_unknown,
 )
-from lab.measuring import Task, measure_method, measure_on_kind
+from lab.measuring import Task
 from lab.shapes import Case, Setting, Shape
-from lab.surfaces import closed_isosurface
-from super_sdf import Mesh, load_network
-from super_sdf.errors import GridError, OutOfMemoryError
+from super_sdf import load_network
 
 SIDE = 3**-0.5  # of the cube whose box diagonal is 1
 CUBIC = [name for name, kind in KINDS.items() if kind.ratio == 1]

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import trilinear
 from scipy import ndimage
-from solids import cube, saved, sphere, torus
+from solids import cube, saved, torus
 
 from lab import methods
-from lab.measuring import Task, measure_method, measure_task
-from lab.metrics import distance_or_dot
-from lab.shapes import HALVES, Case, Setting, Shape, draw_halves, random_rotation
+from lab.measuring import Task, measure_method
+from lab.shapes import Case, Setting, Shape
 from lab.surfaces import interpolate_spline
-from super_sdf import Mesh, pipeline
-from super_sdf.errors import NoSurfaceError
-from super_sdf.truth.solid import Solid
+from super_sdf import Mesh
 
 TASK = Task(Path(), Setting(8), ())
 
