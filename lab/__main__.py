@@ -12,7 +12,7 @@ COMMANDS = {
     "faults": "conversions and batches ended at random moments, also on a cluster, and full disks",
     "zoo": "grids as people have them, and the ways out that refusals name",
     "picture": "draw meshes; the pictures in README and of sharp edges",
-    "fields": "random fields: are their meshes closed manifolds, also in tiles",
+    "fields": "random fields: are their meshes closed manifolds",
 }
 
 

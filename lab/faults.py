@@ -90,8 +90,8 @@ def trial(words: list[str], out: Path, fault: str, runs: int) -> Counter[str]:
     start = time.perf_counter()
     found[run(words, "", 0, 1) or "right"] += 1
     seconds = time.perf_counter() - start
-    right = {p.relative_to(out).as_posix(): p.read_bytes()
-             for p in out.rglob("*") if p.is_file() and p.name != RECORD and p.name[0] != "."}  # fmt: skip
+    meshes = (path for path in out.rglob("*") if path.suffix in MESH_SUFFIXES)
+    right = {path.relative_to(out).as_posix(): path.read_bytes() for path in meshes}
     largest = max(map(len, right.values()), default=1)
     for turn in range(runs):
         if turn == 0 or not is_batch:

@@ -1,9 +1,9 @@
-"""Random fields of 2 to 16 samples a side: are their meshes closed manifolds, also in tiles?
+"""Random fields of 2 to 16 samples a side, and whether their meshes are closed manifolds.
 
     python -m lab fields --count 10000
 
 A fault is an open edge, a vertex of two surfaces, two vertices at one place, two triangles with the
-same corners, or a vertex outside the grid; in tiles, other triangles or a vertex that has moved.
+same corners, or a vertex outside the grid.
 """
 
 from __future__ import annotations
