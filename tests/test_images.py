@@ -79,13 +79,6 @@ def test_the_surface_is_the_one_of_the_command(folder, command):
     assert np.array_equal(surface.regular_faces, mesh.faces)
 
 
-def test_positions_far_away_are_in_double_precision():
-    image, _ = sphere()
-    image.origin = (5e6, 0, 0)
-    surface = image.super_sdf.contour(2, network=trilinear)
-    assert surface.points.dtype == np.float64 and surface.is_manifold
-
-
 def test_where_the_solid_runs_out_of_the_image_the_surface_is_closed_unless_left_open():
     image, _ = sphere()
     half = image.extract_subset((0, 19, 0, 21, 0, 10))
@@ -103,16 +96,6 @@ def test_residuals_are_those_of_the_certificate():
     assert bare.point_data.keys() == [] and bare.points.tobytes() == surface.points.tobytes()
     moved = image.super_sdf.contour(2, residuals=True, offset=0.5)
     assert np.nanmax(np.abs(moved.point_data["residual"])) < 0.05  # of the offset, too
-
-
-def test_masks_of_booleans_are_meshed():
-    image, centre = sphere()
-    inside = image.point_data["distance"] < 0
-    image.clear_data()
-    image.point_data["mask"] = inside
-    assert image.super_sdf.grid().field.kind == "mask"
-    points = image.super_sdf.contour(2).points
-    assert np.abs(np.linalg.norm(points - centre, axis=1) - RADIUS).max() < 0.3
 
 
 def test_the_active_scalars_are_taken_or_those_with_a_name():
@@ -180,18 +163,6 @@ def test_other_mistakes_are_one_line():
     assert said == "values have shape (20, 22, 1): give at least 2 samples on each axis"
     image.spacing = (0.2, 0.2, 0.2)
     assert refusal(GridError, contour).endswith("multiply the values, --scale 0.40123")
-
-
-def test_an_old_pyvista_is_named(monkeypatch):
-    script = (
-        "import pyvista; del pyvista.register_dataset_accessor; pyvista.__version__ = '0.44.1'\n"
-        "try:\n    import super_sdf.functions.pyvista\nexcept OSError as error:\n    print(error)"
-    )
-    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
-    assert done.stdout.decode() == (
-        "super_sdf.functions.pyvista needs PyVista 0.48 or later, this is 0.44.1: "
-        "pip install -e '.[pyvista]' in a clone of super-sdf\n"
-    )
 
 
 def test_pyvista_finds_the_accessor_and_super_sdf_does_not_load_pyvista(tmp_path):

@@ -67,13 +67,6 @@ def test_coordinates_in_single_precision_are_even_up_to_their_rounding():
     )
 
 
-def test_integers_and_unequal_steps_are_coordinates():
-    array = sphere().isel(z=slice(None, None, 2))
-    assert make_grid(array).spacing == (0.5, 0.5, 1.0)
-    whole = (sphere() * 2).assign_coords({name: np.arange(n) for name, n in zip("xyz", SHAPE)})
-    assert make_grid(whole).spacing == (1.0, 1.0, 1.0)
-
-
 def test_arrays_of_dask_are_computed_if_they_fit(monkeypatch):
     array = sphere("zyx").chunk({"z": 5})
     assert np.array_equal(make_grid(array).values, sphere().values)
@@ -117,8 +110,3 @@ REFUSED = {
 @pytest.mark.parametrize("said", REFUSED)
 def test_what_has_no_place_is_refused(said):
     assert refusal(GridError, make_grid, REFUSED[said]) == said
-
-
-def test_a_step_is_even_up_to_a_thousandth():
-    assert make_grid(uneven(13.5 + 0.5 * placement.EVEN / 2)).spacing[1] == 0.5
-    assert "a step of 0.502 among" in refusal(GridError, make_grid, uneven(13.502))

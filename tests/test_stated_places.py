@@ -122,13 +122,6 @@ def test_a_resolution_of_x_and_y_alone_is_told(options):
     ]
 
 
-def test_a_spacing_in_the_metadata_of_tifffile():
-    about = {"axes": "ZYX", "spacing": 0.6, "unit": "mm"}
-    options = {"resolution": (1 / 0.3, 1 / 0.4), "photometric": "minisblack"}
-    tifffile.imwrite("a.tif", sampled().T, metadata=about, **options)
-    check(read_grid("a.tif"), first=None)
-
-
 OME = {
     "nm": ("µm", "µm", "nm", (1, 1, 1000)),
     "mm": ("mm", "mm", "µm", (1, 1, 1000)),
@@ -206,48 +199,6 @@ def test_zarr_by_xarray_has_names_and_coordinates(order, down, version):
     check(read_grid("b.zarr", spacing=STEPS, origin=FIRST))
 
 
-@pytest.mark.parametrize("dtype, offset, version", [("i2", 0.5, 2), ("u2", -40.0, 3)])
-def test_numbers_that_stand_for_values(dtype, offset, version):
-    """As xarray packs values: whole numbers, with a scale and an offset, one of them NaN."""
-    array = placed("zxy").where(placed("zxy") < 2.5)
-    packed = {"dtype": dtype, "scale_factor": 0.002, "add_offset": offset, "_FillValue": 0}
-    about = {"encoding": {"sdf": packed}, "zarr_format": version}
-    array.to_dataset().to_zarr("a.zarr", **about)
-    want = xarray.open_zarr("a.zarr").sdf.values
-    path = Path("a.zarr")
-    with open_volume(path, find_format(path), "zyx", None) as (volume, _):
-        values = volume.read()
-    assert 1000 < np.isnan(want).sum() < want.size - 1000
-    np.testing.assert_allclose(values, want, rtol=0, atol=1e-6)
-    placed("zxy").to_dataset().to_zarr("b.zarr", **about)
-    grid = read_grid("b.zarr")
-    assert np.abs(grid.values - sampled()).max() < 0.0011 and np.allclose(grid.spacing, STEPS)
-
-
-def test_names_that_are_not_x_y_z_are_told():
-    array = placed("zyx").rename(x="column", y="row", z="slice").to_dataset()
-    array.to_zarr("a.zarr", zarr_format=3)
-    grid = read_grid("a.zarr")
-    check(grid)
-    assert grid.notes[0] == "its axes are named slice, row, column: taken as z, y, x"
-    some = {"dimension_names": ["z", None, None], "zarr_format": 3, "dtype": "f4"}
-    zarr.create_array("b.zarr", shape=SIZES[::-1], **some)[...] = sampled().T
-    grid = read_grid("b.zarr", spacing=STEPS, origin=FIRST)
-    check(grid)
-    assert grid.notes[0] == "its axes are named z, ?, ?: taken as z, y, x"
-
-
-def test_a_direction_that_is_given_holds_for_named_axes():
-    turn = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    options = {"spacing": STEPS, "origin": FIRST, "direction": turn}
-    np.save("a.npy", sampled())
-    bare = placed("yxz").drop_vars(["x", "y", "z"])
-    bare.to_dataset().to_zarr("a.zarr", zarr_format=2)
-    want, grid = read_grid("a.npy", **options), read_grid("a.zarr", **options)
-    assert np.array_equal(grid.values, want.values)
-    assert (grid.origin, grid.spacing) == (want.origin, want.spacing)
-
-
 # HDF5
 
 
@@ -281,17 +232,6 @@ def test_hdf5_labels_and_scales(order):
     check(read_grid("a.h5", spacing=STEPS, origin=FIRST))
     check(read_grid("b.h5"))
     check(read_grid("c.h5:/m"))
-
-
-def test_netcdf_names_without_coordinates_are_no_coordinates():
-    """As the netCDF library writes a dimension that has none: zeros under a name that says so."""
-    with h5py.File("a.h5", "w") as file:
-        file["m"] = sampled()
-        attach(file, "xyz", {name: np.zeros(n) for name, n in zip("xyz", SIZES)}, {})
-        for name, count in zip("xyz", SIZES):
-            text = f"This is a netCDF dimension but not a netCDF variable.{count:10d}"
-            file[f"scales/{name}"].attrs["NAME"] = np.bytes_(text)
-    check(read_grid("a.h5", spacing=STEPS, origin=FIRST))
 
 
 @pytest.mark.parametrize(
@@ -347,15 +287,6 @@ def test_axes_of_length_1_are_dropped(name, where):
     write_ones(name, shape)
     check(read_grid(name, spacing=STEPS, origin=FIRST))
     assert describe_grid_file(name)["shape"] == list(SIZES)
-
-
-def test_more_than_three_longer_axes_are_refused():
-    for name, shape in (("n.npy", (4, 6, *SIZES[1:])), ("a.h5", (17, 20, 6, 4))):
-        write_ones(name, shape)
-    said = "n.npy: values have shape (4, 6, 20, 17): give three axes (x, y, z)"
-    assert refusal(GridError, read_grid, "n.npy") == said
-    assert refusal(FileError, read_grid, "a.h5") == "a.h5 holds no 3D dataset"
-    assert "its axis 3 has 4 entries, and a grid" in refusal(GridError, read_grid, "a.h5:m")
 
 
 def test_metaimage_of_four_axes_keeps_its_place():
@@ -478,19 +409,6 @@ def affine() -> np.ndarray:
     return found
 
 
-@pytest.mark.parametrize("order, name", [("<", "a.nii.gz"), (">", "a.nii"), (">", "a.nii.gz")])
-@pytest.mark.parametrize("version", [nibabel.Nifti1Image, nibabel.Nifti2Image])
-def test_both_versions_of_nifti_in_both_orders_of_bytes(version, name, order):
-    header = version.header_class(endianness=order)
-    for key, value in version(sampled(), affine()).header.items():
-        header[key] = value
-    nibabel.save(version(sampled().astype(f"{order}f4"), affine(), header), name)
-    with (gzip.open if name.endswith(".gz") else open)(name, "rb") as file:
-        size = int.from_bytes(file.read(4), {"<": "little", ">": "big"}[order])
-    assert size == {nibabel.Nifti1Image: 348, nibabel.Nifti2Image: 540}[version]
-    check(read_grid(name))
-
-
 def test_nifti_without_a_place_is_not_mirrored():
     """Like ITK, whose direction is the identity, and method 1 of the standard."""
     image = nibabel.Nifti1Image(sampled(), None)
@@ -525,17 +443,6 @@ def test_sform_and_qform_that_disagree_are_told(codes):
     image.set_qform(affine(), codes[1])
     nibabel.save(image, "a.nii")
     assert not [note for note in read_grid("a.nii").notes if "form" in note]
-
-
-@pytest.mark.parametrize(
-    "unit, named", [("micron", "micrometre"), ("meter", "metre"), ("mm", ""), ("unknown", "")]
-)
-def test_the_unit_of_nifti_is_told(unit, named):
-    image = nibabel.Nifti1Image(sampled(), affine())
-    image.header.set_xyzt_units(unit)
-    nibabel.save(image, "a.nii")
-    told = [note for note in read_grid("a.nii").notes if "unit" in note]
-    assert told == ([f"lengths are in the unit that it states, {named}"] if named else [])
 
 
 # MetaImage

@@ -109,7 +109,8 @@ def _read_blocks(archive: Any, request: Request) -> Volume:
     blocks = (len(keys), *(resolution,) * 3, 1)
     if keys.shape != (len(keys), 3) or not len(keys) or not values.shape == weights.shape == blocks:
         raise GridError(f"its keys have shape {keys.shape}, its values {values.shape}")
-    samples = np.where(weights > 0, values, np.nan)[..., 0].transpose(0, 3, 2, 1)  # (block, x, y, z)
+    samples = np.where(weights > 0, values, np.nan)[..., 0]
+    samples = samples.transpose(0, 3, 2, 1)  # (block, x, y, z)
     low = keys.min(0)
     starts = (keys - low) * resolution
     shape = tuple((starts.max(0) + resolution).tolist())
