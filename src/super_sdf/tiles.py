@@ -19,7 +19,7 @@ from .arrays import BoolArray
 from .errors import MeshError, OptionError, OutOfMemoryError
 from .grid.sdf_grid import SdfGrid
 from .options import SHARP, MesherName
-from .refine import bounds, spheres, spline
+from .refine import bounds, prediction, spheres
 from .refine.survey import BandSummary
 from .surface.extract import KEYS_PER_NODE, reach_in_voxels
 from .surface.mesh import Mesh
@@ -131,7 +131,7 @@ def margin_of(
         )
     seen = max(receptive_field, bounds.REACH_OF_SAMPLES)
     if grid.field.smooth is not None:
-        seen = max(seen, spline.BEYOND)
+        seen = max(seen, prediction.BEYOND)
     fitted = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS
     return seen + fitted + reach_in_voxels(mesher, factor) + 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
@@ -228,6 +229,15 @@ def over_planes(
             planes[low - first : high - first] = samples[low:high]
         start, end = first, max(last, first + kept)
         yield work(planes[: last - first], *more)
+
+
+def let_go(samples: SampleArray) -> None:
+    """Let the system take back the pages of a mapped file: they count as held memory."""
+    while hasattr(samples, "source"):
+        samples = samples.source
+    mapped = getattr(samples, "_mmap", None)
+    if hasattr(mapped, "madvise"):
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:
