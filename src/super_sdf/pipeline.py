@@ -299,11 +299,11 @@ def mesh_grid(
     mesher = choose_mesher(chosen.mesher, exact=lattice.field.has_exact)
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     threads, shape = useful_threads(decoder.threads), lattice.shape
-    room = Room.of(chosen.max_memory, factor, mesher, decoder.memory_bytes)
+    room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
     tiles, whole = [Tile((0, 0, 0), shape, (0, 0, 0), shape)], None
     try:
         is_one = map_tiles is None and least_tiles == 1
-        band = survey(lattice, offset, threads=threads, most=room.voxels if is_one else -1)
+        band = survey(lattice, offset, threads=threads, most=room.voxels() if is_one else -1)
     except BandTooLarge:
         band, whole = None, summarise(lattice, offset, threads)
         margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
@@ -328,15 +328,15 @@ def mesh_grid(
             parts.append(part)
             steps.show(len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
-    mesh, leaves = join(parts), any(part.leaves for part in parts)
-    if not len(mesh.faces):
-        raise no_surface(grid, offset)
-    is_cut = any(part.is_cut for part in parts)
-    ends = lattice.field.unseen is not None
-    count = check_closed(mesh, lattice, parts, cap=chosen.cap or not is_cut, ends=ends)
+    leaves, is_cut = (any(getattr(part, name) for part in parts) for name in ("leaves", "is_cut"))
     counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
     if whole:
         counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
+    mesh, names = join(parts)
+    if not len(mesh.faces):
+        raise no_surface(grid, offset)
+    ends = lattice.field.unseen is not None
+    count = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
     steps.finish("isosurface")
     return Result(mesh, count, counts, leaves, is_cut, steps.take_seconds(), len(tiles))
 

@@ -130,7 +130,6 @@ def survey(
     voxel_ijk, patches = (np.concatenate([block[n] for block in blocks]) for n in (0, 1))
     number, value = (np.concatenate([block[n] for block in blocks]) for n in (2, 3))
     del blocks, block
-    let_go(grid.samples)
     lipschitz, sampled = _tell_noise(grid, voxel_ijk, patches)
     if whole is None:
         whole = _summary(patches, lipschitz if sampled is None else lipschitz[sampled], leaves)
@@ -227,6 +226,7 @@ def _blocks(
         if is_checked:
             check_not_cut_off(patches, offset, grid.voxel_size)
         voxel_ijk[:, 0] += low
+        let_go(grid.samples)
         leaves = any(bool((side <= 0).any()) for side in sides)
         return _Block(voxel_ijk, patches, *beyond, leaves, jumps)
 
