@@ -87,19 +87,6 @@ def test_samples_near_the_surface_are_those_of_the_whole_lattice(seed):
     assert asked.evaluations == np.isfinite(near).sum()
 
 
-def test_far_from_the_surface_few_points_are_asked():
-    asked = DistanceFunction(torus)
-    grid = asked.sample(BOX, 2 / 95)
-    assert asked.evaluations < 0.4 * 96**3
-    assert 0.99 * 8 / 95 < np.abs(grid.values).max() < 1.2 * 8 / 95
-    mesh, whole = (
-        reconstruct(DistanceFunction(torus).sample(BOX, 2 / 95, reach), trilinear)
-        for reach in (None, np.inf)
-    )
-    np.testing.assert_array_equal(mesh.faces, whole.faces)
-    np.testing.assert_array_equal(mesh.vertices, whole.vertices)
-
-
 def test_edges_and_corners_are_those_of_the_function():
     plain = reconstruct(DistanceFunction(block).sample(BOX, H))
     mesh = reconstruct(function=block, bounds=BOX, spacing=H)
