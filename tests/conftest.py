@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -76,18 +75,6 @@ def count_fans(faces: np.ndarray) -> np.ndarray:
 def folder(tmp_path, monkeypatch):
     """Work in a folder of its own."""
     monkeypatch.chdir(tmp_path)
-
-
-@pytest.fixture
-def in_process(monkeypatch):
-    """Read files in this process: to start others takes most of the time of many tests."""
-    from super_sdf.files import apart
-    from super_sdf.files.readers import READERS
-
-    monkeypatch.setenv("HDF5_EXTFILE_PREFIX", "")
-    monkeypatch.setattr(
-        apart, "volume_apart", lambda key, request: nullcontext(READERS[key](request))
-    )
 
 
 @pytest.fixture

@@ -9,8 +9,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import h5py
@@ -28,9 +26,8 @@ from numpy.typing import ArrayLike
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from super_sdf import SdfGrid, read_grid
-from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
-from super_sdf.files import formats, unpacking
-from super_sdf.grid.planes import PlaneFile
+from super_sdf.errors import FileError, GridError, OptionError
+from super_sdf.files import formats
 
 DATA = Path(__file__).parent / "data"
 SPACING = 0.5
@@ -43,7 +40,7 @@ TURNS = [
 ]  # half of them mirrored
 
 
-pytestmark = pytest.mark.usefixtures("folder", "in_process")
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 def part(points: np.ndarray) -> np.ndarray:
@@ -142,19 +139,6 @@ def test_an_oblique_grid_keeps_its_direction(name, turn):
     assert np.allclose(grid.direction, OBLIQUE, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ORIENTED)
-def test_the_file_is_read_slab_by_slab_into_a_temporary_file(name, monkeypatch):
-    """As if it were too large for memory: the same samples."""
-    for turn in TURNS[6], TURNS[13]:
-        ORIENTED[name](name, affine_of(turn))
-        with monkeypatch.context() as patch:
-            patch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
-            patch.setattr(unpacking, "PIECE", 3000)
-            grid = read_grid(name)
-        assert isinstance(grid.samples, PlaneFile)
-        check(grid)
-
-
 @pytest.mark.parametrize("name", ["a.nii", "a.nrrd"])
 def test_a_sheared_grid_is_refused(name):
     shear = np.eye(3)
@@ -238,10 +222,9 @@ def text_sdf(affine: np.ndarray) -> str:
     return head + "".join(f"{value:.6g}\n" for value in sampled(affine).ravel("F"))
 
 
-def test_three_dialects_of_sdf(monkeypatch):
+def test_three_dialects_of_sdf():
     affine = affine_of(np.eye(3))
     values, low = sampled(affine), affine[:3, 3].astype("<f4")
-    monkeypatch.setattr("super_sdf.files.streams.TEXT_PIECE", 1001)
     Path("text.sdf").write_text(text_sdf(affine))
     check(read_grid("text.sdf"))
     tag = "#sdf 1\ndim {} {} {}\ndata\n".format(*SIZES).encode()
@@ -286,13 +269,6 @@ STATED = "but {} files state their axes: leave it out"
 )
 def test_axes_that_the_file_states_are_not_overruled(name, options, said):
     assert refusal(OptionError, read_grid, name, **options).startswith(said)
-
-
-def test_what_a_library_loads_whole_is_refused_if_it_would_not_fit():
-    data = sampled(affine_of(np.eye(3))).T
-    tifffile.imwrite("a.tif", data, photometric="minisblack", volumetric=True, tile=(4, 16, 16))
-    with pytest.raises(OutOfMemoryError, match=r"a.tif takes .* since tifffile loads it whole"):
-        read_grid("a.tif", max_memory=1000)
 
 
 def test_special_files_and_folders_are_refused(command):
@@ -359,14 +335,3 @@ def test_the_page_on_formats_lists_those_of_the_table():
     for format_ in (*formats.FORMATS, formats.DICOM):
         start = f"| {format_.name} | `{'`, `'.join(format_.suffixes)}` | "
         assert start + (f"`{format_.extra}`" if format_.extra else "none") in page
-
-
-def test_no_library_is_imported_for_numpy_files():
-    script = (
-        "import sys, numpy; from super_sdf import read_grid;"
-        "f = numpy.linalg.norm(numpy.indices((9, 9, 9)) - 4.1, axis=0) - 2.5;"
-        "numpy.save('a.npy', f); read_grid('a.npy');"
-        "assert not {'nibabel', 'nrrd', 'SimpleITK', 'vtkmodules', 'tifffile', 'h5py', 'zarr',"
-        " 'numcodecs', 'xarray', 'pandas', 'super_sdf.files.readers'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", script], check=True)

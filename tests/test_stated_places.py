@@ -38,7 +38,7 @@ CENTRE = FIRST + np.array([3.2, 3.9, 4.4])
 
 
 pytestmark = [
-    pytest.mark.usefixtures("folder", "in_process"),
+    pytest.mark.usefixtures("folder"),
     pytest.mark.filterwarnings("ignore:Consolidated metadata"),
 ]
 
@@ -215,8 +215,8 @@ def test_numbers_that_stand_for_values(dtype, offset, version):
     array.to_dataset().to_zarr("a.zarr", **about)
     want = xarray.open_zarr("a.zarr").sdf.values
     path = Path("a.zarr")
-    with open_volume(path, find_format(path), "zyx", (10**9, None)) as volume:
-        values = volume.box(tuple(slice(0, n) for n in volume.shape))
+    with open_volume(path, find_format(path), "zyx", None) as (volume, _):
+        values = volume.read()
     assert 1000 < np.isnan(want).sum() < want.size - 1000
     np.testing.assert_allclose(values, want, rtol=0, atol=1e-6)
     placed("zxy").to_dataset().to_zarr("b.zarr", **about)
@@ -560,10 +560,6 @@ def test_what_a_metaimage_may_leave_out_or_call_otherwise():
     assert grid.notes[0] == "it states no ElementSpacing: taken as 1, as ITK does"
     Path("d.mha").write_bytes(whole.replace(b"DimSize", b"DistanceUnits = um\nDimSize"))
     assert read_grid("d.mha").notes[0] == "lengths are in the unit that it states, um"
-    Path("e.mha").write_bytes(whole.replace(b"Offset", b"Offsat"))
-    assert refusal(FileError, read_grid, "e.mha") == (
-        "e.mha: its header is damaged: the line 'Offsat = 10 -4 30' is no Offset"
-    )
 
 
 # VTK image data
@@ -599,4 +595,5 @@ def test_vectors_and_marks_are_read_only_by_name():
     image.save("a.vti")
     check(read_grid("a.vti"))
     said = refusal(GridError, read_grid, "a.vti:normal")
-    assert said == "a.vti:normal is no array of one number per sample"
+    said_ = "a.vti:normal: its array 'normal' has 3 numbers per sample: give an array of one"
+    assert said == said_

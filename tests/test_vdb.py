@@ -20,14 +20,10 @@ from super_sdf.files.vdb_writer import ACTIVE_MASK, ZIP
 DATA = Path(__file__).parent / "data"
 
 
-pytestmark = pytest.mark.usefixtures("in_process")
-
-
 def voxels(path):
     """Return the values of a file, before anything is made of them, and where the first one is."""
-    with open_volume(path, find_format(path), "xyz", (1 << 30, None)) as volume:
-        values = volume.box(tuple(slice(0, n) for n in volume.shape))
-        return values, np.array(volume.origin), volume.spacing[0]
+    with open_volume(path, find_format(path), "xyz", None) as (volume, _):
+        return volume.read(), np.array(volume.origin), volume.spacing[0]
 
 
 def distance(values, origin, spacing, balls):

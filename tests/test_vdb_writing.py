@@ -36,7 +36,7 @@ from super_sdf.files.vdb_writer import (
 
 PAD = 8  # voxels that are looked at beyond the lattice
 
-pytestmark = pytest.mark.usefixtures("folder", "in_process")
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 def turned() -> SdfGrid:
@@ -79,8 +79,8 @@ def level_set(field) -> tuple[np.ndarray, np.float32]:
 
 def held(path, grid: SdfGrid) -> tuple[np.ndarray, np.ndarray, dict]:
     """Return the values in a file, the voxel that is the first, and what is said of the grid."""
-    with open_volume(path, find_format(path), "xyz", (1, None), describes=True) as volume:
-        values = volume.box(tuple(slice(0, n) for n in volume.shape))
+    with open_volume(path, find_format(path), "xyz", None, describes=True) as (volume, _):
+        values = volume.read()
         columns = np.array(grid.direction) * grid.spacing
         np.testing.assert_allclose(volume.direction * volume.spacing, columns, atol=1e-15)
         first = np.linalg.solve(columns, np.array(volume.origin) - grid.origin)

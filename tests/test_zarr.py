@@ -3,26 +3,21 @@
 import json
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import zarr
 from conftest import ball, refusal
 
 from super_sdf import read_grid
-from super_sdf.errors import FileError, GridError, OutOfMemoryError
-from super_sdf.files import grids, unpacking, volume
+from super_sdf.errors import FileError, GridError
+from super_sdf.grid.planes import SamplePlanes
 
 SHAPE = (30, 26, 22)  # x, y, z
-LAYOUTS = {
-    "first axis whole": (22, 26, 1),
-    "middle axis whole": (1, 26, 1),
-    "planes": (22, 1, 30),
-    "odd": (5, 7, 11),
-}
 MODEL = ("--quality", "fast", "--spacing", "1", "-q")
 
 
-pytestmark = pytest.mark.usefixtures("folder", "in_process")
+pytestmark = pytest.mark.usefixtures("folder")
 
 
 def said_of(path, kind=GridError, **options):
@@ -42,41 +37,6 @@ def store(path, array, version=3, name=None, **layout):
     made = zarr.create_array(path, name=name, zarr_format=version, **about)
     made[:] = array
     return made
-
-
-@pytest.mark.parametrize("axes, room", [("xyz", 0), ("zyx", 10**9)])
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_each_chunk_is_read_once(monkeypatch, values, axes, room, layout):
-    """In boxes of a few chunks, to memory or to a file, the axes in either order."""
-    read = []
-    original = volume.Volume.box
-    monkeypatch.setattr(
-        volume.Volume, "box", lambda own, box: read.append(box) or original(own, box)
-    )
-    monkeypatch.setattr(grids, "unpacking_room", lambda bound: room)
-    monkeypatch.setattr(unpacking, "BOX", 4096)
-    array = values if axes == "xyz" else values.T
-    chunks = [min(*pair) for pair in zip(LAYOUTS[layout], array.shape)]
-    store("a.zarr", array, chunks=tuple(chunks))
-    np.testing.assert_array_equal(read_grid("a.zarr", axes=axes, spacing=1).values, values)
-    touched = np.zeros(array.shape, int)
-    for box in read:
-        touched[box] += 1
-        for part, chunk, count in zip(box, chunks, array.shape):
-            assert part.start % chunk == 0
-            assert part.stop % chunk == 0 or part.stop == count
-    assert (touched == 1).all()
-
-
-def test_a_chunk_that_does_not_fit_is_refused_before_it_is_read(monkeypatch, values):
-    store("a.zarr", values.T, chunks=(22, 26, 30))
-    monkeypatch.setattr(grids, "held_memory", lambda: 0)
-    size = 22 * 26 * 30 * 4
-    assert said_of("a.zarr", OutOfMemoryError, spacing=1, max_memory=3 * size - 1) == (
-        "a.zarr is stored in chunks of 22 x 26 x 30 samples, 0 MB each, and to unpack one takes "
-        "0 MB of memory, 0 MB are left; allow more (--max-memory), or store it in smaller chunks"
-    )
-    assert read_grid("a.zarr", spacing=1, max_memory=3 * size).shape == SHAPE
 
 
 def test_a_store_in_a_zip_file(values, command):
@@ -222,3 +182,32 @@ def test_info_of_numpy_files(command, values):
     assert command("info", "no.zarr")[::2] == (1, "Error: no.zarr does not exist\n")
     want = "Error: a.npy and --check: give only one of them\n"
     assert command("info", "a.npy", "--check")[2] == want
+
+
+@pytest.mark.parametrize("axes", ["xyz", "zyx"])
+@pytest.mark.parametrize("chunks", [(8, 8, 8), (22, 26, 30), (5, 7, 11)])
+def test_a_large_array_stays_in_its_file(monkeypatch, values, axes, chunks):
+    """The same samples, read layer by layer as planes are needed, and boxes on their own."""
+    monkeypatch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
+    monkeypatch.setattr("super_sdf.files.grids.LAYER_BYTES", 3000)
+    array = values if axes == "xyz" else values.T[::-1]
+    chunks = tuple(min(pair) for pair in zip(chunks, array.shape))
+    store("a.zarr", array, chunks=chunks)
+    with h5py.File("a.h5", "w") as file:
+        file.create_dataset("a", data=array, chunks=chunks)
+    for name in ("a.zarr", "a.h5"):
+        grid = read_grid(name, axes=axes, spacing=1)
+        assert isinstance(grid.samples, SamplePlanes)
+        want = values if axes == "xyz" else values[:, :, ::-1]
+        assert np.array_equal(grid.values, want)
+        for first, last in ((0, 1), (3, 12), (29, 30), (7, 7)):
+            assert np.array_equal(grid.samples[first:last], want[first:last])
+        box = grid.samples.crop((1, 2, 3), (28, 9, 20))
+        assert np.array_equal(box, want[1:28, 2:9, 3:20])
+
+
+def test_a_damaged_chunk_of_a_large_array_is_a_line(monkeypatch, values):
+    monkeypatch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
+    store("a.zarr", values.T)
+    Path("a.zarr/c/1/1/1").write_bytes(b"no chunk")
+    assert said_of("a.zarr", FileError, spacing=1).startswith("a.zarr cannot be read as Zarr: ")

@@ -67,6 +67,7 @@ def seen(value: object) -> str:
 EXTRAS = {
     "nifti": ("nibabel",),
     "nrrd": ("nrrd",),
+    "metaimage": ("SimpleITK",),
     "vti": ("vtkmodules",),
     "tiff": ("tifffile",),
     "hdf5": ("h5py",),

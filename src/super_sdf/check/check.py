@@ -20,8 +20,7 @@ from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
 from ..grid.cubic import cubic_grid
-from ..grid.sdf_grid import SdfGrid
-from ..labels.volumes import volume_of_samples
+from ..grid.sdf_grid import SdfGrid, volume_of_samples
 from ..options import LENGTHS, MASK, Options, check_distance, check_max_memory
 from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh

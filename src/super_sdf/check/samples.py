@@ -11,7 +11,6 @@ import itertools
 from dataclasses import dataclass
 from typing import Any
 
-import igl.predicates
 import numpy as np
 from numpy.typing import NDArray
 
@@ -104,6 +103,8 @@ def search(
     equally many triangles begin. In a slab, points are looked up in the triangles within ``reach``
     of it; those that are farther away than that in the whole mesh.
     """
+    import igl.predicates  # here, so that pages are made without it
+
     counts = intersections and hasattr(igl.predicates, "find_self_intersections")
     axis = int(np.ptp(mesh.vertices, axis=0).argmax())
     along = mesh.vertices[:, axis][mesh.faces]

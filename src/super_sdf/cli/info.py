@@ -77,8 +77,11 @@ def in_words(facts: dict[str, Any]) -> Iterator[str]:
                 yield from (f"  {line}" for line in in_words(inner))
         elif isinstance(value, (list, tuple)) and value and isinstance(value[0], dict):
             for inner in value:  # the grids of a file of OpenVDB
-                words = (f"{x:,}" if isinstance(x, int) else str(x) for x in inner.values() if x)
+                said = [x for x in inner.values() if x]
+                words = (f"{x:,} active voxels" if isinstance(x, int) else str(x) for x in said)
                 yield f"{name.removesuffix('s')}: {', '.join(words)}"
+        elif key == "notes":
+            yield from (f"note: {note}" for note in value)
         elif isinstance(value, (list, tuple)) and value:
             words = (f"{x:.10g}" if isinstance(x, (int, float)) else str(x) for x in value)
             yield f"{name}: {', '.join(words)}"

@@ -1,7 +1,6 @@
 """The table of grid file formats: help texts, messages, extras and readers follow it.
 
-A new format is a row here, and its reader in ``readers``. It needs no package, so that help texts
-are quick.
+A new format is a row here, and its reader in ``readers``.
 """
 
 from __future__ import annotations
@@ -10,8 +9,7 @@ import re
 from pathlib import Path, PurePath
 from typing import NamedTuple
 
-from ..errors import OptionError
-from ..errors import check_modules
+from ..errors import OptionError, check_modules
 from ..options import MESH_FORMATS, OPTIONS
 
 # What people give by mistake: surfaces, which have to be sampled first.
@@ -34,36 +32,37 @@ WAYS_OUT = {
 class GridFormat(NamedTuple):
     """A grid file format."""
 
-    key: str  # of its reader
+    key: str  # of its reader: ``read_key`` in ``readers.module``
     name: str  # in texts
     suffixes: tuple[str, ...]  # how its file names end, in lower case
+    module: str  # in ``readers``
     extra: str | None = None  # that installs its library
     axes: str | None = None  # the order of axes without --axes; None if the file states it
     has_members: bool = False  # whether a file may hold several arrays: FILE:NAME
-    is_apart: bool = False  # whether its library, in C, reads it in a process of its own
 
 
+MRC_SUFFIXES = (".mrc", ".map", ".ccp4", ".mrc.gz", ".map.gz", ".ccp4.gz")
 FORMATS = (
-    GridFormat("npy", "NumPy", (".npy",), axes="xyz"),
-    GridFormat("npz", "NumPy", (".npz",), axes="xyz"),
-    GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nifti"),
-    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd", has_members=True),
-    GridFormat("metaimage", "MetaImage", (".mha", ".mhd")),
-    GridFormat("vti", "VTK image data", (".vti",), has_members=True),
-    GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tiff", axes="zyx", is_apart=True),
-    GridFormat("hdf5", "HDF5", (".h5", ".hdf5", ".hdf"), "hdf5", "zyx", True, is_apart=True),
-    GridFormat("zarr", "Zarr", (".zarr", ".zarr.zip"), "zarr", "zyx", True, is_apart=True),
-    GridFormat("vdb", "OpenVDB", (".vdb",), "vdb", has_members=True, is_apart=True),
-    GridFormat("sdf", "SDFGen", (".sdf",)),
-    GridFormat("mgh", "FreeSurfer", (".mgz", ".mgh"), "nifti"),
-    GridFormat("analyze", "Analyze", (".hdr",), "nifti"),
-    GridFormat("mrc", "MRC", (".mrc", ".map", ".ccp4", ".mrc.gz", ".map.gz", ".ccp4.gz"), "mrc"),
-    GridFormat("vtk", "legacy VTK", (".vtk",), "vti", has_members=True, is_apart=True),
-    GridFormat("vtkhdf", "VTKHDF", (".vtkhdf",), "vti", has_members=True, is_apart=True),
-    GridFormat("netcdf", "NetCDF", (".nc", ".nc4", ".cdf"), "netcdf", "zyx", True, is_apart=True),
-    GridFormat("mat", "MATLAB", (".mat",), "mat", "xyz", True, is_apart=True),
+    GridFormat("npy", "NumPy", (".npy",), "numpy", axes="xyz"),
+    GridFormat("npz", "NumPy", (".npz",), "numpy", axes="xyz"),
+    GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nibabel", "nifti"),
+    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd", "nrrd", has_members=True),
+    GridFormat("metaimage", "MetaImage", (".mha", ".mhd"), "simpleitk", "metaimage"),
+    GridFormat("vti", "VTK image data", (".vti",), "vtk", "vti", has_members=True),
+    GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tifffile", "tiff", "zyx"),
+    GridFormat("hdf5", "HDF5", (".h5", ".hdf5", ".hdf"), "h5py", "hdf5", "zyx", True),
+    GridFormat("zarr", "Zarr", (".zarr", ".zarr.zip"), "zarr", "zarr", "zyx", True),
+    GridFormat("vdb", "OpenVDB", (".vdb",), "vdb", "vdb", has_members=True),
+    GridFormat("sdf", "SDFGen", (".sdf",), "sdf"),
+    GridFormat("mgh", "FreeSurfer", (".mgz", ".mgh"), "nibabel", "nifti"),
+    GridFormat("analyze", "Analyze", (".hdr",), "nibabel", "nifti"),
+    GridFormat("mrc", "MRC", MRC_SUFFIXES, "mrcfile", "mrc"),
+    GridFormat("vtk", "legacy VTK", (".vtk",), "vtk", "vti", has_members=True),
+    GridFormat("vtkhdf", "VTKHDF", (".vtkhdf",), "vtk", "vti", has_members=True),
+    GridFormat("netcdf", "NetCDF", (".nc", ".nc4", ".cdf"), "scipy", "netcdf", "zyx", True),
+    GridFormat("mat", "MATLAB", (".mat",), "scipy", "mat", "xyz", True),
 )
-DICOM = GridFormat("dicom", "DICOM", ("a folder",), "dicom", has_members=True, is_apart=True)
+DICOM = GridFormat("dicom", "DICOM", ("a folder",), "pydicom", "dicom", has_members=True)
 """A folder that is no Zarr store: the names of slices end in anything."""
 
 GRID_SUFFIXES = tuple(suffix for format_ in FORMATS for suffix in format_.suffixes)

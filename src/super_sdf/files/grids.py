@@ -1,36 +1,46 @@
-"""Reading grid files of all formats, and writing ``.npz``. Files are checked before they are read.
+"""Reading grid files of all formats, and writing ``.npz``.
 
-``formats`` has the table of all formats, ``readers`` their readers.
+``formats`` has the table of all formats, ``readers`` a module for each library.
 """
 
 from __future__ import annotations
 
+import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..errors import FileError, OptionError, SuperSdfError
-from ..grid.placement import STRAIGHT
-from ..grid.planes import InputFile
+from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
+from ..grid.placement import STRAIGHT, check_kind
+from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
-from ..threads import held_memory, memory_bound
 from ..options import AxisOrder, Options, Space, Values, check_path
+from ..threads import held_memory, memory_bound
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
-from .numpy_files import NUMPY_READERS
 from .output import check_free, replacing
 from .regular import check_grid_file
-from .unpacking import take
-from .volume import PLACE, Request, Volume, find_placement, place_in_world
+from .volume import (
+    PLACE,
+    Request,
+    Placement,
+    Volume,
+    find_placement,
+    place_in_world,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-ROOM_SHARE = 0.25  # of what a bound leaves, the share that an unpacked array may take
-UNKNOWN_ROOM = 1 << 28  # bytes that an unpacked array may take if the memory left is unknown
+LAYER_BYTES = 1 << 23  # of planes that are read together, if chunks are smaller
+ROOM_SHARE = 0.25  # of the memory that is left: larger arrays in chunks stay in their file
+
 
 
 def read_grid(
@@ -46,9 +56,9 @@ def read_grid(
 ) -> SdfGrid:
     """Read a grid from a file of any format in ``formats.FORMATS``: see docs/guides/formats.md.
 
-    An ``.npy`` file is not loaded but read plane by plane, now and when the grid is refined. Others
-    are unpacked first, and so are arrays in another axis order: into memory if that takes at most
-    a quarter of what is left of ``max_memory``, else into a temporary file.
+    An ``.npy`` file is mapped into memory and not loaded, unless its axes are in another order.
+    Others are loaded, but for HDF5 and Zarr if an array takes more than a quarter of what is left
+    of ``max_memory``: then its planes are read when they are needed.
 
     Parameters
     ----------
@@ -75,10 +85,10 @@ def read_grid(
     Raises
     ------
     FileError
-        If the file is missing, damaged, truncated, of another kind, or changes while it is read;
-        if the library for its format is missing.
+        If the file is missing, damaged, truncated or of another kind; if the library for its format
+        is missing.
     OutOfMemoryError
-        If there is no room to unpack it.
+        If there is no room to load it.
     GridError
         If its values are not a signed distance grid, or its axes are not at right angles.
     OptionError
@@ -103,83 +113,118 @@ def read_array(
     path = check_path(path, "path")
     format_ = find_format(path)
     order = choose_axes(format_, axes, given["direction"])
-    room, bound = unpacking_room(max_memory), memory_bound(max_memory)
-    left = None if bound is None else bound - (held_memory() or 0)
-    with open_volume(path, format_, order, (room, left)) as volume:
+    left = memory_left(max_memory)
+    with open_volume(path, format_, order, left) as (volume, request):
         volume = volume.in_space(space, str(path))
         if given["direction"] is not None:
             volume = volume.turned(order)
-        arrays = take(volume, str(path), room, given, left)
+        arrays = _taken(volume, request, given)
     return arrays | {"notes": volume.notes, "space": volume.space}
 
 
 @contextmanager
 def open_volume(
-    path: Path,
-    format_: GridFormat,
-    axes: str,
-    memory: tuple[int, int | None],
-    *,
-    describes: bool = False,
-) -> Iterator[Volume]:
-    """Yield the volume in a file; whatever its library raises is an error of one line.
+    path: Path, format_: GridFormat, axes: str, left: int | None, *, describes: bool = False
+) -> Iterator[tuple[Volume, Request]]:
+    """Yield the volume in a file, and what was asked for; a library's error becomes one line.
 
-    ``memory`` is how many bytes the unpacked array may take, and the process in all. ``describes``
-    says that no sample will be read.
+    ``left`` is how many bytes of memory it may take, None if unknown. ``describes`` says that no
+    sample will be read.
     """
     file, member = split_member(path)
     check_grid_file(path)
     check_library(format_)
-    watched = None if file.is_dir() else InputFile.open(file)
-    with one_line_errors(path, format_, watched), ExitStack() as files:
-        request = Request(file, member, axes, *memory, files, describes)
-        if format_.is_apart:
-            from .apart import volume_apart  # loads what talks to other processes
+    with one_line_errors(path, format_), ExitStack() as files:
+        readers = import_module(f".readers.{format_.module}", __package__)
+        read = getattr(readers, f"read_{format_.key}")
+        request = Request(file, member, axes, files, left, describes)
+        yield read(request), request
 
-            yield files.enter_context(volume_apart(format_.key, request))
-        elif format_.key in NUMPY_READERS:
-            yield NUMPY_READERS[format_.key](request)
-        else:
-            from .readers import READERS  # a dozen modules
 
-            yield READERS[format_.key](request)
+def memory_left(max_memory: int | None = None) -> int | None:
+    """Return how many bytes this process may still take, None if unknown."""
+    bound = memory_bound(max_memory)
+    return None if bound is None else max(bound - (held_memory() or 0), 0)
+
+
+class StoredPlanes(SamplePlanes):
+    """The samples of a volume, (nx, ny, nz), that stay in their file until planes are needed.
+
+    Planes of x that share chunks are read together, and the last ones that were read are held.
+    """
+
+    def __init__(self, volume: Volume, placement: Placement, request: Request) -> None:
+        self.volume, self.placement, self.path = volume, placement, request.path
+        self.files = request.files.pop_all()  # closed with this
+        self.shape, self.dtype, self.name = placement.of_world(volume.shape), volume.dtype, str(request.path)
+        chunk = placement.of_world(volume.chunks)[0] if volume.chunks else 1
+        self.layer = chunk * max(LAYER_BYTES // (chunk * prod(self.shape[1:])), 1)
+        self.held: tuple[int, NDArray[Any]] = (-1, np.empty(0))
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+        planes = np.empty((max(last - first, 0), *self.shape[1:]), self.dtype)
+        for start in range(first - first % self.layer, last, self.layer):
+            held = self.held
+            if held[0] != start:
+                stop = min(start + self.layer, self.shape[0])
+                self.held = held = start, self.crop((start, 0, 0), (stop, *self.shape[1:]))
+            low, high = max(first, start), min(last, start + len(held[1]))
+            planes[low - first : high - first] = held[1][low - start : high - start]
+        return planes
+
+    def crop(self, low: Sequence[int], high: Sequence[int]) -> NDArray[Any]:
+        """Return the samples in a box, which alone is read."""
+        box = [slice(None)] * 3
+        for world, (start, stop, count) in enumerate(zip(low, high, self.shape)):
+            axis = self.placement.world_axes.index(world)
+            is_back = self.placement.backwards[axis]
+            box[axis] = slice(count - stop, count - start) if is_back else slice(start, stop)
+        with one_line_errors(self.path, find_format(self.path)):
+            return np.asarray(self.placement.ordered(self.volume.read(*box)), self.dtype)
 
 
 @contextmanager
-def one_line_errors(path: Path, format_: GridFormat, watched: InputFile | None) -> Iterator[None]:
+def one_line_errors(path: Path, format_: GridFormat) -> Iterator[None]:
     """Turn whatever a library raises into a FileError of one line, and silence it meanwhile."""
-    import logging
-
     logs = logging.root.manager.disable
-    check_unchanged = watched.check_unchanged if watched else lambda: None
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             logging.disable(logging.CRITICAL)  # what matters is raised
             yield
     except SuperSdfError as error:
-        check_unchanged()  # a change explains whatever else went wrong
         if str(split_member(path)[0]) in str(error):
             raise
         raise type(error)(f"{path}: {error}") from None
     except MemoryError:
-        raise
+        raise OutOfMemoryError(f"{path} does not fit in memory: save it as .npy") from None
     except Exception as error:  # the libraries raise all kinds of errors
-        check_unchanged()
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = lines[-1][:200] if lines else type(error).__name__
         raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
     finally:
         logging.disable(logs)
-    check_unchanged()
 
 
-def unpacking_room(max_memory: int | None) -> int:
-    """Return how many bytes of memory an unpacked array may take."""
-    bound = memory_bound(max_memory)
-    if bound is None:
-        return UNKNOWN_ROOM
-    return int(ROOM_SHARE * max(bound - (held_memory() or 0), 0))
+def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
+    """Return values (nx, ny, nz), spacing, origin and direction of a volume, for ``make_grid``."""
+    name = str(request.path)
+    check_kind(volume.dtype, volume.shape)
+    placement = find_placement(volume, name)
+    place = place_in_world(volume, placement, given)
+    size = prod(volume.shape) * volume.dtype.itemsize
+    is_large = request.left is not None and size > ROOM_SHARE * request.left
+    values: Any
+    if isinstance(volume.values, np.memmap) and (placement.is_straight or is_large):
+        values = placement.ordered(volume.read())
+    elif is_large and volume.chunks:
+        values = StoredPlanes(volume, placement, request)
+    else:
+        request.check_fits(volume.shape, volume.dtype)
+        dtype = volume.dtype.newbyteorder("=")
+        values = np.ascontiguousarray(placement.ordered(volume.read()), dtype)
+    return {"values": values, **place}
 
 
 def grid_from_image(
@@ -208,7 +253,7 @@ def grid_from_image(
     Returns
     -------
     SdfGrid
-        With a copy of the samples, in a temporary file if they are large.
+        With a copy of the samples.
 
     Raises
     ------
@@ -222,8 +267,8 @@ def grid_from_image(
     from .readers.vtk import NAME, volume_of_image
 
     volume = volume_of_image(image, scalars)
-    arrays = take(volume, NAME, unpacking_room(max_memory), {})
-    return make_grid(**arrays, **values)
+    request = Request(Path(NAME), None, "zyx", ExitStack(), memory_left(max_memory))
+    return make_grid(**_taken(volume, request, {}), **values)
 
 
 def describe_grid_file(path: str | Path) -> dict[str, Any]:
@@ -235,7 +280,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     path = check_path(path, "path")
     format_ = find_format(path)
     order = choose_axes(format_, None)
-    with open_volume(path, format_, order, (0, None), describes=True) as volume:
+    with open_volume(path, format_, order, None, describes=True) as (volume, _):
         if len(volume.shape) != 3:
             raise FileError(f"its array has shape {volume.shape}: give three axes")
         placement = find_placement(volume, str(path))

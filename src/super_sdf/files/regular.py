@@ -12,18 +12,14 @@ import os
 import re
 import stat
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path, PurePath
 
 from ..errors import FileError, seen
 from .formats import find_format, split_member
 
 KINDS = {
-    stat.S_IFDIR: "folder",
-    stat.S_IFIFO: "named pipe",
-    stat.S_IFSOCK: "socket",
-    stat.S_IFCHR: "device",
-    stat.S_IFBLK: "device",
+    **{stat.S_IFDIR: "folder", stat.S_IFIFO: "named pipe", stat.S_IFSOCK: "socket"},
+    **{stat.S_IFCHR: "device", stat.S_IFBLK: "device"},
 }
 REASONS = {
     errno.ENOENT: "does not exist",
@@ -83,20 +79,6 @@ def reason_of(error: OSError) -> str:
     return reason or f"cannot be read: {error.strerror or error}"
 
 
-def _check_store(path: Path) -> None:
-    """Raise FileError unless a path is a readable Zarr folder, which has one of ``MARKS``."""
-    try:
-        names = os.listdir(path)
-    except NotADirectoryError:
-        raise FileError(f"{path} is a file: a Zarr store is a folder") from None
-    except OSError as error:
-        raise FileError(f"{path} {reason_of(error)}") from None
-    mark = next((name for name in MARKS if name in names), None)
-    if mark is None:
-        raise FileError(f"{path} is no Zarr store: it holds none of {', '.join(MARKS)}")
-    check_regular_file(path / mark)
-
-
 def is_store(path: str | Path) -> bool:
     """Return whether a path is a folder whose name is that of a Zarr store."""
     return str(path).lower().endswith(".zarr") and os.path.isdir(path)
@@ -106,10 +88,20 @@ def check_grid_file(path: str | Path) -> None:
     """Raise FileError unless the file that ``FILE`` or ``FILE:NAME`` names can be read."""
     file, _ = split_member(path)
     key = find_format(path).key
-    if key == "zarr" and not file.name.lower().endswith(".zip"):
-        _check_store(file)
-    elif key != "dicom":
-        check_regular_file(file)
+    if key != "zarr" or file.name.lower().endswith(".zip"):
+        if key != "dicom":
+            check_regular_file(file)
+        return
+    try:
+        names = os.listdir(file)
+    except NotADirectoryError:
+        raise FileError(f"{file} is a file: a Zarr store is a folder") from None
+    except OSError as error:
+        raise FileError(f"{file} {reason_of(error)}") from None
+    mark = next((name for name in MARKS if name in names), None)
+    if mark is None:
+        raise FileError(f"{file} is no Zarr store: it holds none of {', '.join(MARKS)}")
+    check_regular_file(file / mark)
 
 
 def files_of(path: str | Path) -> list[Path]:
@@ -121,11 +113,12 @@ def files_of(path: str | Path) -> list[Path]:
     file, _ = split_member(path)
     if is_store(file):
         return sorted(Path(at, name) for at, _, names in os.walk(file) for name in names)
-    named: set[Path] = set()
-    with suppress(OSError):
-        if file.is_file():  # opening a pipe would block
-            named = {file.parent / name for name in _names_in(file)}
-    return [file, *sorted(each for each in named - {file} if os.path.isfile(each))]
+    try:
+        # opening a pipe would block
+        named = {file.parent / name for name in _names_in(file)} if file.is_file() else set()
+        return [file, *sorted(each for each in named - {file} if each.is_file())]
+    except (OSError, ValueError):
+        return [file]
 
 
 def _names_in(file: Path) -> Iterator[str]:
@@ -137,14 +130,17 @@ def _names_in(file: Path) -> Iterator[str]:
         for match in WEIGHTS.finditer(content):
             yield os.fsdecode(content[match.end() : match.end() + match[1][0]])
     elif kind in HEADERS:
-        with file.open("rb") as header:
-            lines = header.read(LONGEST_HEADER).split(b"\n")
-        for line in lines:
-            if b"\0" in line:  # the data
-                break
-            text = os.fsdecode(line).strip()
+        for text in header_lines(file):
             value = re.split("[=:]", text, maxsplit=1)[-1].strip()
             yield from (text, value)
             if NUMBER.search(value):
                 pattern = NUMBER.sub("*", glob.escape(value.split()[0]))
                 yield from glob.glob(pattern, root_dir=file.parent)
+
+
+def header_lines(file: Path) -> list[str]:
+    """Return the lines of text that a file begins with."""
+    with file.open("rb") as header:
+        lines = header.read(LONGEST_HEADER).split(b"\n")
+    binary = next((n for n, line in enumerate(lines) if b"\0" in line), len(lines))
+    return [os.fsdecode(line).strip() for line in lines[:binary]]

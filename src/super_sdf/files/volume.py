@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from itertools import permutations
 from math import prod
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,21 +21,13 @@ from numpy.typing import NDArray
 from ..arrays import Triple
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError
 from ..grid.placement import Direction, as_direction, check_direction
-from ..grid.planes import SampleArray
 from ..threads import in_words
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
 MOST_NAMED = 10  # arrays that an error lists
+COPIES = 2  # of an array that is loaded, while its axes are put in order
 PLACE = ("spacing", "origin", "direction")
 XYZ = np.eye(3)
-ZYX = np.eye(3)[::-1]
-
-Box: TypeAlias = tuple[slice, slice, slice]
-"""Which samples along each axis of an array; all slices have a start and a stop."""
-
-ReadBox: TypeAlias = Callable[[Box], NDArray[Any]]
-Planes: TypeAlias = Callable[[int, int], NDArray[Any]]
-"""Returns planes first to last (exclusive) along the first axis, the slowest in the file."""
 
 
 @dataclass(frozen=True)
@@ -45,69 +37,98 @@ class Request:
     path: Path
     member: str | None  # the name of an array in the file
     axes: str  # the order in a file that does not state one: "xyz" or "zyx"
-    room: int  # bytes of memory that the unpacked array may take
-    left: int | None  # bytes that the process may still take; None if unknown
-    files: ExitStack  # closes what the reader opens, once the volume is copied
+    files: ExitStack  # closes what the reader opens, once the samples are read
+    left: int | None = None  # bytes of memory that the process may still take, if that is known
     describes: bool = False  # no sample will be read: the file is described
 
-    def check_loads(self, size: int, library: str) -> None:
-        """Raise OutOfMemoryError if an array that is loaded whole would not fit in memory."""
-        if self.left is not None and size > self.left:
+    def check_fits(self, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
+        """Raise OutOfMemoryError if an array that a library loads whole does not fit."""
+        need = COPIES * prod(map(int, shape)) * dtype.itemsize
+        if self.left is not None and need > self.left:
             raise OutOfMemoryError(
-                f"{self.path} takes {in_words(size)} of memory, since {library} loads it whole, "
-                f"and {in_words(max(self.left, 0))} are left; save it as .npy in C order"
+                f"{self.path}, {in_words_of(shape, dtype)}, is loaded whole, which takes "
+                f"{in_words(need)} of memory, {in_words(self.left)} are left; allow more "
+                "(--max-memory), or save it as .npy in C order"
             )
 
     def choose(self, names: Sequence[str], what: str) -> str:
         """Return the name of the array to read: the one asked for, else the only one."""
         if not names:
             raise FileError(f"{self.path} holds no {what}")
+        listed = ", ".join(names[:MOST_NAMED])
+        if len(names) > MOST_NAMED:
+            listed += f" and {len(names) - MOST_NAMED:,} more"
         if self.member is not None:
             same = [name for name in names if name.strip("/") == self.member.strip("/")]
             if not same:
-                listed = in_short(names)
                 raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
             return same[0]
         if len(names) > 1:
             raise FileError(
-                f"{self.path} holds several arrays, {in_short(names)}: give {self.path}:{names[0]}"
-                ", say"
+                f"{self.path} holds several arrays, {listed}: give {self.path}:{names[0]}, say"
             )
         return names[0]
 
 
-def in_short(names: Sequence[str]) -> str:
-    """Return the first of some names, and how many more there are."""
-    more = f" and {len(names) - MOST_NAMED:,} more" if len(names) > MOST_NAMED else ""
-    return ", ".join(names[:MOST_NAMED]) + more
+class Later:
+    """An array that a library loads whole, once it is asked for the samples."""
+
+    def __init__(self, shape: Sequence[int], dtype: Any, load: Callable[[], Any]) -> None:
+        self.shape, self.dtype, self.load = tuple(map(int, shape)), np.dtype(dtype), load
+
+    def __getitem__(self, which: Any) -> NDArray[Any]:
+        loaded = np.asarray(self.load())
+        if loaded.shape != self.shape:
+            raise FileError(f"its header promises {self.shape} samples, it holds {loaded.shape}")
+        return loaded[which]
 
 
 @dataclass(frozen=True)
 class Volume:
     """An array of samples in a file, and where they are in the world.
 
-    Sample (a, b, c) of the array is at ``origin + direction @ (spacing * (a, b, c))``: spacings are
-    those along the axes of the array, and the columns of ``direction`` (unit vectors) their world
-    directions.
+    Sample (a, b, c) of the axes in space is at ``origin + direction @ (spacing * (a, b, c))``:
+    spacings are those along the axes of the array, and the columns of ``direction`` (unit vectors)
+    their world directions.
     """
 
-    shape: tuple[int, ...]
-    dtype: np.dtype[Any]
-    read: Planes | None = None
+    values: Any  # what is indexed like an array of NumPy
     spacing: Triple | None = None
     origin: Triple | None = None
     direction: NDArray[np.float64] | None = None
-    stored: SampleArray | None = None  # the array itself, if it need not be unpacked
-    chunks: tuple[int, ...] | None = None  # samples of a chunk along each axis, if there are any
-    read_box: ReadBox | None = None  # instead of ``read``
-    packed: int | None = None  # bytes of the array as it is compressed in the file, if it is
+    kept: tuple[int, ...] = (0, 1, 2)  # the axes in space; of others the first entry is taken
+    convert: Callable[[NDArray[Any]], NDArray[Any]] | None = None  # of what is stored to values
+    converted: np.dtype[Any] | None = None  # the type of what it returns
     notes: tuple[str, ...] = ()  # sentences on what the file says, for the user
     about: dict[str, Any] = field(default_factory=dict)  # how it is stored, for ``info``
     axes: str | None = None  # order of x, y and z along the array, if the file or user names it
     # spacing, origin, direction of x, y, z as the file has them, unchecked, instead of those above
     place: dict[str, Any] = field(default_factory=dict)
     space: str | None = None  # "RAS" or "LPS", if the file states one of them
-    part: str = ""  # follows the name of the file in messages, such as "[values]"
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of samples along each axis that is kept."""
+        return tuple(int(self.values.shape[axis]) for axis in self.kept)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the samples."""
+        return self.converted or np.dtype(self.values.dtype)
+
+    @property
+    def chunks(self) -> tuple[int, ...] | None:
+        """Samples of a chunk along each axis, None if the array is stored in one piece."""
+        chunks = getattr(self.values, "chunks", None)
+        return tuple(int(chunks[axis]) for axis in self.kept) if chunks else None
+
+    def read(self, *parts: slice) -> NDArray[Any]:
+        """Return all samples, or those in a box."""
+        where: list[Any] = [0] * len(self.values.shape)
+        for axis, part in zip(self.kept, parts or [slice(None)] * 3):
+            where[axis] = part
+        samples = self.values[tuple(where)]
+        return self.convert(np.asarray(samples)) if self.convert else samples
 
     def turned(self, axes: str) -> Volume:
         """Return it without its direction, for a user who gives that of x, y and z."""
@@ -127,23 +148,8 @@ class Volume:
             space=space,
         )
 
-    @property
-    def unit(self) -> tuple[int, ...]:
-        """Samples along each axis that are read together at least."""
-        return self.chunks or (1, *self.shape[1:])
 
-    def box(self, box: Box) -> NDArray[Any]:
-        """Return a box of samples, of the array's own type."""
-        if self.read_box:
-            samples = self.read_box(box)
-        else:
-            assert self.read
-            samples = self.read(box[0].start, box[0].stop)[:, box[1], box[2]]
-        return np.asarray(samples).astype(self.dtype, copy=False)
-
-
-@dataclass(frozen=True)
-class Placement:
+class Placement(NamedTuple):
     """Which world axis each axis of an array runs along, or nearest to, and whether backwards.
 
     ``direction`` is that of the array with its axes in this order and sense, None if they run along
@@ -154,9 +160,20 @@ class Placement:
     backwards: tuple[bool, ...]
     direction: Direction | None = None
 
+    @property
+    def is_straight(self) -> bool:
+        """Whether the axes of the array are nearest to x, y and z in this order and sense."""
+        return self.world_axes == (0, 1, 2) and not any(self.backwards)
+
     def of_world(self, numbers: Sequence[Any]) -> tuple[Any, ...]:
         """Return what is said of the axes of an array for those nearest to x, y and z."""
-        return tuple(numbers[self.world_axes.index(w)] for w in range(3))
+        return tuple(numbers[self.world_axes.index(world)] for world in range(3))
+
+    def ordered(self, samples: NDArray[Any]) -> NDArray[Any]:
+        """Return a view of samples with their axes along x, y and z."""
+        flips = tuple(axis for axis in range(3) if self.backwards[axis])
+        turned = np.flip(samples, flips) if flips else samples
+        return turned.transpose(self.of_world((0, 1, 2)))
 
 
 def triple(numbers: Any) -> Triple:
@@ -167,14 +184,14 @@ def triple(numbers: Any) -> Triple:
 
 def in_words_of(shape: Sequence[int], dtype: np.dtype[Any]) -> str:
     """Return shape, type and size of an array, for messages."""
-    size = prod(shape) * dtype.itemsize
+    size = prod(map(int, shape)) * dtype.itemsize
     return f"{' x '.join(map(str, shape))} {dtype}, {size:,} bytes"
 
 
-def kept_axes(shape: Sequence[int]) -> list[int]:
+def kept_axes(shape: Sequence[int]) -> tuple[int, ...]:
     """Return the axes of an array without those of length 1 that are beside three others."""
     single = [axis for axis, count in enumerate(shape) if count == 1][: max(len(shape) - 3, 0)]
-    return [axis for axis in range(len(shape)) if axis not in single]
+    return tuple(axis for axis in range(len(shape)) if axis not in single)
 
 
 def from_affine(matrix: NDArray[Any]) -> tuple[Triple, Triple, NDArray[np.float64]]:
@@ -183,13 +200,6 @@ def from_affine(matrix: NDArray[Any]) -> tuple[Triple, Triple, NDArray[np.float6
     lengths = np.linalg.norm(columns, axis=0)
     direction = columns / np.where(lengths > 0, lengths, 1)
     return triple(lengths), triple(np.asarray(matrix, np.float64)[:3, 3]), direction
-
-
-def reversed_axes(
-    spacing: Any, direction: NDArray[np.float64]
-) -> tuple[Triple, NDArray[np.float64]]:
-    """Return spacing and direction for the array with its axes in reverse order."""
-    return triple(np.asarray(spacing, np.float64)[::-1]), np.asarray(direction)[:, ::-1]
 
 
 def axes_direction(axes: str) -> NDArray[np.float64]:
@@ -229,20 +239,11 @@ def place_in_world(volume: Volume, placement: Placement, given: dict[str, Any]) 
         spacing = placement.of_world(volume.spacing)
     if origin is None:
         origin = volume.origin
-    if origin is not None and any(placement.backwards):
-        origin = _lowest_corner(volume, placement, spacing, origin)
+    if origin is not None and any(placement.backwards):  # to the sample that comes first now
+        columns = XYZ if placement.direction is None else np.array(placement.direction)
+        steps = np.broadcast_to(np.asarray(spacing, np.float64), 3)
+        origin = np.broadcast_to(np.asarray(origin, np.float64), 3).copy()
+        for count, axis, is_back in zip(volume.shape, placement.world_axes, placement.backwards):
+            origin -= is_back * columns[:, axis] * ((count - 1) * steps[axis])
     direction = placement.direction if direction is None else direction
     return {"spacing": spacing, "origin": origin, "direction": direction}
-
-
-def _lowest_corner(
-    volume: Volume, placement: Placement, spacing: Any, origin: Any
-) -> NDArray[np.float64]:
-    """Return the position of the sample that comes first when no axis runs backwards."""
-    columns = XYZ if placement.direction is None else np.array(placement.direction)
-    steps = np.broadcast_to(np.asarray(spacing, np.float64), 3)
-    corner = np.broadcast_to(np.asarray(origin, np.float64), 3).copy()
-    for count, axis, backwards in zip(volume.shape, placement.world_axes, placement.backwards):
-        if backwards:
-            corner -= columns[:, axis] * ((count - 1) * steps[axis])
-    return corner

@@ -1,0 +1,82 @@
+"""MRC and CCP4 maps, with mrcfile: lengths are in angstrom.
+
+Columns, rows and sections run along the world's axes in the order of ``mapc``, ``mapr`` and
+``maps``.
+"""
+
+from __future__ import annotations
+
+from math import prod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import FileError, GridError
+from ..volume import XYZ, Later, Request, Volume, in_words_of, triple
+
+HEADER = 1024  # bytes
+VOLUME_STACKS = 401  # space groups from here on are of stacks of volumes
+RIGHT = 0.01  # degrees
+
+
+def read_mrc(request: Request) -> Volume:
+    """Read a ``.mrc``, ``.map`` or ``.ccp4`` file, or one that is packed with gzip.
+
+    The origin is the field of this name, in angstrom; if it is 0 the place of the first sample in
+    the unit cell, in samples.
+    """
+    import mrcfile
+    from mrcfile.utils import data_dtype_from_header
+
+    with mrcfile.open(request.path, permissive=True, header_only=True) as opened:
+        header = opened.header
+    sizes = tuple(int(header[f"n{axis}"]) for axis in "zyx")
+    dtype = data_dtype_from_header(header)
+    promised, follow = prod(sizes) * dtype.itemsize, request.path.stat().st_size - HEADER
+    if min(sizes) < 1 or (request.path.suffix.lower() != ".gz" and promised > follow):
+        words = in_words_of(sizes, dtype)
+        raise FileError(f"it is truncated: {words} are promised, but {follow:,} follow")
+    if header.ispg >= VOLUME_STACKS and header.mz != header.nz:
+        raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
+    order = [int(header[name]) - 1 for name in ("maps", "mapr", "mapc")]
+    order = [2, 1, 0] if order == [-1] * 3 else order
+    if sorted(order) != [0, 1, 2]:
+        raise FileError(f"its axes mapc, mapr, maps are {[axis + 1 for axis in order[::-1]]}")
+    angles = _numbers(header.cellb, ("alpha", "beta", "gamma"))
+    if angles.any() and np.abs(angles - 90).max() > RIGHT:
+        raise GridError(
+            f"the angles of its unit cell are {_listed(angles)} degrees, not "
+            "90: resample it on a grid with right angles"
+        )
+    counts = np.array([int(header[name]) for name in ("mx", "my", "mz")])
+    cell = _numbers(header.cella, "xyz")
+    steps, starts = cell / np.maximum(counts, 1), np.zeros(3)
+    is_stated = bool((cell > 0).all() and (counts > 0).all())
+    starts[order] = [int(header[f"n{axis}start"]) for axis in "zyx"]
+    stated, in_cell = _numbers(header.origin, "xyz"), starts * steps
+    notes: tuple[str, ...] = ()
+    if stated.any() and in_cell.any() and not np.allclose(stated, in_cell, atol=steps.max() / 100):
+        notes = (
+            f"its origin is {_listed(stated)} and its nstart means {_listed(in_cell)}: the origin "
+            "is taken",
+        )
+
+    def load() -> Any:
+        with mrcfile.open(request.path, permissive=True) as opened:
+            return opened.data
+
+    spacing = triple(steps[order]) if is_stated else None
+    origin = triple(stated if stated.any() else in_cell)
+    return Volume(Later(sizes, dtype, load), spacing, origin, XYZ[:, order], notes=notes)
+
+
+def _numbers(fields: Any, names: Any) -> NDArray[np.float64]:
+    numbers = np.array([fields[name] for name in names], np.float64)
+    if not np.isfinite(numbers).all():
+        raise FileError(f"its header is damaged: {', '.join(names)} are {numbers.tolist()}")
+    return numbers
+
+
+def _listed(numbers: NDArray[np.float64]) -> str:
+    return ", ".join(f"{number:g}" for number in numbers)

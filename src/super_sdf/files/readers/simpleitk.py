@@ -1,0 +1,112 @@
+"""MetaImage, with SimpleITK: world coordinates are LPS.
+
+ITK opens whatever file a header names, and takes a torn zlib stream for data: names are checked
+before, and compressed data is unpacked here.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import FileError, GridError, seen
+from ...options import LPS
+from ..regular import LONGEST_HEADER, check_beside
+from ..volume import Later, Request, Volume, kept_axes, triple
+
+NO_UNIT = ("", "?", "mm", "UNKNOWN")
+PIECE = 1 << 16  # compressed bytes at a time
+
+
+def read_metaimage(request: Request) -> Volume:
+    """Read a ``.mha`` file, or a ``.mhd`` file and the data files that it names."""
+    import SimpleITK
+
+    with request.path.open("rb") as file:
+        beginning = file.read(LONGEST_HEADER)
+    found = re.search(rb"^ElementDataFile *[=:] *([^\n]*)\n?", beginning, re.M)
+    if not found:
+        raise FileError("its header is damaged: it has no ElementDataFile")
+    lines = beginning[: found.start()].decode(errors="replace").splitlines()
+    pairs = (re.split("[=:]", line, maxsplit=1) for line in lines)
+    fields = {pair[0].strip(): pair[-1].strip() for pair in pairs}
+    named = found[1].decode(errors="surrogateescape").strip()
+    files = [] if named.lower() == "local" else _names(named, beginning[found.end() :])
+    files = [check_beside(request.path, name) for name in files]
+    SimpleITK.ProcessObject.GlobalWarningDisplayOff()
+    reader = SimpleITK.ImageFileReader()
+    reader.SetFileName(str(request.path))
+    reader.SetImageIO("MetaImageIO")
+    try:
+        reader.ReadImageInformation()
+    except RuntimeError:
+        raise FileError("ITK finds its header damaged, or that of no MetaImage") from None
+    size, components = reader.GetSize(), reader.GetNumberOfComponents()
+    kept = kept_axes(size)
+    if len(kept) != 3 or components != 1:
+        more = f" of {components} numbers" * (components != 1)
+        raise GridError(
+            f"{request.path} has shape {size}{more}: give a file of three axes (x, y, z)"
+        )
+    one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
+    dtype = SimpleITK.GetArrayViewFromImage(one).dtype
+    path, start = (files[0], 0) if files else (request.path, found.end())
+    promised, follow = prod(size) * dtype.itemsize, path.stat().st_size - start
+    is_packed = _is_true(fields, "CompressedData") and len(files) <= 1
+    if not is_packed and len(files) <= 1 and promised > follow:
+        raise FileError(f"{path} is truncated: {promised:,} bytes are promised, {follow:,} follow")
+
+    def load() -> Any:
+        if not is_packed:
+            return SimpleITK.GetArrayFromImage(reader.Execute()).T
+        is_big = any(_is_true(fields, f"{name}ByteOrderMSB") for name in ("BinaryData", "Element"))
+        data = _unpacked(path, start, promised)
+        return np.frombuffer(data, dtype.newbyteorder("><"[not is_big])).reshape(size[::-1]).T
+
+    steps = np.array(reader.GetSpacing())[list(kept)]
+    direction = np.array(reader.GetDirection()).reshape(len(size), -1)[np.ix_(kept, kept)]
+    origin = triple(np.array(reader.GetOrigin())[list(kept)])
+    place = triple(np.abs(steps)), origin, direction * np.sign(steps)
+    unit = fields.get("DistanceUnits", "?")
+    notes = (f"lengths are in the unit that it states, {unit}",) * (unit not in NO_UNIT)
+    if not {"ElementSpacing", "ElementSize"} & set(fields):
+        notes += ("it states no ElementSpacing: taken as 1, as ITK does",)
+    return Volume(Later(size, dtype, load), *place, kept, notes=notes, space=LPS)
+
+
+def _is_true(fields: dict[str, str], name: str) -> bool:
+    return fields.get(name, "F")[:1] in ("T", "t", "1")  # as ITK reads it
+
+
+def _names(named: str, rest: bytes) -> list[str]:
+    """Return the names of the data files, of which a list or a pattern has one a slice."""
+    if named.upper().startswith("LIST"):
+        return [line for line in rest.decode(errors="surrogateescape").split("\n") if line.strip()]
+    if "%" not in named:
+        return [named]
+    pattern, *numbers = named.split()
+    if not re.fullmatch("[^%]*%0?[0-9]?d[^%]*", pattern) or len(numbers) < 2:
+        raise FileError(f"its ElementDataFile is {seen(named)}: give NAME%03d.raw 1 20 1")
+    first, last, step = (int(number) for number in (*numbers, "1")[:3])
+    return [pattern % number for number in range(first, last + 1, step)]
+
+
+def _unpacked(path: Path, start: int, size: int) -> bytearray:
+    """Return the ``size`` bytes of a zlib stream; FileError unless it is whole and has as many."""
+    unpacker, data = zlib.decompressobj(), bytearray()
+    with path.open("rb") as file:
+        file.seek(start)
+        while len(data) <= size and not unpacker.eof and (piece := file.read(PIECE)):
+            data += unpacker.decompress(piece)
+    if len(data) != size or not unpacker.eof:
+        end = "ends" if unpacker.eof else "is torn"
+        raise FileError(
+            f"{path} is damaged: {size:,} bytes are promised, and its compressed data {end} "
+            f"after {len(data):,}"
+        )
+    return data

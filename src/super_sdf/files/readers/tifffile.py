@@ -1,0 +1,108 @@
+"""TIFF stacks, with tifffile: arrays (z, y, x), a page per z.
+
+Spacing is read where ImageJ's metadata, or its like by tifffile, or OME's states it for all three
+axes; ImageJ states an origin, too.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+from xml.etree import ElementTree
+
+from ...errors import GridError
+from ..regular import check_beside
+from ..volume import Later, Request, Volume
+from .axes import Axis, placed, values_of
+
+
+def read_tiff(request: Request) -> Volume:
+    """Read the first series of a ``.tif`` file: pages of one size, or an ImageJ or OME stack."""
+    import tifffile
+
+    # not as a file of MicroManager, whose other files would be opened
+    opened = tifffile.TiffFile(request.path, is_mmstack=False, is_ndtiff=False)
+    file = request.files.enter_context(opened)
+    ome = ElementTree.fromstring(file.ome_metadata) if file.is_ome else None
+    for element in () if ome is None else ome.iter():
+        named = element.get("FileName") or element.get("MetadataFile")
+        if named and named != request.path.name:
+            check_beside(request.path, named)
+    series = file.series[0]
+    if len(series.shape) != 3 or "S" in series.axes:
+        raise GridError(
+            f"{request.path} has axes {series.axes} of shape {series.shape}: give a stack of "
+            "three axes (z, y, x), without channels"
+        )
+    is_named = request.axes == "zyx" and sorted(series.axes) == ["X", "Y", "Z"]
+    names = series.axes.lower() if is_named else request.axes
+    stated = _ome_axes(ome) if ome is not None else _imagej_axes(file)
+    place = placed([stated.get(name, Axis(name)) for name in names], {}, series.shape, names)
+    sizes, unit = _pixel_sizes(file), _resolution_unit(file)
+    if ome is None and not stated and sizes and unit:
+        place["notes"] += (
+            f"its pixels are {sizes[0]:.6g} x {sizes[1]:.6g} {unit}, but it does not state how far "
+            "its pages are apart: no spacing is taken from it (give --spacing X,Y,Z)",
+        )
+    segments = [size for page in series.pages if page is not None for size in page.databytecounts]
+    said = values_of(
+        series.dtype,
+        {},
+        absent=segments.count(0),
+        total=len(segments),
+        fill=series.keyframe.nodata,
+    )
+    return Volume(Later(series.shape, series.dtype, series.asarray), **place, **said)
+
+
+def _imagej_axes(file: Any) -> dict[str, Axis]:
+    """Return the axes of an ImageJ stack by their names; none if it is not calibrated.
+
+    What is not stated holds as in ImageJ: a spacing of z of 1, the unit of the resolution, that of
+    x for all axes, and origins of 0 beside others, which are in pixels.
+    """
+    metadata: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
+    sizes = _pixel_sizes(file)
+    if not sizes or not (file.is_imagej or "spacing" in metadata):
+        return {}
+    unit = str(metadata.get("unit") or _resolution_unit(file))
+    if "spacing" not in metadata and "unit" not in metadata and unit:
+        return {}  # x and y may be those of a print
+    # ImageJ writes letters beyond ASCII by their numbers
+    units = [
+        re.sub(r"\\u([0-9a-fA-F]{4})", lambda number: chr(int(number[1], 16)), each)
+        for each in (str(metadata.get(f"{axis}unit") or unit) for axis in "xyz")
+    ]
+    steps = [*sizes, abs(float(metadata.get("spacing") or 1))]
+    is_bare = not any(unit and not unit.startswith("pixel") for unit in units)
+    if is_bare and "spacing" not in metadata and sizes == (1, 1):
+        return {}
+    starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]
+    places = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
+    return {each[0]: Axis(*each) for each in zip("xyz", units, steps, places)}
+
+
+def _pixel_sizes(file: Any) -> tuple[float, float] | None:
+    tags = file.pages[0].tags
+    if "XResolution" not in tags or "YResolution" not in tags:
+        return None
+    stated = (tags[name].value for name in ("XResolution", "YResolution"))  # pixels, units
+    x, y = (units / pixels if pixels else 0.0 for pixels, units in stated)
+    return (x, y) if x > 0 and y > 0 else None
+
+
+def _resolution_unit(file: Any) -> str:
+    tag = file.pages[0].tags.get("ResolutionUnit")
+    number = 2 if tag is None else int(tag.value)  # inches, by the standard
+    return {2: "inch", 3: "cm", 4: "mm", 5: "µm"}.get(number, "")
+
+
+def _ome_axes(ome: ElementTree.Element) -> dict[str, Axis]:
+    stated: dict[str, Axis] = {}
+    pixels = ome.find(".//{*}Pixels")
+    about = {} if pixels is None else pixels.attrib
+    for axis in "XYZ":
+        size, unit = about.get(f"PhysicalSize{axis}"), about.get(f"PhysicalSize{axis}Unit", "µm")
+        if size and float(size) > 0:
+            stated[axis.lower()] = Axis(axis.lower(), unit, float(size))
+    return stated
