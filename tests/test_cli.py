@@ -17,7 +17,6 @@ from super_sdf import write_mesh
 from super_sdf.cli import main as cli
 from super_sdf.files.formats import GRID_SUFFIXES
 from super_sdf.files.meshes import MESH_SUFFIXES
-from super_sdf.network.network import shipped_models
 from super_sdf.options import MESH_FORMATS, OPTIONS, Options, parse_size
 
 
@@ -80,18 +79,6 @@ def test_noise_is_told(here, command):
     code, out, err = command("upsample", "noisy.npy", "out.ply", "--spacing", "1", "--json")
     assert code == 0 and json.loads(out)["noisy_voxels"] > 0
     assert " % of the band the values differ by more than distances can: they are taken" in err
-
-
-def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
-    from super_sdf.network.network import Network
-
-    def all_inside(self, patches, table, voxels, offsets):
-        return np.full((len(voxels), len(offsets)), -1, np.float32)
-
-    monkeypatch.setattr(Network, "__call__", all_inside)
-    code, _, err = command("upsample", "in.npy", "out.ply")
-    assert code == 0 and "fine values contradict the coarse ones around them" in err
-    assert trimesh.load("out.ply").is_watertight
 
 
 def test_version_help_info_and_usage_errors(command):
@@ -235,9 +222,3 @@ def test_wrong_values_are_named_in_lists_by_their_names(here, command):
     Path("list.jsonl").write_text('{"in": "in.npy", "simplify": -1}')
     _, _, err = command("batch", "list.jsonl", "--out", "out", "--simplify", "0.5")
     assert "'simplify' is -1: give a number" in err and "--simplify" not in err
-
-
-def test_a_network_is_chosen_by_its_file(here, command):
-    model = str(shipped_models()["fast"])
-    words = ("batch", "in.npy", "--out", "meshes", "--model", model, "--factor", 2)
-    assert command(*words)[0] == 0 and os.listdir("meshes")

@@ -381,7 +381,7 @@ def mesh_grid(
     if whole:
         counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
     steps.finish("isosurface")
-    return Result(mesh, count, counts, leaves, is_cut, steps.take_seconds(), len(tiles))
+    return Result(mesh, count, counts, leaves, is_cut, steps.seconds, len(tiles))
 
 
 def make_tile(
