@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 import super_sdf
-from super_sdf.check.surface import count_components
 from super_sdf.errors import SuperSdfError
 from super_sdf.files.regular import check_regular_file
 from super_sdf.threads import forget_peak, held_memory
@@ -168,8 +167,8 @@ def measure_on_kind(shape: Shape, mesh: Mesh) -> Measurement:
     return {
         **compare(shape, mesh)[0],
         "volume_off": mesh.volume() / shape.mesh.volume() - 1,
-        "pieces": count_components(mesh.faces, len(mesh.vertices)),
-        "pieces_of_reference": count_components(shape.mesh.faces, len(shape.mesh.vertices)),
+        "pieces": mesh.components()[0],
+        "pieces_of_reference": shape.mesh.components()[0],
     }
 
 

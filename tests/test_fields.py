@@ -2,12 +2,7 @@
 
 import os
 import re
-import resource
-import signal
-import subprocess
-import sys
 import zipfile
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +14,6 @@ from super_sdf import (
     SdfGrid,
     extract_mesh,
     fine_grid,
-    load_network,
     make_grid,
     read_field,
     read_grid,
@@ -30,7 +24,6 @@ from super_sdf import (
 )
 from super_sdf.errors import FileError, OptionError, OptionTypeError, OutOfMemoryError, WriteError
 from super_sdf.files import fields as writing
-from super_sdf.threads import held_memory
 
 NORMAL = np.array([2.0, -1.0, 2.0]) / 3
 SPACING, ORIGIN = 0.3, (7.0, -8.0, 9.0)
@@ -90,40 +83,6 @@ def test_positions_and_distances_are_those_of_a_plane(factor):
     middle = plane().to_world(field.voxel_ijk[some])
     assert np.abs(blocks.mean(1) - middle).max() < 1e-12  # a block lies round its sample
     assert np.ptp(blocks[0], axis=0) == pytest.approx(SPACING)
-
-
-def test_values_are_relative_to_the_offset_surface():
-    field = upsample(plane(), trilinear, offset=0.25)
-    assert np.abs(field.distances() - to_plane(field.positions()) + 0.25).max() < 1e-6
-
-
-def test_a_field_without_a_grid_says_so():
-    field = replace(upsample(ball(), trilinear), grid=None)
-    for call in (field.positions, lambda: extract_mesh(field)):
-        said = refusal(OptionError, call)
-        assert said.startswith("the field has no grid: make it with upsample")
-
-
-@pytest.mark.parametrize("factor", [2, 4, 6])
-def test_the_fine_lattice_of_a_plane_is_the_plane_also_far_from_it(factor):
-    fine = fine_grid(upsample(plane(), trilinear, factor))
-    assert fine.shape == tuple(factor * n + 1 for n in (12, 11, 10))
-    ijk = np.moveaxis(np.indices(fine.shape), 0, -1)
-    points = fine.to_world(ijk)
-    assert np.abs(points[0, 0, 0] - np.array(ORIGIN) + SPACING / 2).max() < 1e-12
-    assert np.abs(fine.values - to_plane(points)).max() < 2e-6
-    assert fine.low == pytest.approx(fine.values.min(), abs=SPACING)
-
-
-def test_the_lattice_holds_the_samples_and_their_signs():
-    grid = ball()
-    fine = fine_grid(upsample(grid, trilinear, 4))
-    at_samples = fine.values[2::4, 2::4, 2::4]
-    assert np.abs(at_samples - grid.values).max() < 1e-5
-    jump = np.full((9, 9, 9), 5, np.float32)  # far values with no band between
-    jump[3:6, 3:6, 3:6] = -5
-    fine = fine_grid(upsample(SdfGrid.trusted(jump, 1.0), trilinear, 4))
-    assert np.array_equal(fine.values[2::4, 2::4, 2::4] < 0, jump < 0)
 
 
 @pytest.mark.parametrize("name", GRIDS)
@@ -187,31 +146,6 @@ def test_the_keys_are_as_documented():
     assert len(border) and (to_plane(border) < 0).all()
 
 
-def test_dense_files_hold_the_lattice_at_its_place():
-    field = upsample(plane(), trilinear, 4)
-    write_field(field, "field.npy")
-    write_field(field, "field.vti")
-    fine, array = fine_grid(field), np.load("field.npy")
-    image = read_grid("field.vti", inside="negative")
-    assert array.dtype == np.float32 and np.array_equal(array, fine.values)
-    assert np.array_equal(image.values, fine.values)
-    assert image.spacing == pytest.approx(fine.spacing, rel=1e-12)
-    assert image.origin == pytest.approx(fine.origin, rel=1e-12)
-
-
-def test_a_field_from_a_file_has_no_far_values():
-    write_field(upsample(ball(), trilinear, 2), "field.npz")
-    back = read_field("field.npz")
-    write_field(back, "again.npz")
-    assert Path("again.npz").read_bytes() == Path("field.npz").read_bytes()
-    for name in ("again.npy", "again.vdb"):
-        assert refusal(FileError, write_field, back, name) == (
-            "field.npz holds the refined field without the coarse samples: read those from their "
-            "own file"
-        )
-    assert sorted(os.listdir()) == ["again.npz", "field.npz"]
-
-
 @pytest.fixture(scope="module")
 def good(tmp_path_factory) -> dict[str, np.ndarray]:
     """Return the arrays of a field's file."""
@@ -248,93 +182,11 @@ def test_files_that_are_no_fields_are_refused_in_one_line(said, good):
     assert damage(good, **WRONG[said]) == "a.npz" + said
 
 
-def test_blocks_that_do_not_fit_together_are_refused(good):
-    """Their mesh would have triangles of vertices that there are not."""
-    said = "a.npz[values] is damaged: blocks differ at nodes that they share"
-    random = np.random.default_rng(0).normal(size=good["values"].shape)
-    assert damage(good, values=random) == said
-    for place in ((0, 0, 0), (0, 1, 2), (2, 1, 1)):  # a corner, an edge and a face of a block
-        values = good["values"].copy()
-        values[len(values) // 2][place] += 1
-        assert damage(good, values=values) == said
-    border = "a.npz[border_inside] is damaged: not all are border voxels without a block"
-    for voxel in (good["voxels"][:1], np.array([[1, 1, 1]], np.int32)):
-        assert damage(good, border_inside=voxel) == border
-
-
-def test_damaged_and_foreign_files_are_refused():
-    field = upsample(ball(12, 3.0), trilinear, 2)
-    Path("b.npz").write_bytes(b"hello")
-    np.savez("grid.npz", values=ball().values)
-    write_field(field, "flipped.npz")
-    data = bytearray(Path("flipped.npz").read_bytes())
-    with zipfile.ZipFile("flipped.npz") as archive:
-        data[archive.getinfo("values.npy").header_offset + 5000] ^= 255
-    Path("flipped.npz").write_bytes(data)
-    for name, kind, said in (
-        ("b.npz", FileError, "b.npz cannot be read as a refined field: File is not a zip file"),
-        ("none.npz", FileError, "none.npz does not exist"),
-        ("b.npy", OptionError, "b.npy is no sparse field: give .npz"),
-        ("grid.npz", FileError, "grid.npz is no refined field: it has no key 'version'"),
-        ("flipped.npz", FileError, "flipped.npz cannot be read as a refined field: Bad CRC-32"),
-    ):
-        assert refusal(kind, read_field, name).startswith(said)
-    write_field(field, "field.npz")
-    assert refusal(FileError, read_grid, "field.npz") == (
-        "field.npz is a refined field, no grid: mesh it with extract_mesh(read_field(path))"
-    )
-
-
-def limit_files():
-    """Let this process write no file of more than 600 kB, as if the disk were full."""
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, 600_000))
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".vti"])
-def test_a_file_that_the_system_cuts_off_is_an_error_of_one_line(suffix):
-    np.savez("grid.npz", values=ball(12, 3.0).values[:8], spacing=1.0)
-    words = ["upsample", "grid.npz", "a.ply", "--save-field", "f" + suffix]
-    done = subprocess.run(
-        [sys.executable, "-m", "super_sdf", *words, "--factor=8", "--quality=fast", "-q"],
-        preexec_fn=limit_files,
-        capture_output=True,
-        text=True,
-    )
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == f"Error: f{suffix} cannot be written: File too large\n"
-    assert os.listdir() == ["grid.npz"]
-
-
-def test_targets_are_refused_before_anything_is_written():
-    field = upsample(ball(12, 3.0), trilinear, 2)
-    Path("old.npz").write_bytes(b"old")
-    no_field = "field.obj is not a field file: give one of .npz, .vdb, .npy, .vti"
-    for given, name, kind, said in (
-        (field, "field.obj", OptionError, no_field),
-        (field, "old.npz", WriteError, "old.npz exists: remove it or use --force"),
-        (3, "field.npz", OptionTypeError, "field is 3: give one from upsample"),
-    ):
-        assert refusal(kind, write_field, given, name).startswith(said)
-    assert os.listdir() == ["old.npz"] and Path("old.npz").read_bytes() == b"old"
-    write_field(field, "old.npz", force=True)
-    assert read_field("old.npz").factor == 2
-
-
 def test_a_lattice_that_does_not_fit_is_refused(monkeypatch):
-    shape, bound = (1025, 1025, 1025), held_memory() + 10**9
-    start = "cannot be written: 1025 x 1025 x 1025 values take 4.31 GB"
-    check = writing.check_field_fits
-    said = refusal(OutOfMemoryError, check, Path("a.vti"), shape, bound)
-    assert said.startswith(f"a.vti {start} of memory, ") and said.endswith(
-        "are left; write .npy, which is written plane by plane, or .npz, which is sparse"
-    )
-    monkeypatch.setattr(writing, "free_space", lambda path: 4_000_000_000)
-    for name in ("a.npy", "a.vti"):
-        assert refusal(WriteError, check, Path(name), shape, bound) == (
-            f"{name} {start}, 4.00 GB are free there; write .npz, which is sparse"
-        )
-    check(Path("a.npz"), shape, 1)
+    monkeypatch.setattr("super_sdf.threads.free_memory", lambda: 10**9)
+    said = refusal(OutOfMemoryError, writing.check_field_fits, Path("a.vti"), (1025,) * 3)
+    assert said.startswith("a.vti, 1025 x 1025 x 1025 values, needs 4.31 GB of memory, 1.00 GB are")
+    writing.check_field_fits(Path("a.npy"), (1025,) * 3)
 
 
 def test_the_command_writes_the_mesh_and_the_field(command):
@@ -352,26 +204,6 @@ def test_the_command_writes_the_mesh_and_the_field(command):
     write_mesh(extract_mesh(read_field("a.npz"), cap=False), "d.ply")
     assert Path("c.ply").read_bytes() == Path("d.ply").read_bytes()
     assert np.load("c.npy").shape == (57, 61, 65)
-
-
-REFUSED = {
-    ("--save-field", "old.npz"): "old.npz exists: remove it or use --force",
-    ("--save-field", "no/a.npz"): "no is not a folder: make it first",
-    ("--save-field", "grid.npz", "--force"): (
-        "grid.npz is the same file as grid.npz: give another file"
-    ),
-}
-
-
-@pytest.mark.parametrize("options", REFUSED)
-def test_the_command_refuses_in_one_line_and_writes_nothing(options, command):
-    np.savez("grid.npz", values=ball().values, spacing=1.0)
-    Path("old.npz").write_bytes(b"old")
-    before = Path("grid.npz").read_bytes()
-    code, out, said = command("upsample", "grid.npz", "a.ply", *options)
-    assert code != 0 and (out, said) == ("", f"Error: {REFUSED[options]}\n")
-    assert sorted(os.listdir()) == ["grid.npz", "old.npz"]
-    assert Path("grid.npz").read_bytes() == before and Path("old.npz").read_bytes() == b"old"
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".vti", ".vdb"])
@@ -402,17 +234,100 @@ def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
         assert said == f"Error: {target} exists: remove it or use --force\n"
 
 
+def test_the_fine_lattice_is_right_also_far_from_the_surface_and_in_dense_files():
+    field = upsample(plane(), trilinear, 4)
+    fine = fine_grid(field)
+    assert fine.shape == tuple(4 * n + 1 for n in (12, 11, 10))
+    points = fine.to_world(np.moveaxis(np.indices(fine.shape), 0, -1))
+    assert np.abs(points[0, 0, 0] - np.array(ORIGIN) + SPACING / 2).max() < 1e-12
+    assert np.abs(fine.values - to_plane(points)).max() < 2e-6
+    write_field(field, "field.npy")
+    write_field(field, "field.vti")
+    array, image = np.load("field.npy"), read_grid("field.vti", inside="negative")
+    assert array.dtype == np.float32 and np.array_equal(array, fine.values)
+    assert np.array_equal(image.values, fine.values)
+    assert (image.spacing, image.origin) == (fine.spacing, fine.origin)
+    jump = np.full((9, 9, 9), 5, np.float32)  # far values with no band between
+    jump[3:6, 3:6, 3:6] = -5
+    fine = fine_grid(upsample(SdfGrid.trusted(jump, 1.0), trilinear, 4))
+    assert np.array_equal(fine.values[2::4, 2::4, 2::4] < 0, jump < 0)
+
+
+def test_a_field_from_a_file_has_no_far_values(good):
+    np.savez("field.npz", **good)
+    back = read_field("field.npz")
+    write_field(back, "again.npz")
+    assert all(np.array_equal(good[key], array) for key, array in np.load("again.npz").items())
+    for name in ("again.npy", "again.vdb"):
+        assert refusal(FileError, write_field, back, name) == (
+            "field.npz holds the refined field without the coarse samples: read those from their "
+            "own file"
+        )
+    assert sorted(os.listdir()) == ["again.npz", "field.npz"]
+
+
+def test_blocks_that_do_not_fit_together_are_refused(good):
+    """Their mesh would have triangles of vertices that there are not."""
+    said = "a.npz[values] is damaged: blocks differ at nodes that they share"
+    for place in ((0, 0, 0), (0, 1, 2), (2, 1, 1)):  # a corner, an edge and a face of a block
+        values = good["values"].copy()
+        values[len(values) // 2][place] += 1
+        assert damage(good, values=values) == said
+    border = "a.npz[border_inside] is damaged: not all are border voxels without a block"
+    for voxel in (good["voxels"][:1], np.array([[1, 1, 1]], np.int32)):
+        assert damage(good, border_inside=voxel) == border
+
+
+def test_damaged_and_foreign_files_are_refused(good):
+    Path("b.npz").write_bytes(b"hello")
+    np.savez("grid.npz", values=ball().values)
+    np.savez("field.npz", **good)
+    data = bytearray(Path("field.npz").read_bytes())
+    with zipfile.ZipFile("field.npz") as archive:
+        data[archive.getinfo("values.npy").header_offset + 5000] ^= 255
+    Path("flipped.npz").write_bytes(data)
+    for name, kind, said in (
+        ("b.npz", FileError, "b.npz cannot be read as a refined field: File is not a zip file"),
+        ("none.npz", FileError, "none.npz does not exist"),
+        ("b.npy", OptionError, "b.npy is no sparse field: give .npz"),
+        ("grid.npz", FileError, "grid.npz is no refined field: it has no key 'version'"),
+        ("flipped.npz", FileError, "flipped.npz cannot be read as a refined field: Bad CRC-32"),
+    ):
+        assert refusal(kind, read_field, name).startswith(said)
+    assert refusal(FileError, read_grid, "field.npz") == (
+        "field.npz is a refined field, no grid: mesh it with extract_mesh(read_field(path))"
+    )
+
+
+def test_targets_are_refused_before_anything_is_written(command):
+    field = upsample(ball(12, 3.0), trilinear, 2)
+    Path("old.npz").write_bytes(b"old")
+    no_field = "field.obj is not a field file: give one of .npz, .vdb, .npy, .vti"
+    for given, name, kind, said in (
+        (field, "field.obj", OptionError, no_field),
+        (field, "old.npz", WriteError, "old.npz exists: remove it or use --force"),
+        (3, "field.npz", OptionTypeError, "field is 3: give one from upsample"),
+    ):
+        assert refusal(kind, write_field, given, name).startswith(said)
+    assert os.listdir() == ["old.npz"] and Path("old.npz").read_bytes() == b"old"
+    write_field(field, "old.npz", force=True)
+    assert read_field("old.npz").factor == 2
+    np.savez("grid.npz", values=ball().values, spacing=1.0)
+    before = Path("grid.npz").read_bytes()
+    words = "upsample", "grid.npz", "a.ply", "--save-field", "grid.npz", "--force"
+    said = "Error: grid.npz is the same file as grid.npz: give another file\n"
+    assert command(*words)[2] == said and Path("grid.npz").read_bytes() == before
+
+
 TURNED = [[0.0, 0.0, 1.0], [0.8, 0.6, 0.0], [0.6, -0.8, 0.0]]  # mirrored
 
 
 @pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.5, 0.5, 0.75)])
 def test_direction_and_spacing_are_kept(spacing):
-    centre, radius = (6.2, 6.9, 7.1), 4.1 * min(spacing)
-    off = (np.indices((14, 15, 16)).T - centre) * spacing
-    values = np.linalg.norm(off, axis=-1).T - radius
+    off = (np.indices((14, 15, 16)).T - (6.2, 6.9, 7.1)) * spacing
+    values = np.linalg.norm(off, axis=-1).T - 4.1 * min(spacing)
     grid = make_grid(values, spacing=spacing, origin=(3, -4, 5), direction=TURNED)
-    network = load_network("fast")
-    field = upsample(grid, network)
+    field = upsample(grid, trilinear)
     for name in ("a.npz", "a.vti"):
         write_field(field, name)
     image, again = read_grid("a.vti"), read_field("a.npz")
@@ -424,8 +339,5 @@ def test_direction_and_spacing_are_kept(spacing):
     np.testing.assert_allclose(*corners, atol=2e-5)  # in an order that no axis decides
     np.testing.assert_array_equal(again.placed.direction, grid.direction)
     np.testing.assert_array_equal(again.positions(), field.positions())
-    near = np.abs(field.distances()) < 0.25
-    truth = np.linalg.norm(field.positions() - grid.to_world(centre), axis=1) - radius
-    np.testing.assert_allclose(field.distances()[near], truth[near], atol=0.03)
     for mesher in ("marching", "sharp"):
-        assert same(extract_mesh(again, mesher=mesher), reconstruct(grid, network, mesher=mesher))
+        assert same(extract_mesh(again, mesher=mesher), reconstruct(grid, trilinear, mesher=mesher))

@@ -15,7 +15,6 @@ from solids import cube, joined, sphere, square, torus
 
 from lab.surfaces import isosurface
 from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
-from super_sdf.check.surface import count_components
 from super_sdf.convert import convert
 from super_sdf.options import Options
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
@@ -26,7 +25,7 @@ from super_sdf.network.network import load_network
 from super_sdf.simplify import collapsing, simplify
 from super_sdf.simplify.collapsing import collapse_within
 from super_sdf.simplify.measuring import Original
-from super_sdf.surface.topology import irregular_places
+from super_sdf.simplify.collapsing import irregular_places
 
 QUICK = ("--quality", "fast", "--factor", 2)
 UNREACHED = (
@@ -156,7 +155,7 @@ def test_any_field_stays_a_closed_manifold_within_the_error(seed, error, in_floa
     assert is_closed_manifold(found.mesh)
     assert len(np.unique(found.mesh.vertices, axis=0)) == len(found.mesh.vertices)
     assert max(found.deviation.largest, found.deviation.largest_back) <= error
-    before, after = (count_components(m.faces, len(m.vertices)) for m in (mesh, found.mesh))
+    before, after = (m.components()[0] for m in (mesh, found.mesh))
     assert before == after
 
 

@@ -12,11 +12,27 @@ from conftest import ball, refusal, trilinear
 from test_fields import TURNED, cut_ball, tip
 from test_vdb import text
 
-from super_sdf import (SdfGrid, extract_mesh, fine_grid, make_grid, read_grid, reconstruct, upsample, write_field)
+from super_sdf import (
+    SdfGrid,
+    extract_mesh,
+    fine_grid,
+    make_grid,
+    read_grid,
+    reconstruct,
+    upsample,
+    write_field,
+)
 from super_sdf.errors import OptionError
 from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
-from super_sdf.files.vdb_writer import (ACTIVE_MASK, INSIDE, MIXED, OUTSIDE, LevelSet, leaf_bytes, write_tree)
+from super_sdf.files.vdb_writer import (
+    INSIDE,
+    MIXED,
+    OUTSIDE,
+    LevelSet,
+    leaf_bytes,
+    write_tree,
+)
 
 PAD = 8  # voxels that are looked at beyond the lattice
 
@@ -92,125 +108,37 @@ def test_every_voxel_comes_back(name, factor):
     assert (expected == background).all()  # whatever is not background was in the box
 
 
+def test_the_head_is_the_one_that_openvdb_expects():
+    """The map by scales is translation, scale, size, 1/scale, 1/scale^2, 1/(2 scale)."""
+    maps = {"leaving": "UniformScaleTranslateMap", "stretched": "ScaleTranslateMap"}
+    for name, kind in {**maps, "turned": "AffineMap"}.items():
+        field = upsample(GRIDS[name](), trilinear, 2)
+        write_field(field, f"{name}.vdb")
+        data = Path(f"{name}.vdb").read_bytes()
+        assert struct.unpack_from("<qIII?", data) == (0x56444220, 224, 5, 0, True)
+        assert struct.unpack_from("<II", data, 57) == (0, 1)  # no metadata of the file, one grid
+        assert data[65:].startswith(text("surface") + text("Tree_float_5_4_3") + text(""))
+        assert b"level set" in data[:400]
+        at, fine = data.index(text(kind)) + len(text(kind)), fine_grid(field)
+        if name == "turned":
+            matrix, point = np.frombuffer(data, "<f8", 16, at).reshape(4, 4), np.array([3.0, 5, 7])
+            np.testing.assert_allclose(([*point, 1] @ matrix)[:3], fine.to_world(point))
+        else:
+            h = np.array(fine.spacing)
+            vectors = np.frombuffer(data, "<f8", 18, at).reshape(6, 3)
+            np.testing.assert_allclose(vectors, [fine.origin, h, h, 1 / h, 1 / h**2, 0.5 / h])
+
+
 @pytest.mark.parametrize("name", GRIDS)
-def test_the_level_set_is_a_grid_with_the_same_surface(name):
+def test_the_level_set_is_a_closed_grid_with_the_same_surface(name):
     """Also of a solid that leaves the grid: closed along the border, as the mesh is."""
-    grid = GRIDS[name]()
-    field = upsample(grid, trilinear, 4)
+    field = upsample(GRIDS[name](), trilinear, 4)
     write_field(field, "a.vdb")
     again = reconstruct(read_grid("a.vdb"), trilinear, 2, cap=False, mesher="marching")
     want = extract_mesh(field, cap=True, mesher="marching")
-    assert again.is_closed()
+    assert again.is_closed() and again.volume() == pytest.approx(want.volume(), rel=0.01)
     ends = [np.array([mesh.vertices.min(0), mesh.vertices.max(0)]) for mesh in (again, want)]
-    fine = fine_grid(field)
-    assert np.abs(ends[0] - ends[1]).max() < 0.5 * max(fine.spacing)
-    assert volume(again) == pytest.approx(volume(want), rel=0.01)
-
-
-def volume(mesh) -> float:
-    """Return the signed volume of a mesh, by the divergence theorem."""
-    corners = mesh.vertices[mesh.faces]
-    return float(np.linalg.det(corners - mesh.vertices.mean(0)).sum() / 6)
-
-
-def parsed(path) -> dict:
-    """Return the parts of a file, read as OpenVDB's source describes them."""
-    data, found = Path(path).read_bytes(), {}
-    magic, found["version"], _, _, found["seekable"] = struct.unpack_from("<qIII?", data)
-    assert magic == 0x56444220
-    found["uuid"], place = data[21:57].decode(), 57
-    assert struct.unpack_from("<II", data, place) == (0, 1)  # no metadata of the file, one grid
-    place += 8
-    name = text("surface") + text("Tree_float_5_4_3") + text("")
-    assert data[place : place + len(name)] == name
-    place += len(name)
-    start, values, end = struct.unpack_from("<qqq", data, place)
-    assert start == place + 24 and end == len(data)
-    flags, count = struct.unpack_from("<II", data, start)
-    assert flags == ACTIVE_MASK
-    place, entries = start + 8, {}
-    for _ in range(count):
-        key, kind, value = iter_texts(data, place)
-        place += 12 + len(key) + len(kind) + len(value)
-        entries[key.decode()] = (kind.decode(), value)
-    (size,) = struct.unpack_from("<I", data, place)
-    found["map"] = data[place + 4 : place + 4 + size].decode()
-    return found | {"metadata": entries, "data": data, "transform": place + 4 + size, "at": values}
-
-
-def iter_texts(data: bytes, place: int):
-    """Yield three strings of bytes, each after its length."""
-    for _ in range(3):
-        (size,) = struct.unpack_from("<I", data, place)
-        yield data[place + 4 : place + 4 + size]
-        place += 4 + size
-
-
-def test_the_bytes_are_those_that_openvdb_expects():
-    """Straight: translation, scale, size, 1/scale, 1/scale^2, 1/(2 scale); the leaves come last."""
-    field = upsample(cut_ball(), trilinear, 4)
-    write_field(field, "a.vdb")
-    found = parsed("a.vdb")
-    assert (found["version"], found["seekable"]) == (224, True)
-    assert found["map"] == "UniformScaleTranslateMap"
-    h, data = 0.075, found["data"]
-    place = [0.85, 1.85, 2.85], *([x] * 3 for x in (h, h, 1 / h, 1 / h**2, 0.5 / h))
-    vectors = np.frombuffer(data, "<f8", 18, found["transform"]).reshape(6, 3)
-    np.testing.assert_allclose(vectors, place, rtol=1e-12)
-    buffers, background, tiles, _ = struct.unpack_from("<IfII", data, found["transform"] + 144)
-    assert (buffers, tiles) == (1, 0) and background == np.float32(3 * h)
-    corner = struct.unpack_from("<3i", data, found["transform"] + 160)
-    assert [x % 4096 for x in corner] == [0, 0, 0]
-    said = {key: kind for key, (kind, _) in found["metadata"].items()}
-    assert said == {
-        "class": "string",
-        "file_bbox_max": "vec3i",
-        "file_bbox_min": "vec3i",
-        "file_voxel_count": "int64",
-        "is_saved_as_half_float": "bool",
-        "name": "string",
-    }
-    values, _ = level_set(field)
-    active = np.argwhere(np.abs(values) < background) - PAD
-    box = [found["metadata"][f"file_bbox_{end}"][1] for end in ("min", "max")]
-    assert struct.unpack("<3i", box[0]) == tuple(active.min(0))
-    assert struct.unpack("<3i", box[1]) == tuple(active.max(0))
-
-
-def test_the_values_begin_where_the_file_says():
-    """All leaves are in one node: their masks end the topology, then the first mask comes again."""
-    field = upsample(ball(12, 3.0), trilinear, 2)
-    write_field(field, "a.vdb")
-    found = parsed("a.vdb")
-    values, background = level_set(field)
-    cubes = np.pad(values, [(0, -count % 8) for count in values.shape], constant_values=1e9)
-    x, y, z = (count // 8 for count in cubes.shape)
-    near = (np.abs(cubes) < background).reshape(x, 8, y, 8, z, 8).transpose(0, 2, 4, 1, 3, 5)
-    masks = [cube for cube in near.reshape(-1, 512) if cube.any()]
-    packed = np.packbits(masks, axis=1, bitorder="little").tobytes()
-    data, at = found["data"], found["at"]
-    assert data[at - len(packed) : at + 64] == packed + packed[:64]
-
-
-def test_the_map_is_a_matrix_only_where_the_axes_are_turned():
-    maps = {"turned": "AffineMap", "stretched": "ScaleTranslateMap"}
-    for name, kind in maps.items():
-        field = upsample(GRIDS[name](), trilinear, 2)
-        write_field(field, f"{name}.vdb")
-        assert parsed(f"{name}.vdb")["map"] == kind
-    found = parsed("turned.vdb")
-    matrix = np.frombuffer(found["data"], "<f8", 16, found["transform"]).reshape(4, 4)
-    fine = fine_grid(upsample(turned(), trilinear, 2))
-    point = np.array([3.0, 5.0, 7.0])
-    np.testing.assert_allclose(([*point, 1] @ matrix)[:3], fine.to_world(point))
-
-
-def test_the_number_of_a_file_is_that_of_its_field():
-    grid, moved = ball(), SdfGrid.trusted(ball().values, 1.0, (0, 0, 1))
-    for name, given in (("a", grid), ("b", grid), ("c", moved)):
-        write_field(upsample(given, trilinear, 2), f"{name}.vdb")
-    a, b, c = (parsed(f"{name}.vdb") for name in "abc")
-    assert a["data"] == b["data"] and a["uuid"] != c["uuid"]
+    assert np.abs(ends[0] - ends[1]).max() < 0.5 * max(fine_grid(field).spacing)
 
 
 def test_trees_of_many_nodes_have_the_right_side_everywhere(tmp_path):

@@ -9,7 +9,8 @@ import pytest
 from super_sdf import Mesh, make_grid, reconstruct, reconstruct_labels
 from super_sdf.check.check import check_mesh
 from super_sdf.truth.mesh_files import read_mesh
-from super_sdf.labels.volumes import MOST, keep_volumes, volume_of_samples
+from super_sdf.grid.sdf_grid import volume_of_samples
+from super_sdf.labels.volumes import MOST, keep_volumes
 
 SPACING = (1.5, 1.5, 4.0)
 

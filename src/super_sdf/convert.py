@@ -20,7 +20,7 @@ from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.cubic import cubic_grid
 from .grid.placement import as_triple
-from .grid.sdf_grid import SdfGrid, describe_place
+from .grid.sdf_grid import SdfGrid, describe_place, mean_spacing, volume_of_samples
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP, Options
 from .pipeline import mesh_grid
@@ -134,7 +134,7 @@ def convert(
 
         check_apart(save_field, files)
         shape = lattice_shape(grid.shape, options.factor)
-        check_field_fits(Path(save_field), shape, options.max_memory)
+        check_field_fits(Path(save_field), shape)
         saving = saving_field(save_field, force=force)
     watch.lap("read")
     shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
@@ -188,7 +188,7 @@ def reworked(
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
     simplified, off = None, list[str]()
     if options.keep_volume:
-        from .labels.volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
+        from .labels.volumes import keep_volumes, volume_notes
 
         volume = volume_of_samples(grid)
         (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))

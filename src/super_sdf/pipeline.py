@@ -10,8 +10,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,24 +20,25 @@ from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import MeshError
+from .errors import OptionTypeError, OutOfMemoryError, seen
 from .functions.function import Function, as_function, sampled
 from .grid.cubic import cubic_grid
-from .grid.sdf_grid import SdfGrid, check_grid
+from .grid.sdf_grid import SdfGrid, check_grid, crop
 from .network.decoder import Decoder, adapt, decode
 from .network.network import given_or_loaded, network_for
 from .options import Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
-from .refine.field import FineField, SampleSpheres, border_is_crossed
+from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.spheres import fit_to_spheres, spheres_of_band
 from .refine.spline import interpolate
-from .refine.survey import Band, BandSummary, no_surface, survey
+from .refine.survey import Band, BandSummary, BandTooLarge, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import choose_mesher, extract
 from .surface.mesh import Mesh, vertex_type
-from .threads import useful_threads
+from .threads import in_words, useful_threads
+from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
 
 
 def refine(
@@ -169,6 +171,49 @@ def upsample(
     return field
 
 
+def extract_mesh(
+    field: FineField,
+    grid: SdfGrid | None = None,
+    *,
+    mesher: options.MesherName = options.DEFAULT_MESHER,
+    cap: bool = True,
+    function: Function | None = None,
+) -> Mesh:
+    """Return the zero level of a field as triangles in world coordinates; a node of 0 is inside.
+
+    Parameters
+    ----------
+    field : FineField
+        From ``upsample`` or ``read_field``.
+    grid : SdfGrid, optional
+        A coarse grid for spacing, origin and direction. Default: the one that the field was made
+        from. A field that was made without its grid stays open.
+    mesher, cap, function
+        As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
+
+    Raises
+    ------
+    OptionError
+        If there is no such mesher; if there are more vertices than 32-bit numbers.
+    OptionTypeError
+        If an argument is something else.
+    """
+    if not isinstance(field, FineField):
+        raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
+    grid = field.placed if grid is None else grid
+    check_grid(grid)
+    samples = field.spheres
+    chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
+    cap = options.check_cap(cap) and field.grid is not None
+    check_can_close(grid, cap=cap)
+    mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
+    if function is None:
+        return mesh
+    from .functions.zero import put_on_zero  # imported here, as few call it
+
+    return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)
+
+
 def reconstruct(
     grid: SdfGrid | None = None,
     network: Decoder | None = None,
@@ -249,11 +294,28 @@ class Result:
 
     mesh: Mesh
     open_edges: int
-    counts: dict[str, int]  # those of ``FineField``, summed over the tiles
+    counts: dict[str, int]  # see ``FineField``; in tiles, a pinned node may count twice
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
     is_cut: bool  # whether the surface leaves the grid, or may end at unknown samples
-    seconds: dict[str, float] = field(default_factory=dict)  # by step
-    tiles: int = 1
+    seconds: dict[str, float]  # by step
+    tiles: int
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """All that a tile is made of, besides the network; it can be sent to another process."""
+
+    tile: Tile
+    grid: SdfGrid  # the samples of the tile
+    shape: tuple[int, int, int]  # samples of the whole grid
+    whole: BandSummary | None  # None of a tile that is the whole grid
+    options: Options
+    mesher: options.MesherName
+    threads: int
+
+
+MapTiles = Callable[[Callable[[Task], Part], Iterator[Task]], Iterable[Part]]
+"""Calls a function, which can be pickled, with each task, and returns the parts in any order."""
 
 
 def mesh_grid(
@@ -263,10 +325,13 @@ def mesh_grid(
     *,
     progress: Progress | None = None,
     save_field: Callable[[FineField], None] | None = None,
+    map_tiles: MapTiles | None = None,
+    least_tiles: int = 1,
 ) -> Result:
     """Return the mesh of a grid: in one piece, or in tiles if it does not fit in memory.
 
-    ``save_field`` is called with the fine field.
+    ``save_field`` is called with the fine field, which needs one piece. ``map_tiles`` has tiles
+    made elsewhere, ``least_tiles`` or more, each within the memory bound.
     """
     check_grid(grid)
     options.check_network(network)
@@ -275,18 +340,83 @@ def mesh_grid(
     steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
     mesher = choose_mesher(chosen.mesher, exact=lattice.field.has_exact)
-    vertex_type(lattice, factor)
-    threads = useful_threads(decoder.threads)
-    field = refine(lattice, decoder, factor, offset, threads=threads, steps=steps)
-    if not field.has_surface:
+    vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
+    threads, shape = useful_threads(decoder.threads), lattice.shape
+    room = Room.of(chosen.max_memory, factor, mesher, decoder.memory_bytes)
+    tiles, whole = [Tile((0, 0, 0), shape, (0, 0, 0), shape)], None
+    try:
+        is_one = map_tiles is None and least_tiles == 1
+        band = survey(lattice, offset, threads=threads, most=room.voxels if is_one else -1)
+    except BandTooLarge:
+        band, whole = None, summarise(lattice, offset, threads)
+        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
+        tiles = plan(shape, whole, margin, room, least_tiles)
+    steps.finish("band")
+    if whole and save_field:
+        raise OutOfMemoryError(
+            f"the refined field does not fit in the {in_words(room.bound)} that may be used: use a "
+            "smaller factor, allow more (--max-memory), or leave --save-field out"
+        )
+
+    def task_of(tile: Tile) -> Task:
+        part = crop(lattice, tile.low, tile.high) if whole else lattice
+        return Task(tile, part, shape, whole, chosen, mesher, threads)
+
+    if band:
+        parts = [make_tile(task_of(tiles[0]), decoder, band, steps, save_field)]
+    else:
+        parts = []
+        for part in (map_tiles or map)(partial(make_tile, network=decoder), map(task_of, tiles)):
+            parts.append(part)
+            steps.show(len(parts) / len(tiles))
+        parts.sort(key=lambda part: part.tile.low)
+    del band
+    mesh, leaves = join(parts), any(part.leaves for part in parts)
+    if not len(mesh.faces):
         raise no_surface(grid, offset)
+    is_cut = any(part.is_cut for part in parts)
+    ends = lattice.field.unseen is not None
+    count = check_closed(mesh, lattice, parts, cap=chosen.cap or not is_cut, ends=ends)
+    counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
+    if whole:
+        counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
+    steps.finish("isosurface")
+    return Result(mesh, count, counts, leaves, is_cut, steps.take_seconds(), len(tiles))
+
+
+def make_tile(
+    task: Task,
+    network: Decoder,
+    band: Band | None = None,
+    steps: StepCounter | None = None,
+    save_field: Callable[[FineField], None] | None = None,
+) -> Part:
+    """Return the part of the mesh that belongs to a tile, which may be the whole grid."""
+    tile, chosen, factor = task.tile, task.options, task.options.factor
+    band = band or survey(task.grid, chosen.offset, threads=task.threads, whole=task.whole)
+    if not band.decoded.any():
+        return Part.without_surface(tile)
+    field = refine_band(band, network, factor, task.threads, steps)
+    field = replace(field, grid=task.grid, offset=chosen.offset)
+    del band
     if save_field:
         save_field(field)
-        steps.watch.lap("save field")
-    is_cut = field.octants is not None or (field.leaves and border_is_crossed(field))
-    mesh, _ = extract(field, lattice, mesher=mesher, cap=chosen.cap, threads=threads)
-    count = mesh.open_edges()
-    if count and (chosen.cap or not is_cut):
-        raise MeshError(f"the mesh is torn, with {count:,} open edges: report it")
-    steps.finish("isosurface")
-    return Result(mesh, count, field.counts, field.leaves, is_cut, steps.take_seconds())
+    border = np.array([(0, 0, 0), task.shape]) - np.array(tile.low)
+    is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
+    mesh, keys = extract(
+        field,
+        task.grid,
+        mesher=task.mesher,
+        cap=chosen.cap,
+        threads=task.threads,
+        first=tile.low,
+        shape=task.shape,
+    )
+    counts = dict(field.counts)
+    if task.whole:
+        own = tile.owns(field.voxel_ijk + np.array(tile.low))
+        counts["decoded_voxels"] = int(np.count_nonzero(own))
+        counts["nodes"] = field.parts.count_nodes(factor, own)
+    more = {"counts": counts, "leaves": field.leaves, "is_cut": is_cut}
+    del field
+    return own_part(mesh, keys, tile, task.shape, factor, **more)

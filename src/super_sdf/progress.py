@@ -16,8 +16,7 @@ ShareCallback = Callable[[float], None]
 """Called with the finished share of a step, from 0 to 1."""
 
 TOTAL = 1000
-# Share of the time that each step takes with a network on a CPU. The first runs once, the others
-# once per slab.
+# Share of the time that each step takes with a network on a CPU.
 STEPS = {"band": 0.03, "network": 0.45, "nodes": 0.15, "isosurface": 0.37}
 
 
@@ -73,11 +72,16 @@ class StepCounter:
         self.done = 0.0
         self.watch = Stopwatch()
 
+    def show(self, share: float) -> None:
+        """Report the share of all that comes after the first step."""
+        first = self.lengths.get("band", 0)
+        self._show(first + share * (TOTAL - first))
+
     def finish(self, name: str) -> None:
         """Report that a step is done, and record its time."""
         self.watch.lap(name)
         self.done += self.lengths[name]
-        self._show(self.done)
+        self._show(TOTAL if name == "isosurface" else self.done)
 
     def take_seconds(self) -> dict[str, float]:
         """Return the seconds per step since the last call."""

@@ -130,7 +130,6 @@ def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) 
 
     A page that super-sdf wrote may be replaced, so that a batch can be resumed.
     """
-    check_modules("--report", "report")
     from ..files.regular import files_of
     from ..pages.html import is_page
     from ..pages.items import items_folder

@@ -11,7 +11,16 @@ import click
 
 from ..errors import check_modules
 from ..options import OPTIONS, Options
-from .common import CONTEXT, FILE, Command, option, print_stderr, print_stdout, shared, table_options
+from .common import (
+    CONTEXT,
+    FILE,
+    Command,
+    option,
+    print_stderr,
+    print_stdout,
+    shared,
+    table_options,
+)
 
 EXAMPLES = """\b
 Examples:
@@ -63,7 +72,14 @@ def command(mesh: Path, grid: Path, **given: Any) -> None:
     what upsample takes. The exit code is 1 if a limit is exceeded.
     """
     check_modules("check", "report", ("igl",))
-    from ..check.check import (LIMITS, check_coloured, check_files, check_limits, exceeded, write_coloured)
+    from ..check.check import (
+        LIMITS,
+        check_coloured,
+        check_files,
+        check_limits,
+        exceeded,
+        write_coloured,
+    )
     from ..files.output import check_apart
     from ..files.regular import files_of
 

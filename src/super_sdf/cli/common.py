@@ -118,7 +118,7 @@ SHARED = {
         help="Check each mesh against its samples, as check does. Needs the extra report."),
     "report": option("--report", type=FILE, metavar="PAGE.html",
         help="Also write a page for the browser: figures, times, warnings, the check of each mesh, "
-        "and a 3-D view of it beside coarse marching cubes. Needs the extra report."),
+        "and a 3-D view of it beside coarse marching cubes. The check needs the extra report."),
     "force": option("--force", is_flag=True, help="Replace output files that exist."),
     "json": option("--json", "as_json", is_flag=True, help="Print results as JSON."),
     "quiet": option("-q", "--quiet", is_flag=True, help="Print errors only."),
@@ -158,7 +158,6 @@ def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bo
     """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
     from ..files.output import check_apart, check_free
 
-    check_modules(word, "report")
     if page.suffix.lower() not in (".html", ".htm"):
         raise OptionError(f"{page} is not a page: give {word} a file .html or .htm")
     check_free(page, force=force)

@@ -8,9 +8,18 @@ from typing import Any
 
 import click
 
-from ..errors import check_modules
 from ..options import OPTIONS
-from .common import (CONTEXT, FILE, Command, check_page, chosen_options, option, print_stderr, shared, table_options)
+from .common import (
+    CONTEXT,
+    FILE,
+    Command,
+    check_page,
+    chosen_options,
+    option,
+    print_stderr,
+    shared,
+    table_options,
+)
 
 EXAMPLES = """\b
 Examples:
@@ -44,10 +53,9 @@ def command(
     beside coarse marching cubes of the samples, from one camera, with the residuals of its samples
     as colours. The options below apply to grids.
 
-    The page is one file, which shows all of it without a server; its address is printed. Needs the
-    extra report.
+    The page is one file, which shows all of it without a server; its address is printed. Residuals
+    need the extra report.
     """
-    check_modules("view", "report")
     from ..network.network import load_network
     from ..pages.html import viewed_page, write_page
 

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from io import FileIO
 from math import prod
-from pathlib import Path
-from threading import Lock
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from ..arrays import FloatArray
-from ..errors import FileError, GridError
+from ..errors import GridError
 from ..threads import check_fits
 
 FAR = 1e6  # spacings
@@ -30,69 +26,6 @@ Index: TypeAlias = Sequence[int] | NDArray[Any]
 """One index per axis."""
 Ranges: TypeAlias = Sequence[tuple[Any, ...]]
 """Ranges of planes: the first, that after the last, and what else a function gets."""
-
-
-class InputFile:
-    """A file that any thread may read at any offset; it must not change while it is open.
-
-    ``name`` is that in messages, ``size`` its size in bytes when it was opened.
-    """
-
-    def __init__(self, file: FileIO, name: str) -> None:
-        self.file, self.name = file, name
-        self.state = self._stat()
-        self.size = self.state[0]
-        self._lock = Lock()
-
-    @classmethod
-    def open(cls, path: Path) -> InputFile:
-        """Open a file by its path; FileError if that fails."""
-        try:
-            return cls(FileIO(str(path)), str(path))
-        except OSError as error:
-            raise FileError(f"{path} cannot be read: {error.strerror or error}") from None
-
-    def __del__(self) -> None:
-        if hasattr(self, "file"):
-            self.file.close()
-
-    def _stat(self) -> tuple[int, int]:
-        status = os.fstat(self.file.fileno())
-        return status.st_size, status.st_mtime_ns
-
-    def check_unchanged(self) -> None:
-        """Raise FileError if the file was written to since it was opened."""
-        if self._stat() != self.state:
-            raise FileError(f"{self.name} changed while it was read: read it when it is complete")
-
-    def read_into(self, out: NDArray[Any], offset: int) -> None:
-        """Fill a contiguous array with the bytes from ``offset`` on; FileError if that fails."""
-        view = out.view(np.uint8).reshape(-1).data
-        while view:
-            count = self._read_some(view, offset)
-            if not count:
-                break
-            view, offset = view[count:], offset + count
-        self.check_unchanged()
-        if view:
-            raise FileError(f"{self.name} ends {len(view):,} bytes too early")
-
-    def _read_some(self, view: memoryview, offset: int) -> int:
-        """Read at least one byte unless the file ends; return the number of bytes read."""
-        try:
-            if hasattr(os, "preadv"):  # needs no file position, which forked processes share
-                return os.preadv(self.file.fileno(), [view], offset)
-            with self._lock:
-                self.file.seek(offset)
-                return self.file.readinto(view) or 0
-        except OSError as error:
-            raise FileError(f"{self.name} cannot be read: {error.strerror or error}") from None
-
-    def read(self, offset: int, count: int) -> NDArray[np.uint8]:
-        """Return ``count`` bytes from ``offset`` on, or fewer at the end of the file."""
-        out = np.empty(max(min(count, self.size - offset), 0), np.uint8)
-        self.read_into(out, offset)
-        return out
 
 
 class SamplePlanes(ABC):
@@ -169,31 +102,6 @@ class LazyPlanes(SamplePlanes):
     def crop(self, low: Index, high: Index) -> SampleArray:
         """Return the samples in a box, which alone is read."""
         return np.asarray(self.source[_box(low, high)])
-
-
-class PlaneFile(SamplePlanes):
-    """A 3D array in a file from byte ``offset`` on; if ``swapped``, it is (nx, nz, ny) there."""
-
-    def __init__(
-        self,
-        file: InputFile,
-        offset: int,
-        shape: tuple[int, ...],
-        dtype: np.dtype[Any],
-        *,
-        swapped: bool = False,
-    ) -> None:
-        self.file, self.offset, self.name = file, offset, file.name
-        self.shape, self.dtype, self.swapped = shape, dtype, swapped
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive); FileError if the file changed."""
-        _, ny, nz = self.shape
-        planes = np.empty(
-            (max(last - first, 0), *((nz, ny) if self.swapped else (ny, nz))), self.dtype
-        )
-        self.file.read_into(planes, self.offset + first * ny * nz * self.dtype.itemsize)
-        return planes.transpose(0, 2, 1) if self.swapped else planes
 
 
 class CroppedPlanes(SamplePlanes):

@@ -1,4 +1,1 @@
-"""Pages for a browser: reports of conversions, and a viewer of meshes; needs the extra ``report``.
-
-It may import ``certificate``, ``simplification``, ``convert`` and what lies below.
-"""
+"""Pages for a browser: reports of conversions, and a viewer of meshes."""

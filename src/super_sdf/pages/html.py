@@ -18,14 +18,13 @@ from typing import Any
 
 from .. import __version__
 from ..check import check
-from ..check.check import Certificate
 from ..convert import convert
-from ..options import Options
 from ..files.formats import is_grid
 from ..files.output import replacing
 from ..network.decoder import Decoder
+from ..options import Options
 from ..truth.mesh_files import read_mesh
-from .items import Entry, Item, entry_of, entry_of_report, item_of_files, numbers, tiles
+from .items import Entry, Item, entry_of, entry_of_report, item_of_files, numbers
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")
@@ -40,47 +39,46 @@ def make_page(
     """Return a page of ``meshes``, packed and by the id of their entry.
 
     ``facts`` are ``title``, ``lead`` (a sentence), ``alert`` (a sentence or ""), ``summary`` (rows
-    of label and text), ``notes`` and ``files``, entries as ``entries`` makes them. If ``beside``,
-    the page may load scripts from beside it, with the meshes that are not in it.
+    of label and text), ``notes`` and ``files``, entries. If ``beside``, the page may load scripts
+    from beside it, with the meshes that are not in it.
     """
+
+    def hash_of(text: str) -> str:
+        """Return the hash by which a policy names an inline script or style."""
+        digest = hashlib.sha256(text.encode("utf-8")).digest()
+        return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+    def safe(value: Any) -> str:
+        """Return JSON in ASCII in which the characters of markup are escaped."""
+        return json.dumps(value, ensure_ascii=True, allow_nan=False).translate(MARKUP)
+
     style = (HOME / "page.css").read_text("utf-8")
     scripts = [(HOME / name).read_text("utf-8") for name in SCRIPTS]
-    own = " ".join(map(_source_hash, scripts)) + (" 'self' file:" if beside else "")
-    colours = {name: list(getattr(check, name)) for name in ("TOUCHING", "PIERCED", "UNKNOWN")}
+    own = " ".join(map(hash_of, scripts)) + (" 'self' file:" if beside else "")
     known = {
         "version": __version__,
         "made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
         "colours": {
-            **{name.lower(): colour for name, colour in colours.items()},
-            "apart": list(check.NOT_TOUCHING),
+            "touching": check.TOUCHING,
+            "pierced": check.PIERCED,
+            "unknown": check.UNKNOWN,
+            "apart": check.NOT_TOUCHING,
             "full": check.FULL,
         },
     }
-    # the names of blocks are ours, never a file's
-    blocks = [
-        f'<script type="application/json" id="meshes-{name}">{safe_json(packed)}</script>'
+    blocks = [  # their names are ours, never a file's
+        f'<script type="application/json" id="meshes-{name}">{safe(packed)}</script>'
         for name, packed in (meshes or {}).items()
     ]
     return Template((HOME / "page.html").read_text("utf-8")).substitute(
-        policy=f"default-src 'none'; script-src {own}; style-src {_source_hash(style)}; "
+        policy=f"default-src 'none'; script-src {own}; style-src {hash_of(style)}; "
         "img-src data:; base-uri 'none'; form-action 'none'",
         generator=GENERATOR,
         style=style,
-        facts=safe_json({**facts, **known}),
+        facts=safe({**facts, **known}),
         meshes="\n".join(blocks),
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
     )
-
-
-def _source_hash(text: str) -> str:
-    """Return the hash by which a policy names an inline script or style."""
-    digest = hashlib.sha256(text.encode("utf-8")).digest()
-    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
-
-
-def safe_json(value: Any) -> str:
-    """Return JSON in ASCII without the characters of markup, which are escaped."""
-    return json.dumps(value, ensure_ascii=True, allow_nan=False).translate(MARKUP)
 
 
 def write_page(text: str, path: Path, *, force: bool = False) -> None:
@@ -103,7 +101,7 @@ def page_of_conversion(
     report: Mapping[str, Any],
     options: Options,
     made: Any = None,
-    certificate: Certificate | None = None,
+    certificate: check.Certificate | None = None,
 ) -> str:
     """Return the page of a conversion.
 
@@ -111,34 +109,46 @@ def page_of_conversion(
     unless what was ``made`` has ``mesh`` and ``grid``. The mesh is checked unless there is a
     certificate already.
     """
-    given = options, made, certificate
-    item = item_of_files(report["output"], report["input"], *given)
+    item = item_of_files(report["output"], report["input"], options, made, certificate)
     name = Path(report["output"]).name
     entry = entry_of_report(name, report, item)
-    return _whole_page(name, [(entry, item)], tiles(entry))
+    shown = [row for row in entry["certificate"] if row[0] in ("mean residual", "largest residual")]
+    faults = [["faults", str(len(entry["faults"]) or "none")]] if shown else []
+    summary = [["result", entry["line"]], ["time", f"{entry['seconds']:.1f} s"], *shown, *faults]
+    return _whole_page(name, [(entry, item)], summary)
 
 
-def viewed_page(
-    sources: Sequence[str], load: Callable[[], Decoder], options: Options
-) -> str:
+def viewed_page(sources: Sequence[str], load: Callable[[], Decoder], options: Options) -> str:
     """Return the page of some mesh files and grid files; all that it shows is within it.
 
     ``load`` returns the network, and is called if there is a grid; ``options`` say how that is
     refined.
     """
     network = load() if any(map(is_grid, sources)) else None
-    shown = [
-        _viewed_grid(source, network, options)
-        if network and is_grid(source)
-        else _viewed_mesh(source, options.max_memory)
-        for source in sources
-    ]
+    shown = []
+    for source in sources:
+        name = Path(source).name
+        if network is not None and is_grid(source):
+            with TemporaryDirectory(prefix="super-sdf-") as folder:
+                target = Path(folder, "mesh.ply")
+                done = convert(source, target, network, options)
+                item = item_of_files(target, source, options, done)
+            said = {"input": source, "asked": options.digest(), "seconds": done.seconds}
+            shown.append((entry_of_report(name, {**done.report(), **said}, item), item))
+            continue
+        mesh, item = read_mesh(source), Item()
+        item.show(name, mesh)
+        low, high = (numbers(corner(axis=0)) for corner in (mesh.vertices.min, mesh.vertices.max))
+        bounds = ["bounds", f"({low}) to ({high})"]
+        facts = [["mesh", source], ["vertices", f"{len(mesh.vertices):,}"], bounds]
+        line = f"{len(mesh.faces):,} triangles, {'closed' if mesh.is_closed() else 'open'}"
+        shown.append((entry_of(name, line=line, facts=facts, remarks=item.remarks), item))
     title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
-    return _whole_page(title, shown)
+    return _whole_page(title, shown, [])
 
 
 def _whole_page(
-    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]] = ()
+    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]]
 ) -> str:
     """Return a page with the meshes of its entries; ``summary`` are rows of label and text."""
     meshes = {str(number): item.meshes for number, (_, item) in enumerate(shown)}
@@ -148,25 +158,3 @@ def _whole_page(
     ]
     facts = {"title": title, "lead": "", "alert": "", "notes": [], "files": entries}
     return make_page({**facts, "summary": summary}, meshes)
-
-
-def _viewed_grid(source: str, network: Decoder, options: Options) -> tuple[Entry, Item]:
-    """Refine a grid; return what the page says and shows of it."""
-    with TemporaryDirectory(prefix="super-sdf-") as folder:
-        target = Path(folder, "mesh.ply")
-        done = convert(source, target, network, options)
-        item = item_of_files(target, source, options, done)
-    report = {**done.report(), "input": source, "asked": options.digest(), "seconds": done.seconds}
-    return entry_of_report(Path(source).name, report, item), item
-
-
-def _viewed_mesh(source: str, max_memory: int | None = None) -> tuple[Entry, Item]:
-    """Read a mesh; return what the page says and shows of it."""
-    mesh, item, name = read_mesh(source), Item(), Path(source).name
-    item.show(name, mesh, max_memory=max_memory)
-    low, high = (numbers(corner(axis=0)) for corner in (mesh.vertices.min, mesh.vertices.max))
-    bounds = ["bounds", f"({low}) to ({high})"]
-    facts = [["mesh", source], ["vertices", f"{len(mesh.vertices):,}"], bounds]
-    line = f"{len(mesh.faces):,} triangles, {'closed' if mesh.is_closed() else 'open'}"
-    shown = {"thumbnail": item.thumbnail, "remarks": item.remarks}
-    return entry_of(name, line=line, facts=facts) | shown, item

@@ -15,32 +15,30 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..check.check import Certificate, band_of, check_mesh, read_for_check
-from ..options import Options
-from ..errors import SuperSdfError
+from ..check.check import Certificate, check_mesh, read_for_check
+from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
 from ..grid.cubic import cubic_grid
+from ..options import Options
 from ..surface.mesh import Mesh
-from .meshes import coarse_surface, packed_mesh, thumbnail
+from .meshes import coarse_surface, packed_mesh
 
 RESULT, COARSE = "super-sdf", "marching cubes of the samples"
 LONGEST_HEAD = 1 << 20  # bytes of a file's first line
 COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
 LISTS = ("facts", "certificate", "stages", "faults", "notes", "warnings", "remarks")
-NUMBERS = ("seconds", "residual", "thumbnail", "meshes")
 COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "tiles")
-NOT_DRAWN = "not drawn: run the command again for its picture and its meshes"
+NOT_DRAWN = "not drawn: run the command again for its meshes"
 
 Entry = dict[str, Any]
 """A file in the JSON of a page.
 
 id : what its meshes are found by
-name, detail : what it is, and the grid and the mesh
+name : what it is
 status : "ok", "failed" or "waiting"; of a failed one ``reason``
 line : counts in one line
 seconds, residual : for sorting; None if unknown
-thumbnail : a data URL or None
 facts, certificate, stages : lists of label and text
 faults, notes, warnings, remarks : lists of sentences
 meshes : "page", "beside" or None: where its meshes are
@@ -51,24 +49,16 @@ meshes : "page", "beside" or None: where its meshes are
 class Item:
     """What a page shows of one result."""
 
-    thumbnail: str | None = None  # a data URL
     meshes: list[dict[str, Any]] = field(default_factory=list)  # packed: result, coarse mesh
     certificate: dict[str, Any] | None = None  # or, under "error", why there is none
     remarks: list[str] = field(default_factory=list)  # what is missing, and why
     made_of: str = ""  # the SHA-256 of the mesh file, if the item is kept in a file
     size: int = 0  # about how many bytes the meshes take in a page; of an item from a file
 
-    def show(
-        self,
-        title: str,
-        mesh: Mesh,
-        certificate: Certificate | None = None,
-        max_memory: int | None = None,
-    ) -> None:
-        """Add a mesh, or a remark why it is not shown; the first one is also in the thumbnail."""
-        self.thumbnail = self.thumbnail or thumbnail(mesh)
+    def show(self, title: str, mesh: Mesh, certificate: Certificate | None = None) -> None:
+        """Add a mesh, or a remark why it is not shown."""
         try:
-            self.meshes.append(packed_mesh(title, mesh, certificate, max_memory))
+            self.meshes.append(packed_mesh(title, mesh, certificate))
         except SuperSdfError as error:
             self.remarks.append(f"not shown: {error}")
 
@@ -89,21 +79,23 @@ def item_of_files(
         shown, samples = read_for_check(mesh, grid, options, made)
     except SuperSdfError as error:
         return Item(certificate={"error": str(error)}, remarks=[f"not shown: {error}"])
-    item, memory, band = Item(), options.max_memory, None
+    item, checked = Item(), None
     try:
-        band = band_of(samples, options)
+        check_modules("a check of the mesh, with residuals,", "report", ("igl",))
         certificate = certificate or check_mesh(shown, samples, options)
         item.certificate = certificate.report()
     except SuperSdfError as error:
         item.certificate = {"error": str(error)}
-    item.show(RESULT, shown, certificate, memory)
-    if band:
-        lattice, checked = cubic_grid(samples, options.offset), None
-        coarse = coarse_surface(band, lattice)
-        if certificate and len(coarse.faces):
+    item.show(RESULT, shown, certificate)
+    lattice = cubic_grid(samples, options.offset)
+    hidden = lattice.field.unseen is not None
+    if lattice.field.unseen is None and len(
+        (coarse := coarse_surface(lattice, options.offset)).faces
+    ):
+        if certificate:
             checked = check_mesh(coarse, samples, options, intersections=False)
         title = COARSE + (", made equally spaced" if lattice.shape != samples.shape else "")
-        item.show(title, coarse, checked, memory)
+        item.show(title, coarse, checked)
     return item
 
 
@@ -124,16 +116,31 @@ def item_path(folder: Path, target: str) -> Path:
 
 def keep_item(item: Item, folder: Path, target: str, sha256: str) -> None:
     """Write the item of an output whose mesh file has this hash; the folder is made for it."""
-    item.made_of = sha256
+    size, path = sum(len(mesh["data"]) for mesh in item.meshes), item_path(folder, target)
+    head = json.dumps({**vars(item), "meshes": [], "size": size, "made_of": sha256})
+    call = f"{CALL}({json.dumps(path.stem)}, {json.dumps(item.meshes)});"
     with naming(folder):
         folder.mkdir(exist_ok=True)
-    write_item(item, item_path(folder, target))
+    with replacing(path) as part:
+        part.write_bytes(COMMENT + f"{head}\n{call}\n".encode("ascii"))
 
 
 def find_item(folder: Path, target: str, sha256: str) -> Item | None:
     """Return the item of an output without its meshes; None if there is none of this mesh."""
-    item = read_head(item_path(folder, target))
-    return item if item and item.made_of == sha256 else None
+    try:
+        with item_path(folder, target).open("rb") as file:
+            line = file.readline(LONGEST_HEAD)
+        item = Item(**json.loads(line.removeprefix(COMMENT)))
+    except (OSError, ValueError, TypeError):  # missing, or damaged
+        return None
+    return item if item.made_of == sha256 else None
+
+
+def read_meshes(path: Path) -> list[dict[str, Any]]:
+    """Return the packed meshes from the file of an item that was just written or read."""
+    _, call = path.read_bytes().split(b"\n", 1)
+    meshes: list[dict[str, Any]] = json.loads(call[call.index(b"[") : call.rindex(b"]") + 1])
+    return meshes
 
 
 def remove_items(folder: Path, targets: Iterable[str]) -> None:
@@ -144,36 +151,11 @@ def remove_items(folder: Path, targets: Iterable[str]) -> None:
         folder.rmdir()
 
 
-def write_item(item: Item, path: Path) -> None:
-    """Write the file of an item, complete or not at all; its stem is the id that the page uses."""
-    size = sum(len(mesh["data"]) for mesh in item.meshes)
-    head = json.dumps({**vars(item), "meshes": [], "size": size})
-    call = f"{CALL}({json.dumps(path.stem)}, {json.dumps(item.meshes)});"
-    with replacing(path) as part:
-        part.write_bytes(COMMENT + f"{head}\n{call}\n".encode("ascii"))
-
-
-def read_head(path: Path) -> Item | None:
-    """Return an item from its file, without the meshes; None if there is none."""
-    try:
-        with path.open("rb") as file:
-            line = file.readline(LONGEST_HEAD)
-        return Item(**json.loads(line.removeprefix(COMMENT)))
-    except (OSError, ValueError, TypeError):  # missing, or damaged
-        return None
-
-
-def read_meshes(path: Path) -> list[dict[str, Any]]:
-    """Return the packed meshes from the file of an item that was just written or read."""
-    _, call = path.read_bytes().split(b"\n", 1)
-    meshes: list[dict[str, Any]] = json.loads(call[call.index(b"[") : call.rindex(b"]") + 1])
-    return meshes
-
-
 def entry_of(name: str, status: str = "ok", **known: Any) -> Entry:
     """Return an entry with what is known of a file; the rest is empty."""
     empty: Entry = {"id": "", "name": name, "status": status, "reason": "", "line": ""}
-    return empty | dict.fromkeys(NUMBERS) | {key: [] for key in LISTS} | known
+    empty |= dict.fromkeys(("seconds", "residual", "meshes")) | {key: [] for key in LISTS}
+    return empty | known
 
 
 def entry_of_report(name: str, report: Mapping[str, Any], item: Item | None) -> Entry:
@@ -184,36 +166,13 @@ def entry_of_report(name: str, report: Mapping[str, Any], item: Item | None) -> 
     """
     stages = report["stages"] if "stages" in report else report.get("seconds", {})
     certificate = report.get("check") or (item.certificate if item else None) or {}
-    return entry_of(
-        name,
-        line=_counts(report),
-        seconds=report["seconds"] if "stages" in report else sum(stages.values()),
-        residual=(certificate.get("residual") or {}).get("mean"),
-        facts=_facts(report),
-        stages=[[stage, f"{spent:.2f} s"] for stage, spent in stages.items()],
-        certificate=certificate_facts(certificate),
-        faults=certificate.get("faults", []),
-        notes=[*report.get("inferred", []), *report.get("notes", [])],
-        warnings=list(report.get("warnings", [])),
-        thumbnail=item.thumbnail if item else None,
-        remarks=item.remarks if item else [NOT_DRAWN],
-    )
-
-
-def _counts(report: Mapping[str, Any]) -> str:
+    shape = " x ".join(map(str, report.get("shape", ())))
     said = [f"{report['triangles']:,} triangles"] if "triangles" in report else []
-    if "closed" in report:
-        said.append("closed" if report["closed"] else "open")
-    if "shape" in report:
-        said.append(f"from {' x '.join(map(str, report['shape']))} samples")
-    return ", ".join(said)
-
-
-def _facts(report: Mapping[str, Any]) -> list[list[str]]:
-    texts = {
+    said += ["closed" if report["closed"] else "open"] if "closed" in report else []
+    facts = {
         "grid": report.get("input") or report.get("in"),
         "mesh": report.get("output"),
-        "samples": " x ".join(map(str, report.get("shape", ()))),
+        "samples": shape,
         "spacing": numbers(report.get("spacing", ())),
         "origin": numbers(report.get("origin", ())),
         "values": (report.get("field") or {}).get("kind"),
@@ -224,20 +183,24 @@ def _facts(report: Mapping[str, Any]) -> list[list[str]]:
     }
     if simplified := report.get("simplified"):
         off = simplified["deviation"]
-        texts["simplified"] = (
+        facts["simplified"] = (
             f"from {simplified['triangles_before']:,} triangles; largest distance "
             f"{off['largest']:.4f} voxels, {off['largest_back']:.4f} back; "
             f"a voxel is {simplified['voxel_size']:.6g}"
         )
-    return [[label, str(text)] for label, text in texts.items() if text not in (None, "")]
-
-
-def tiles(entry: Entry) -> list[list[str]]:
-    """Return the figures for the head of a page of one file."""
-    shown = [row for row in entry["certificate"] if row[0] in ("mean residual", "largest residual")]
-    faults = [["faults", str(len(entry["faults"]) or "none")]] if shown else []
-    line = [["result", entry["line"]]] if entry["line"] else []
-    return [*line, ["time", f"{entry['seconds']:.1f} s"], *shown, *faults]
+    return entry_of(
+        name,
+        line=", ".join([*said, f"from {shape} samples"] if shape else said),
+        seconds=report["seconds"] if "stages" in report else sum(stages.values()),
+        residual=(certificate.get("residual") or {}).get("mean"),
+        facts=[[label, str(text)] for label, text in facts.items() if text not in (None, "")],
+        stages=[[stage, f"{spent:.2f} s"] for stage, spent in stages.items()],
+        certificate=certificate_facts(certificate),
+        faults=certificate.get("faults", []),
+        notes=[*report.get("inferred", []), *report.get("notes", [])],
+        warnings=list(report.get("warnings", [])),
+        remarks=item.remarks if item else [NOT_DRAWN],
+    )
 
 
 def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
@@ -257,8 +220,9 @@ def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
         ]
     else:
         rows.append(["residual", "unknown, since no sample is exact"])
-    kinds = ("closed", "oriented", "manifold")
-    qualities = [("" if surface[key] else "not ") + key for key in kinds]
+    qualities = [
+        ("" if surface[key] else "not ") + key for key in ("closed", "oriented", "manifold")
+    ]
     pairs = surface["self_intersections"]
     return [
         *rows,

@@ -68,13 +68,10 @@ function badges(file) {
 
 /** Return the line of a file, which opens and closes the rest. */
 function summaryOf(file) {
-  const picture = file.thumbnail
-    ? make("img", { className: "thumb", src: file.thumbnail, alt: "", decoding: "async" })
-    : make("span", { className: "thumb empty" });
   const figures = [];
   if (file.residual !== null) figures.push(`mean residual ${file.residual.toFixed(4)} voxels`);
   if (file.seconds !== null) figures.push(`${file.seconds.toFixed(1)} s`);
-  return make("summary", {}, picture,
+  return make("summary", {},
     make("span", { className: "what" },
       make("span", { className: "name" }, file.name, " ", ...badges(file)),
       make("span", { className: file.reason ? "reason" : "line" }, file.reason || file.line)),

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +34,7 @@ from .nodes import (
     part_sizes,
 )
 
+COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "pinned_nodes")
 AT_ONCE = 1 << 20  # values of the lattice at a time, but at least a plane
 
 
@@ -197,15 +199,17 @@ class FineField:
         return np.ascontiguousarray(self.voxel_ijk[:, 0])
 
 
-def border_is_crossed(field: FineField) -> bool:
+def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> bool:
     """Return whether the surface crosses the border of the grid.
 
     The border is that of the fine lattice, half a voxel beyond the outermost samples. So it may be
-    crossed though all samples on it are outside.
+    crossed though all samples on it are outside. Of a part of a grid, ``border`` (2, 3) are the
+    whole grid's first voxels and those after its last ones, counted from the first of the part.
     """
     side = block_ijk(field.factor)
-    for axis, samples in enumerate(field.shape):
-        for voxel, node in ((0, 0), (samples - 1, field.factor)):
+    for axis in range(3):
+        first, after = (0, field.shape[axis]) if border is None else border[:, axis]
+        for voxel, node in ((first, 0), (after - 1, field.factor)):
             at_face = np.flatnonzero(field.voxel_ijk[:, axis] == voxel)
             outer = np.flatnonzero(side[:, axis] == node)
             for chunk in chunks_of(len(at_face), len(outer)):

@@ -114,13 +114,13 @@ class SharedParts:
     table: IntArray  # (27, D), neighbour table of the D voxels, -1 where there is no neighbour
     owner: NDArray[np.int8]  # (27, D), of each part, as a place: ``CENTRE`` is the voxel itself
 
-    def owned(self, rows: slice = slice(None)) -> BoolArray:
+    def owned(self, rows: slice | BoolArray = slice(None)) -> BoolArray:
         """Return which parts voxels own, (27, n) bool."""
         own: BoolArray = self.owner[:, rows] == CENTRE
         return own
 
-    def count_nodes(self, factor: int, rows: slice = slice(None)) -> int:
-        """Return the number of different nodes."""
+    def count_nodes(self, factor: int, rows: slice | BoolArray = slice(None)) -> int:
+        """Return the number of nodes that voxels own."""
         return int(np.count_nonzero(self.owned(rows), axis=1) @ part_sizes(factor))
 
 
@@ -285,5 +285,5 @@ def pin_to_skipped(blocks: FloatArray, parts: SharedParts, factor: int, skipped:
             wrong = known & ((blocks[node] > 0) != outside)
             if wrong.any():
                 blocks[node, wrong] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
-                changed += np.count_nonzero(wrong & (parts.owner[part] == CENTRE))
+                changed += int(np.count_nonzero(wrong & (parts.owner[part] == CENTRE)))
     return changed

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from pyfqmr import Simplify
 
 from ..arrays import BoolArray
-from ..surface.mesh import Mesh
-from ..surface.topology import irregular_places, row_keys
+from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid
 from .measuring import Original, mean_side
 
@@ -291,3 +290,28 @@ def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any])
     number[extra] = len(moved) + np.arange(len(extra))
     faces = np.concatenate([collapsed.astype(np.int32), number[mesh.faces[kept]]])
     return Mesh(np.concatenate([vertices, mesh.vertices[extra]]), faces)
+
+
+def irregular_places(mesh: Mesh) -> NDArray[np.float64]:
+    """Return where a mesh is no closed manifold, (n, 6): the two ends of an edge, or a point twice.
+
+    These are the edges, in the direction of their triangle, without exactly one triangle that
+    passes them in the other direction, and the vertices at which several fans of triangles meet, or
+    that are at the position of another one, or at which two triangles have the same three corners.
+    """
+    positions, faces = mesh.vertices.astype(np.float64), mesh.faces
+    opposite, _, _ = mesh.pair_edges()
+    fans = mesh.count_fans(opposite)
+    unpaired = np.flatnonzero(opposite < 0)
+    start, end = faces.ravel()[unpaired], np.roll(faces, -1, axis=1).ravel()[unpaired]
+    pinched = np.flatnonzero(fans > 1)
+    doubled = _doubled(np.sort(faces, axis=1).astype(np.float64))
+    both = np.concatenate([pinched, _doubled(positions), faces[doubled].astype(np.intp).ravel()])
+    ends = np.concatenate([start, both]), np.concatenate([end, both])
+    return np.concatenate([positions[ends[0]], positions[ends[1]]], axis=1)
+
+
+def _doubled(rows: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return the rows that are equal to another row."""
+    _, inverse, uses = np.unique(row_keys(rows), return_inverse=True, return_counts=True)
+    return np.flatnonzero(uses[inverse] > 1)

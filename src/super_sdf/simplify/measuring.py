@@ -12,8 +12,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from ..surface.mesh import Mesh
-from ..surface.topology import row_keys
+from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Distances, Points, Solid
 
 POINTS_AT_ONCE = 1 << 18

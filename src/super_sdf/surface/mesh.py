@@ -114,6 +114,54 @@ class Mesh:
                 root = above
         return len(np.unique(root[self.faces[:, 0]])), root
 
+    def pair_edges(self) -> tuple[IntArray, NDArray[np.intp], int]:
+        """Find the neighbour of each triangle across each of its edges, by sorting all edges.
+
+        Returns
+        -------
+        (3 m,) int32
+            The other half of each half-edge; half-edge 3 f + i runs from corner i of face f to the
+            next corner. -1 if the edge is not shared by exactly two triangles that pass it in
+            opposite directions.
+        (e,) int
+            How many triangles each edge has.
+        int
+            The number of edges that two triangles pass in the same direction.
+        """
+        faces = self.faces
+        start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+        key = np.minimum(start, end).astype(np.int64) * len(self.vertices) + np.maximum(start, end)
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        order = order.astype(np.int32)  # meshes are large: half of the memory
+        first = np.flatnonzero(np.append(True, key[1:] != key[:-1]))
+        uses = np.diff(np.append(first, faces.size))
+        pair = first[uses == 2]
+        one, other = order[pair], order[pair + 1]
+        against = start[one] == end[other]
+        opposite = np.full(faces.size, -1, np.int32)
+        opposite[one[against]], opposite[other[against]] = other[against], one[against]
+        return opposite, uses, int((~against).sum())
+
+    def count_fans(self, opposite: IntArray) -> NDArray[np.int64]:
+        """Return for each vertex, (n,), how many fans of triangles meet there: 1 in a manifold.
+
+        The half-edges of a vertex are walked from triangle to triangle, in steps of 1, 2, 4, ... A
+        fan is a cycle, counted at its lowest half-edge, or ends at an edge without a neighbour.
+        ``opposite`` is from ``pair_edges``.
+        """
+        start, half = self.faces.ravel(), np.arange(self.faces.size, dtype=np.int32)
+        step = opposite[half.reshape(-1, 3)[:, [2, 0, 1]].ravel()]
+        ends = step < 0
+        step = np.where(ends, half, step)
+        lowest, count = half, len(self.vertices)
+        for _ in range(int(np.bincount(start).max(initial=1)).bit_length()):
+            lowest = np.minimum(lowest, lowest[step])
+            step = step[step]
+        cycles = (lowest == half) & ~ends[step]
+        one_of_each = np.concatenate([start[ends], start[cycles]])
+        return np.bincount(one_of_each, minlength=count)
+
 
 def check_mesh(mesh: Any) -> None:
     """Raise OptionTypeError if ``mesh`` is not a ``Mesh``."""
@@ -129,6 +177,18 @@ def join_meshes(pieces: list[Mesh]) -> Mesh:
         np.concatenate([piece.vertices for piece in pieces]),
         np.concatenate([piece.faces for piece in pieces]),
     )
+
+
+def row_keys(rows: NDArray[np.float64]) -> NDArray[np.uint64]:
+    """Return a hash of each row of numbers, (n,): equal rows have equal ones, others hardly ever.
+
+    Zeros of either sign are equal.
+    """
+    keys = np.zeros(len(rows), np.uint64)
+    for column in np.ascontiguousarray(rows.T + 0.0).view(np.uint64):
+        keys = (keys ^ column) * np.uint64(0x9E3779B97F4A7C15)
+        keys ^= keys >> np.uint64(29)
+    return keys
 
 
 def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float64]:

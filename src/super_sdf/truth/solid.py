@@ -9,14 +9,17 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import igl
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import MeshError
 from ..surface.mesh import Mesh
 from .mesh_files import read_mesh
+
+if TYPE_CHECKING:
+    import igl
 
 Points = NDArray[np.float64]
 Distances = NDArray[np.float64]
@@ -44,12 +47,16 @@ class Solid:
 
     @cached_property
     def _triangles(self) -> igl.AABB:
+        import igl
+
         tree = igl.AABB()
         tree.init(self.mesh.vertices, self.mesh.faces)
         return tree
 
     @cached_property
     def _winding(self) -> igl.FastWindingNumberBVH:
+        import igl
+
         tree = igl.FastWindingNumberBVH()
         tree.init(self.mesh.vertices, self.mesh.faces)
         return tree

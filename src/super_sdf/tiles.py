@@ -1,0 +1,293 @@
+"""A grid that is too large for the memory, or for one machine, as tiles: cut, and joined again.
+
+A tile is a box of samples with a margin as wide as all that a vertex depends on; it is refined as a
+grid of its own. The lattice of samples is parted by the tiles without their margins. A vertex
+belongs to the tile that has the node of its key (see ``surface.extract``), a triangle to that of its
+smallest key; the position of a vertex is that of its owner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .arrays import BoolArray
+from .errors import MeshError, OptionError, OutOfMemoryError
+from .grid.sdf_grid import SdfGrid
+from .options import SHARP, MesherName
+from .refine import bounds, spheres, spline
+from .refine.survey import BandSummary
+from .surface.extract import KEYS_PER_NODE, reach_in_voxels
+from .surface.mesh import Mesh
+from .threads import check_count, held_memory, in_words, memory_bound
+
+Index = tuple[int, int, int]
+Box = tuple[Index, Index]
+"""From the lowest index to before the highest."""
+LEAST_SIDE = 8  # samples of a tile without its margin: smaller ones are nearly all margin
+ON_BORDER = 1e-2  # voxels: open edges so near to the border of the grid end there
+
+
+@dataclass(frozen=True)
+class Tile:
+    """A box of samples, from the lowest index to before the highest, with and without margin."""
+
+    low: Index
+    high: Index
+    inner_low: Index
+    inner_high: Index
+
+    def __str__(self) -> str:
+        box = zip(self.inner_low, self.inner_high)
+        return "the tile of samples " + ", ".join(f"{low} to {high - 1}" for low, high in box)
+
+    def owns(self, voxel_ijk: NDArray[np.integer]) -> BoolArray:
+        """Return which voxels (n, 3) belong to the tile, (n,)."""
+        inside: BoolArray = ((voxel_ijk >= self.inner_low) & (voxel_ijk < self.inner_high)).all(1)
+        return inside
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """The mesh of a tile: vertices that it owns, and others that its triangles use."""
+
+    tile: Tile
+    mesh: Mesh
+    keys: NDArray[np.int64]  # (n,), of its vertices
+    mine: BoolArray  # (n,), which of these it owns
+    counts: dict[str, int]  # see ``FineField``
+    leaves: bool  # whether the solid leaves the whole grid
+    is_cut: bool  # whether the surface leaves the grid there, or may end at unknown samples
+    worker: str = ""  # the process that made it, if that was another one
+
+    @classmethod
+    def without_surface(cls, tile: Tile) -> Part:
+        """Return the part of a tile in which no surface is."""
+        mesh = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
+        return cls(tile, mesh, np.empty(0, np.int64), np.empty(0, bool), {}, False, False)
+
+    def __str__(self) -> str:
+        return str(self.tile) + f" ({self.worker})" * bool(self.worker)
+
+
+@dataclass(frozen=True)
+class Room:
+    """How many voxels of the band fit in the memory that may be taken."""
+
+    bound: float  # bytes that the process may hold
+    held: int  # bytes that it holds
+    per_voxel: float  # bytes for each voxel of a tile's band, measured ...
+    per_mesh: float  # ... and of the mesh, while it is joined
+
+    @classmethod
+    def of(
+        cls,
+        max_memory: int | None,
+        factor: int,
+        mesher: MesherName,
+        network_bytes: tuple[float, float],
+    ) -> Room:
+        """Return the room for a mesher and a network, with its bytes per voxel and per value."""
+        bound, values = memory_bound(max_memory), (factor + 1) ** 3
+        run = network_bytes[0] + network_bytes[1] * values
+        fit = 700 + 5.5 * values
+        mesh = 350 + 4.5 * values + factor**2 * (60 if mesher == SHARP else 25)
+        held = held_memory() or 0
+        return cls(bound or np.inf, held, max(run, fit, mesh), 30.0 * factor**2)
+
+    @property
+    def voxels(self) -> float:
+        """The voxels that can be refined in one piece."""
+        return (self.bound - self.held) / (self.per_voxel + self.per_mesh)
+
+    def beside(self, whole: BandSummary) -> float:
+        """Return the voxels that a tile may have beside the mesh of the whole grid."""
+        left = self.bound - self.held - self.per_mesh * float(whole.cells.sum())
+        return left / self.per_voxel
+
+    def refusal(self, voxels: int, whole: BandSummary) -> OutOfMemoryError:
+        """Return the error for tiles with so many voxels."""
+        count = int(whole.cells.sum())
+        need = self.held + self.per_mesh * count + self.per_voxel * voxels
+        return OutOfMemoryError(
+            f"{count:,} voxels near the surface need {in_words(1.03 * need)} of memory even in the "
+            f"smallest tiles, {in_words(self.bound)} may be used; use a smaller factor, or allow "
+            "more (--max-memory)"
+        )
+
+
+def margin_of(
+    grid: SdfGrid, receptive_field: int | None, mesher: MesherName, factor: int
+) -> int:
+    """Return how many samples to every side a tile's vertices and triangles depend on."""
+    if receptive_field is None:
+        raise OptionError(
+            "the network states no receptive field, so it has to see the whole grid at once, and "
+            "that does not fit: allow more memory (--max-memory), or use another network"
+        )
+    seen = max(receptive_field, bounds.REACH_OF_SAMPLES)
+    if grid.field.smooth is not None:
+        seen = max(seen, spline.BEYOND)
+    fitted = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS
+    return seen + fitted + reach_in_voxels(mesher, factor) + 1
+
+
+def plan(
+    shape: Index, summary: BandSummary, margin: int, room: Room | None = None, least: int = 1
+) -> list[Tile]:
+    """Cut a grid into tiles that each fit in the memory, ``least`` or more of them.
+
+    The largest is cut first, along its longest axis, with as many voxels on either side. Boxes
+    without voxels are left out. OutOfMemoryError if the smallest tiles do not fit.
+    """
+    cells, side, most = summary.cells, summary.side, room.beside(summary) if room else np.inf
+    before = np.zeros([n + 1 for n in cells.shape], np.int64)  # voxels in all cells before
+    before[1:, 1:, 1:] = cells.cumsum(0).cumsum(1).cumsum(2)
+
+    def seen(box: Box) -> int:
+        """Return the voxels in a box of cells and in its margin."""
+        low = [max(n * side - margin, 0) // side for n in box[0]]
+        high = [min(-(-(n * side + margin) // side), m) for n, m in zip(box[1], cells.shape)]
+        part = before[np.ix_(*zip(low, high))]
+        return int(np.diff(np.diff(np.diff(part, axis=0), axis=1), axis=2).sum())
+
+    boxes: list[Box] = [((0, 0, 0), as_index(cells.shape))]
+    done: list[Box] = []
+    while boxes:
+        boxes.sort(key=seen)
+        box = boxes.pop()
+        needed = seen(box)
+        if needed <= most and len(boxes) + len(done) + 1 >= least:
+            done += [box, *boxes]
+            break
+        if halves := _halves(box, cells, -(-LEAST_SIDE // side)):
+            boxes += halves
+        elif room is None or needed <= most:
+            done.append(box)
+        else:
+            raise room.refusal(needed, summary)
+    tiles = []
+    for low, high in sorted(done):
+        inner_low, inner_high = np.array(low) * side, np.minimum(np.array(high) * side, shape)
+        around, beyond = np.maximum(inner_low - margin, 0), np.minimum(inner_high + margin, shape)
+        tiles.append(Tile(*map(as_index, (around, beyond, inner_low, inner_high))))
+    return tiles
+
+
+def _halves(box: Box, cells: NDArray[np.int64], least: int) -> list[Box]:
+    """Return the halves of a box of cells that have voxels; none if it is too small to be cut."""
+    low, high = box
+    part = cells[tuple(map(slice, low, high))]
+    axis = int(np.argmax(part.shape))
+    if part.shape[axis] < 2 * least:
+        return []
+    count = np.moveaxis(part, axis, 0).sum((1, 2)).cumsum()
+    at = int(np.searchsorted(count, count[-1] / 2)) + 1
+    at = low[axis] + min(max(at, least), part.shape[axis] - least)
+    middle, start = list(high), list(low)
+    middle[axis] = start[axis] = at
+    halves = (low, as_index(middle)), (as_index(start), high)
+    return [half for half in halves if cells[tuple(map(slice, *half))].any()]
+
+
+def as_index(numbers: Iterable[Any]) -> Index:
+    """Return one whole number per axis."""
+    i, j, k = map(int, numbers)
+    return i, j, k
+
+
+def voxels_of(keys: NDArray[np.int64], shape: Index, factor: int) -> NDArray[np.int64]:
+    """Return the voxels (n, 3) in which the nodes of keys lie: in the upper one of two."""
+    lattice = tuple(factor * (n + 2) + 1 for n in shape)
+    node_ijk = np.stack(np.unravel_index(keys // KEYS_PER_NODE, lattice), 1)
+    return np.clip(node_ijk // factor - 1, 0, np.array(shape) - 1)
+
+
+def own_part(
+    mesh: Mesh,
+    keys: NDArray[np.int64],
+    tile: Tile,
+    shape: Index,
+    factor: int,
+    **known: Any,
+) -> Part:
+    """Return what belongs to a tile of the mesh that it makes, which has the margin, too.
+
+    ``known`` are counts and flags of the part.
+    """
+    if tile.inner_low == (0, 0, 0) and tile.inner_high == shape:
+        return Part(tile, mesh, keys, np.ones(len(keys), bool), **known)
+    mine = tile.owns(voxels_of(keys, shape, factor))
+    of_corner = keys[mesh.faces]
+    first = np.take_along_axis(mesh.faces, of_corner.argmin(1)[:, None], 1)[:, 0]
+    faces = mesh.faces[mine[first]]
+    used = mine.copy()
+    used[faces] = True
+    number = np.cumsum(used, dtype=np.int32) - np.int32(1)
+    part = Mesh(mesh.vertices[used], number[faces])
+    return Part(tile, part, keys[used], mine[used], **known)
+
+
+def join(parts: Sequence[Part]) -> Mesh:
+    """Return the mesh of all tiles; MeshError, which names tiles, if two do not meet.
+
+    Vertices come tile by tile, and so do triangles.
+    """
+    if len(parts) == 1:
+        return parts[0].mesh
+    counts = [int(np.count_nonzero(part.mine)) for part in parts]
+    starts = np.cumsum([0, *counts])
+    check_count(int(starts[-1]), "vertices")
+    foreign = np.unique(np.concatenate([part.keys[~part.mine] for part in parts]))
+    place = np.full(len(foreign), -1, np.int32)  # of vertices that other tiles use
+    for part, start in zip(parts, starts.tolist()):
+        keys = part.keys[part.mine]
+        at = np.minimum(np.searchsorted(foreign, keys), len(foreign) - 1)
+        known = np.flatnonzero(foreign[at] == keys) if len(foreign) else at[:0]
+        place[at[known]] = start + known
+    vertices, faces = [], []
+    for part, start, count in zip(parts, starts.tolist(), counts):
+        number = np.empty(len(part.keys), np.int32)
+        number[part.mine] = np.arange(start, start + count)
+        number[~part.mine] = place[np.searchsorted(foreign, part.keys[~part.mine])]
+        if len(number) and number.min() < 0:
+            raise torn([part], f"{np.count_nonzero(number < 0):,} vertices", "lack in those beside")
+        vertices.append(part.mesh.vertices[part.mine])
+        faces.append(number[part.mesh.faces])
+    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def check_closed(
+    mesh: Mesh, lattice: SdfGrid, parts: Sequence[Part], *, cap: bool, ends: bool
+) -> int:
+    """Return how many edges of a mesh are open; MeshError if some are that should not be.
+
+    Open are those on the border of the grid, if there is no ``cap``, and any others if the surface
+    ``ends`` at unknown samples. The mesh is that of the ``parts``, if there are some.
+    """
+    edges = mesh.boundary()
+    if ends or not len(edges):
+        return len(edges)
+    bad = edges
+    if not cap:
+        place = lattice.to_index(mesh.vertices[edges].reshape(-1, 3)).reshape(-1, 2, 3)
+        border = (place < ON_BORDER - 0.5) | (place > np.array(lattice.shape) - 0.5 - ON_BORDER)
+        bad = edges[~border.all(1).any(1)]
+    if len(bad):
+        starts = np.cumsum([np.count_nonzero(part.mine) for part in parts])
+        some = np.unique(np.searchsorted(starts, bad.ravel(), "right")) if len(parts) else ()
+        raise torn([parts[n] for n in some], f"{len(bad):,} edges", "are open")
+    return len(edges)
+
+
+def torn(parts: Sequence[Part], what: str, fault: str) -> MeshError:
+    """Return the error for tiles that do not meet."""
+    where = " in " + " and ".join(map(str, parts[:4])) if parts else ""
+    way = "run it again, and report it if that does not help"
+    if any(part.worker for part in parts):
+        way = "use workers with the same processor, NumPy and onnxruntime"
+    return MeshError(f"the mesh is torn: {what}{where} {fault}; {way}")
