@@ -6,8 +6,17 @@ import numpy as np
 import pytest
 from conftest import ball, trilinear
 
-import super_sdf
-from super_sdf import (SdfGrid, SuperSdfError, extract_mesh, load_network, make_grid, read_grid, reconstruct, upsample, write_mesh)
+from super_sdf import (
+    SdfGrid,
+    SuperSdfError,
+    extract_mesh,
+    load_network,
+    make_grid,
+    read_grid,
+    reconstruct,
+    upsample,
+    write_mesh,
+)
 from super_sdf.errors import GridError, OptionError
 
 ROOT = Path(__file__).parent.parent

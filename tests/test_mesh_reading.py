@@ -13,7 +13,7 @@ from corpus.meshes import off
 from solids import cube, sphere
 
 from super_sdf import Mesh
-from super_sdf.errors import MeshError, SuperSdfError
+from super_sdf.errors import SuperSdfError
 from super_sdf.truth.mesh_files import merged, read_mesh
 from super_sdf.truth.solid import load_solid
 
@@ -68,20 +68,6 @@ def test_files_without_a_solid_are_named(tmp_path, name):
     content, said = WRONG[name]
     (path := tmp_path / name).write_bytes(content)
     assert refusal(SuperSdfError, load_solid, path).startswith(f"{path} {said}")
-
-
-def test_faces_of_vertices_that_are_not_there(tmp_path):
-    trimesh.Trimesh(BOX, FACES + 3, process=False).export(path := tmp_path / "box.ply")
-    assert " has a face of vertex 10, of 8: repair it" in refusal(MeshError, read_mesh, path)
-
-
-def test_a_scene_is_one_mesh(tmp_path):
-    scene = trimesh.Scene([trimesh.Trimesh(BOX + shift, FACES) for shift in (0, 3)])
-    scene.export(tmp_path / "two.glb")
-    solid, notes = load_solid(tmp_path / "two.glb")
-    assert notes == [] and solid.mesh.volume() == pytest.approx(2)
-    points = np.array([[0.0, 0, 0], [3, 3, 3], [1.5, 1.5, 1.5]])
-    assert solid.is_inside(points).tolist() == [1, 1, 0]
 
 
 @pytest.mark.parametrize("size", [1e-9, 1e-3, 1.0, 1e6, 1e25])

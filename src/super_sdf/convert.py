@@ -166,7 +166,9 @@ def convert(
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     no_edges = []
     if options.mesher == SHARP and not lattice.field.has_exact:
-        no_edges = [f"{lattice.field.kind} values show no edges: the mesh is that of marching cubes"]
+        no_edges = [
+            f"{lattice.field.kind} values show no edges: the mesh is that of marching cubes"
+        ]
     return Conversion(
         grid,
         mesh,

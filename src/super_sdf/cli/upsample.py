@@ -32,20 +32,22 @@ Examples:
 MANY = 50_000  # triangles of which simplifying is worth a hint
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
-
 # fmt: off
-@click.command(cls=common.Command, context_settings=common.CONTEXT, epilog=EXAMPLES, help=HELP,
-    short_help="Refine a grid and write its surface as a mesh.")
-@click.argument("source", metavar="IN")
-@click.argument("target", metavar="OUT")
-@common.table_options(*OPTIONS)
-@common.shared("names", "cluster", "jobs", "check")
-@option("--save-field", metavar="FIELD",
-    help="Also write the refined field: .npz for the values near the surface, .vdb for a level set "
-    "of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti.")
-@common.shared("report", "force", "json", "quiet")
-@option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
+TAKES = (
+    click.argument("source", metavar="IN"),
+    click.argument("target", metavar="OUT"),
+    common.table_options(*OPTIONS),
+    common.shared("names", "cluster", "jobs", "check"),
+    option("--save-field", metavar="FIELD",
+        help="Also write the refined field: .npz for the values near the surface, .vdb for a level "
+        "set of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti."),
+    common.shared("report", "force", "json", "quiet"),
+    option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage."),
+)
 # fmt: on
+
+
+@common.make_command("Refine a grid and write its surface as a mesh.", EXAMPLES, *TAKES, text=HELP)
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
     options, watch = common.chosen_options(given), Stopwatch()
@@ -154,7 +156,8 @@ def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:
     lines = [
         f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "
         f"{'closed' if report['closed'] else 'open'}, from {low} to {high}, {seconds}"
-        + hint * (not few and triangles > MANY)
+        + hint
+        * (not few and triangles > MANY)
     ]
     if field:
         shape = " x ".join(map(str, field["shape"]))
