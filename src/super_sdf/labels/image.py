@@ -52,7 +52,8 @@ class LabelImage:
 
     def volumes(self) -> list[float]:
         """Return the volume of each label's samples, each of which counts as a box."""
-        return (self.counts * float(np.prod(self.grid.spacing))).tolist()
+        box = float(np.prod(self.grid.spacing))
+        return [count * box for count in self.counts.tolist()]
 
 
 def find_image(

@@ -276,7 +276,8 @@ def _on_edges(
     share[within] = np.where(none, 0.5, one / np.where(none, 1, one + other))
     share = np.clip(share, CLEARANCE, 1 - CLEARANCE)
     begin, stop = (np.clip(end.astype(float), -CAP_HEIGHT, last + CAP_HEIGHT) for end in ends)
-    return begin + share[:, None] * (stop - begin)
+    places: NDArray[np.float64] = begin + share[:, None] * (stop - begin)
+    return places
 
 
 def _with_inner_points(
