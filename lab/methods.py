@@ -17,17 +17,15 @@ from scipy import ndimage
 from super_sdf.arrays import FloatArray, IntArray
 from super_sdf.errors import NoSurfaceError, OptionError
 from super_sdf.grid.sdf_grid import SdfGrid
-from super_sdf.surface.mesh import Mesh
 from super_sdf.network.decoder import Decoder
 from super_sdf.options import DEFAULT_MESHER, MARCHING, SHARP
-from super_sdf.pipeline import reconstruct, refine
-from super_sdf.simplify.simplify import simplify_mesh
-from super_sdf.slabs.cutting import whole
+from super_sdf.pipeline import extract_mesh, reconstruct, refine_band
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField, SampleSpheres
-from super_sdf.surface.extract import extract_mesh
 from super_sdf.refine.nodes import block_ijk, share_parts
 from super_sdf.refine.survey import survey
+from super_sdf.simplify.simplify import simplify_mesh
+from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import grid_points
 
 from .kinds import BY_METHOD, KINDS
@@ -95,7 +93,7 @@ def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
     """
     band = survey(grid)
     band = replace(band, decoded=np.ones(len(band.voxel_ijk), bool))
-    fine = refine(band, network, factor, whole(band))
+    fine = refine_band(band, network, factor)
     nodes = factor * fine.voxel_ijk[:, None] + block_ijk(factor)  # (V, Q, 3)
     field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
     world = fine.values * np.float32(grid.voxel_size / 2)
@@ -120,7 +118,7 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     blocks = np.stack(values) * np.float32(2 / side)
     middle = blocks[len(block) // 2]
     spheres = SampleSpheres(shape, voxel_ijk, middle)
-    fine = FineField(shape, factor, voxel_ijk, blocks, parts, (0, shape[0]), spheres=spheres)
+    fine = FineField(shape, factor, voxel_ijk, blocks, parts, spheres=spheres)
     grid = SdfGrid.trusted(_node_of_blocks(field, block[0], factor), side, low + side / 2)
     return extract_mesh(fine, grid, mesher=SHARP)
 

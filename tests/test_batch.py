@@ -3,182 +3,145 @@
 import hashlib
 import json
 import os
+import random
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import trimesh
-from batches import CONSTANT, FAST, LONE, PLAIN, files, rows
+from batches import CONSTANT, FAST, LONE, files, rows
 from conftest import ball
-from onnx_files import entry
+from planted import COMMAND, run_beside_planted_files
+from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines
 
 from super_sdf.batch import job as batch_job
-from super_sdf.batch.job import Result, Settings
-from super_sdf.batch.ledger import fingerprint, is_unchanged
-from super_sdf.batch.plan import Batch
-from super_sdf.cli.batch_report import describe_progress, duration
+from super_sdf.batch.inputs import find_jobs
+from super_sdf.batch.pool import Death, work_in_processes
+from super_sdf.batch.run import count_workers
 from super_sdf.convert import convert
-from super_sdf.files.regular import files_of
+from super_sdf.errors import SuperSdfError
+from super_sdf.files.formats import GRID_SUFFIXES
+from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.network.network import shipped_models
+from super_sdf.options import BATCH_LISTS, Options
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
+SMALL = (*FAST, "--factor", 2, "--spacing", 1)
 
 
-def test_folders_are_mirrored_failures_named_and_meshes_those_of_single_runs(run_batch, command):
-    code, out, err = run_batch("in")
-    assert (code, out) == (1, "")
-    assert err == (
-        f"Failed: in/bad.npy: {CONSTANT}\n"
-        f"Note: 1 have notes on how they were read: see {Path('out/report.jsonl')}\n"
-        "3 done, 1 failed; 3 meshes closed, 0 open\n"
+@pytest.fixture
+def batch(command):
+    """Run a batch on a single process; return the exit code, the summary, and what stderr says."""
+
+    def go(*words, out="out"):
+        network = () if "--model" in words else FAST
+        code, said, err = command("batch", *words, "--out", out, *LONE[:-2], *network, "--json")
+        return code, json.loads(said), err
+
+    return go
+
+
+def contents(folder="out"):
+    """Return the bytes of the files in a folder that are not hidden."""
+    return {
+        name: Path(folder, name).read_bytes() for name in files(folder) if name != "report.jsonl"
+    }
+
+
+def is_made(row, folder="out"):
+    """Return whether the files of a row are there with the content that it says."""
+    known = {row["out"]: row["output"]} if "sha256" in row["output"] else row["output"]
+    return all(
+        hashlib.sha256(Path(folder, name).read_bytes()).hexdigest() == each["sha256"]
+        for name, each in known.items()
     )
+
+
+# Files, folders, patterns, lists
+
+
+def test_folders_are_mirrored_failures_named_and_meshes_those_of_single_runs(batch, command):
+    code, facts, err = batch("in")
+    assert code == 1 and f"Failed: in/bad.npy: {CONSTANT}\n" in err
+    assert (facts["done"], facts["failed"], facts["closed"]) == (3, 1, 3)
     made = {"a.ply": "a.npy", "deep/b.ply": "deep/b.npz", "deep/er/c.d.ply": "deep/er/c.d.npy"}
-    assert files().keys() == made.keys() | {"report.jsonl"}
-    code, _, _ = command("batch", "in", "--out", "two", *LONE[2:], "--threads", 1, "--jobs", 2)
-    assert code == 1 and files("two").keys() == files().keys()
+    assert contents().keys() == made.keys()
+    assert not list(Path("out").rglob(".super-sdf-parts"))
     for mesh, grid in made.items():
         command("upsample", f"in/{grid}", "single.ply", *LONE[2:], "--force")
-        single = Path("single.ply").read_bytes()
-        assert single == Path("out", mesh).read_bytes() == Path("two", mesh).read_bytes()
-
-
-def test_the_report_holds_a_row_a_file_and_a_rerun_does_nothing(run_batch):
-    run_batch("in")
+        assert Path("single.ply").read_bytes() == Path("out", mesh).read_bytes()
     by_name = {row["out"]: row for row in rows()}
-    assert len(rows()) == len(by_name) == 4
-    mesh, row = trimesh.load("out/a.ply"), by_name["a.ply"]
-    assert (row["vertices"], row["triangles"]) == (len(mesh.vertices), len(mesh.faces))
-    assert row["in"] == os.path.abspath("in/a.npy") and row["status"] == "ok" and row["closed"]
-    assert row["content"] == fingerprint(Path("in/a.npy"))
-    assert row["output"] == fingerprint(Path("out/a.ply"))
-    assert by_name["deep/er/c.d.ply"]["closed"] and by_name["deep/er/c.d.ply"]["capped"]
+    assert len(rows()) == len(by_name) == 4 and is_made(by_name["a.ply"])
+    assert by_name["a.ply"]["in"] == os.path.abspath("in/a.npy") and by_name["a.ply"]["closed"]
+    assert by_name["a.ply"]["triangles"] == len(trimesh.load("out/a.ply").faces)
     bad = by_name["bad.ply"]
     assert (bad["status"], bad["reason"], bad["retry"]) == ("failed", CONSTANT, False)
-    before, report = files(), rows()
-    code, _, err = run_batch("in")
-    assert (code, files(), rows()) == (1, before, report)
-    assert err == (
-        f"Failed: in/bad.npy: {CONSTANT}\nnothing to do: 3 done before, 1 failed before "
-        "(--retry tries again); 3 meshes closed, 0 open\n"
-    )
-    os.remove("in/bad.npy")
-    want = "nothing to do: 3 done before; 3 meshes closed, 0 open\n"
-    assert run_batch("in") == (0, "", want)
+    before = files(), rows()
+    code, facts, _ = batch("in")
+    assert code == 1 and facts["done_before"] == 3 and (files(), rows()) == before
 
 
-def test_what_has_changed_is_done_again(run_batch, monkeypatch):
+def test_what_has_changed_is_done_again(batch):
     def redone(*arguments):
         """Return the outputs that another run makes."""
         before = len(rows())
-        run_batch("in", *arguments)
+        batch("in", *arguments)
         return [row["out"] for row in rows()[before:]]
 
-    run_batch("in")
+    batch("in")
     np.save("in/a.npy", ball(12, 3.2).values)
     assert redone() == ["a.ply"]
     os.utime("in/a.npy")
-    Path("in/a.npy").rename("in/moved.npy")
-    Path("in/moved.npy").rename("in/a.npy")
     assert redone() == []
     Path("out/deep/b.ply").unlink()
     assert redone() == ["deep/b.ply"]
     assert redone("--retry") == ["bad.ply"]
-    assert len(redone("--offset", 0.5)) == 4
+    assert redone("--fail-fast") == [] and len(redone("--offset", 0.5)) == 4
     assert redone("--offset", 0.5, "--threads", 1) == []
-    assert run_batch("in/a.npy", "--offset", 100)[0] == 1  # a failure between
-    assert redone("--offset", 0.5) == ["a.ply"] and rows()[-1]["status"] == "ok"
-    assert "4 to do" in run_batch("in", "--offset", 0.5, "--force", "--dry-run")[2]
-    monkeypatch.setattr("super_sdf.batch.plan.__version__", "next")
-    assert "4 to do" in run_batch("in", "--offset", 0.5, "--dry-run")[2]
-
-
-def test_a_mesh_that_was_changed_is_replaced_by_force_only(run_batch):
-    run_batch("in/a.npy")
-    made = Path("out/a.ply").read_bytes()
-    os.utime("out/a.ply")
-    assert "nothing to do: 1 done before" in run_batch("in/a.npy")[2]  # as it was made
-    Path("out/a.ply").write_bytes(made[:-1] + b"x")
-    why = "out/a.ply exists and was changed after a batch made it: remove it or use --force"
-    for options in ((), ("--offset", 0.5), ("--retry",)):
-        code, _, err = run_batch("in/a.npy", *options)
-        assert code == 1 and err.startswith(f"Failed: in/a.npy: {why}\n") and "1 refused" in err
-        assert Path("out/a.ply").read_bytes() == made[:-1] + b"x"
-    assert "1 to do" in run_batch("in/a.npy", "--dry-run", "--force")[2]
-    assert run_batch("in/a.npy", "--force")[0] == 0 and Path("out/a.ply").read_bytes() == made
-    assert "nothing to do: 1 done before" in run_batch("in/a.npy")[2]
-
-
-def test_each_label_has_a_mesh_of_its_own(run_batch):
-    labels = np.where(ball(12, 4.0).values < 0, 2**64 - 1, 0).astype(np.uint64)
-    labels[5:7, 5:7, 5:7] = 7
-    np.save("labels.npy", labels)
-    for label in (2**64 - 1, 7):
-        assert run_batch("labels.npy", "--label", label)[0] == 0
-    assert sorted(files()) == [f"labels-label{2**64 - 1}.ply", "labels-label7.ply", "report.jsonl"]
-    Path("list.jsonl").write_text(
-        "\n".join(f'{{"in": "labels.npy", "label": {label}}}' for label in (2**64 - 1, 7))
-    )
-    want = "nothing to do: 2 done before; 2 meshes closed, 0 open\n"
-    assert run_batch("list.jsonl") == (0, "", want)
-
-
-MHD = "ObjectType = Image\nNDims = 3\nDimSize = 12 12 12\nElementType = MET_FLOAT\n"
-NRRD = "NRRD0004\ntype: float\ndimension: 3\nsizes: 12 12 12\nendian: little\nencoding: raw\n"
-SLICES = "\n".join(f"part {z}.raw" for z in range(12))
-HEADERS = {
-    "x.mhd": (f"{MHD}ElementDataFile = part of it.raw\n", ["part of it.raw"]),
-    "pattern.mhd": (
-        f"{MHD}ElementDataFile = p[%02d.raw 0 11 1\n",
-        [f"p[{z:02}.raw" for z in range(12)],
-    ),
-    "x.nrrd": (f"{NRRD}datafile:x.raw\n", ["x.raw"]),
-    "list.nhdr": (f"{NRRD}data file: LIST\n{SLICES}\n", SLICES.split("\n")),
-}
-
-
-@pytest.mark.parametrize("name", HEADERS)
-def test_the_fingerprint_of_a_header_covers_its_data(name):
-    text, parts = HEADERS[name]
-    Path(name).write_text(text)
-    alone = fingerprint(Path(name))
-    Path("other.raw").write_text("of no header")
-    assert alone["sha256"] == hashlib.sha256(text.encode()).hexdigest()
-    for part in parts:
-        Path(part).write_text("x")
-    known = fingerprint(Path(name))
-    assert known["size"] == alone["size"] + len(parts) and is_unchanged(Path(name), known)
-    assert files_of(name) == [Path(name), *sorted(map(Path, parts))]
-    for part in parts:
-        before = os.stat(part).st_mtime_ns
-        Path(part).write_text("y")
-        os.utime(part, ns=(before + 1, before + 1))  # such as a copy that keeps its time
-        assert not is_unchanged(Path(name), known)
-        Path(part).write_text("x")
-        assert is_unchanged(Path(name), known)
-
-
-def test_the_fingerprint_of_a_network_covers_weights_beside_it_and_is_an_option(run_batch):
-    """Their names are those of entries "location" of its tensors; see onnx.proto."""
-    names = ["weights.bin", "more weights.bin"]
-    found = [entry(1, "location") + entry(2, name) for name in (*names, "not there.bin")]
-    Path("own.onnx").write_bytes(b"".join(entry(13, each) for each in found))
-    for name in names:
-        Path(name).write_text("x")
-    assert files_of("own.onnx") == [Path("own.onnx"), *sorted(map(Path, names))]
+    facts = batch("in", "--offset", 0.25, "--dry-run")[1]
+    assert facts["made_again"] == {"outputs": 3, "options": ["offset"]}
+    assert len(facts["to_do"]) == 4 and len(redone("--offset", 0.5, "--force")) == 4
     shutil.copy(shipped_models()["fast"], "own.onnx")
-    run_batch("in/deep", "--model", "own.onnx")
+    batch("in/deep", "--model", "own.onnx", out="own")
     shutil.copy(shipped_models()["base"], "own.onnx")
-    assert "2 to do" in run_batch("in/deep", "--model", "own.onnx", "--dry-run")[2]
+    assert len(batch("in/deep", "--model", "own.onnx", "--dry-run", out="own")[1]["to_do"]) == 2
 
 
-def test_an_input_is_never_written_over(run_batch):
+def test_files_that_no_batch_made_or_that_were_changed_are_replaced_by_force_only(batch):
     Path("out").mkdir()
-    os.link(Path("in/deep/b.npz").absolute(), "out/a.ply")
-    before = Path("in/deep/b.npz").read_bytes()
-    code, _, err = run_batch("in", "--force")
-    want = "Failed: in/a.npy: out/a.ply is the same file as in/deep/b.npz: remove that link\n"
-    assert code == 1 and want in err and Path("in/deep/b.npz").read_bytes() == before
+    Path("out/a.ply").write_text("mine")
+    for _ in range(2):
+        code, _, err = batch("in/a.npy")
+        assert code == 1 and "out/a.ply exists and was not made by a batch: remove it or" in err
+        assert Path("out/a.ply").read_text() == "mine" and len(rows()) == 1
+    assert batch("in/a.npy", "--force")[0] == 0
+    made = Path("out/a.ply").read_bytes()
+    Path("out/a.ply").write_bytes(made[:-1] + b"x")
+    for options in ((), ("--offset", 0.5), ("--retry",)):
+        assert "was changed after a batch made it: remove it or" in batch("in/a.npy", *options)[2]
+        assert Path("out/a.ply").read_bytes() == made[:-1] + b"x"
+    assert batch("in/a.npy", "--force")[0] == 0 and Path("out/a.ply").read_bytes() == made
+    assert batch("in/a.npy", "--offset", 0.5)[0] == 0  # its own, of other options
+    Path("out/a.ply").unlink()
+    Path("out/a.ply").symlink_to("../in/a.npy")
+    assert "out/a.ply is a link: remove it" in batch("in/a.npy", "--force")[2]
+    assert Path("in/a.npy").stat().st_size > 1000
+
+
+def test_a_file_that_appears_meanwhile_is_kept(batch, monkeypatch):
+    def interfere(source, *rest, **options):
+        Path("out/a.ply").write_text("mine")
+        return convert(source, *rest, **options)
+
+    monkeypatch.setattr(batch_job, "convert", interfere)
+    for _ in range(2):
+        assert batch("in/a.npy")[0] == 1 and Path("out/a.ply").read_text() == "mine"
 
 
 @pytest.mark.parametrize(
@@ -189,7 +152,7 @@ def test_an_input_is_never_written_over(run_batch):
     ],
 )
 def test_what_was_not_the_inputs_fault_stops_nothing_and_is_tried_again(
-    run_batch, monkeypatch, error, reason
+    batch, monkeypatch, error, reason
 ):
     def fail(source, *rest, **options):
         if source.name == "a.npy":
@@ -197,101 +160,428 @@ def test_what_was_not_the_inputs_fault_stops_nothing_and_is_tried_again(
         return convert(source, *rest, **options)
 
     monkeypatch.setattr(batch_job, "convert", fail)
-    code, _, err = run_batch("in")
-    assert code == 1 and f"Failed: in/a.npy: {reason}\n" in err
-    assert err.endswith("2 done, 2 failed; 2 meshes closed, 0 open\n")
+    code, facts, err = batch("in")
+    assert code == 1 and f"Failed: in/a.npy: {reason}\n" in err and facts["done"] == 2
     monkeypatch.setattr(batch_job, "convert", convert)
-    assert run_batch("in/a.npy") == (0, "", "1 done, 0 failed; 1 meshes closed, 0 open\n")
+    assert batch("in/a.npy")[:1] == (0,)
 
 
-def test_two_inputs_for_one_output_are_refused_and_one_named_twice_is_one(run_batch):
+def test_two_inputs_for_one_output_are_refused_and_one_named_twice_is_one(batch, command):
     shutil.copy("in/deep/b.npz", "in/a.npz")
-    want = (
-        "Error: in/a.npy and in/a.npz would both become a.ply: rename one, or give 'out' in a "
-        ".jsonl manifest\n"
-    )
-    assert run_batch("in") == (2, "", want) and not Path("out").exists()
-    assert run_batch("in/a.npy", "in/a.npy", Path("in/a.npy").absolute())[0] == 0
+    _, _, err = command("batch", "in", "--out", "out")
+    assert "in/a.npy and in/a.npz would both become a.ply: rename one, or give 'out' in" in err
+    assert not Path("out").exists()
+    assert batch("in/a.npy", "in/a.npy", Path("in/a.npy").absolute())[1]["done"] == 1
 
 
-def test_a_dry_run_says_what_would_be_done_and_writes_nothing(run_batch):
-    code, out, err = run_batch("in", "--dry-run")
-    assert code == 0 and f"to do: in/a.npy -> {Path('out/a.ply')}\n" in out
-    assert err == "4 to do, 0 done before, 0 failed before, 0 refused\n" and out.count("\n") == 4
+def test_a_dry_run_says_what_would_be_done_and_writes_nothing(batch):
+    assert batch("in", "--dry-run")[1]["to_do"][0].keys() == {"in", "out"}
     assert not Path("out").exists()
     Path("in/list.txt").write_text("bad.npy\ndeep/b.npz\ndeep/er/c.d.npy")
-    run_batch("in/list.txt")
+    batch("in/list.txt")
     Path("out/a.ply").write_text("mine")
     np.save("in/new.npy", ball(12, 3.0).values)
-    before, counts = files(), "1 to do, 2 done before, 1 failed before, 1 refused\n"
-    _, out, err = run_batch("in", "in/new.npy", "--dry-run")
-    assert f"done before: in/deep/b.npz -> {Path('out/deep/b.ply')}\n" in out and err == counts
-    assert f"failed before: in/bad.npy: {CONSTANT}\n" in out and "refused: in/a.npy: " in out
-    code, out, err = run_batch("in", "--dry-run", "--json")
-    plan = json.loads(out)
-    assert code == 0 and err == counts and files() == before
-    assert plan["to_do"] == [{"in": os.path.abspath("in/new.npy"), "out": "new.ply"}]
-    assert plan["failed_before"] == [
-        {"in": os.path.abspath("in/bad.npy"), "out": "bad.ply", "reason": CONSTANT}
-    ]
+    before, plan = files(), batch("in", "--dry-run")[1]
+    assert [entry["out"] for entry in plan["to_do"]] == ["new.ply"] and files() == before
+    assert [entry["reason"] for entry in plan["failed_before"]] == [CONSTANT]
     assert [entry["out"] for entry in plan["refused"]] == ["a.ply"] and plan["unread"] == []
 
 
-def test_json_is_the_summary_and_fail_fast_begins_nothing_after_a_failure(run_batch):
-    code, out, err = run_batch("in", "--json", "--quiet", "--open")
-    facts = json.loads(out)
-    assert code == 1 and err == f"Failed: in/bad.npy: {CONSTANT}\n"
-    assert facts.pop("seconds") > 0
-    assert facts == {
-        **{"done": 3, "done_before": 0, "failed": 1, "not_begun": 0, "closed": 2, "open": 1},
-        "made_again": {"outputs": 0, "options": []},
-        "failures": [{"in": os.path.abspath("in/bad.npy"), "out": "bad.ply", "reason": CONSTANT}],
-        "report": str(Path("out/report.jsonl")),
-    }
+def test_fail_fast_begins_nothing_after_a_failure(batch):
     Path("list.jsonl").write_text('{"in": "in/bad.npy"}\n{"in": "in/a.npy"}')
     np.save("in/bad.npy", np.ones((30, 30, 30)))  # the largest goes first
     for _ in range(2):
-        code, _, err = run_batch("list.jsonl", "--fail-fast", out="new")
-        assert code == 1
-        assert err.endswith("\n0 done, 1 failed, 1 not begun; 0 meshes closed, 0 open\n")
-    assert len(rows("new")) == 1
+        code, facts, _ = batch("list.jsonl", "--fail-fast")
+        assert code == 1 and (facts["done"], facts["failed"], facts["not_begun"]) == (0, 1, 1)
 
 
-def test_what_was_noisy_is_said_once_and_of_many_failures_twenty(run_batch, command):
-    noise = np.random.default_rng(0).uniform(-0.3, 0.3, (12, 12, 12))
-    np.save("in/noisy.npy", ball(12, 4.0).values + noise)
-    words = ("batch", "in", "--out", "out", *PLAIN[:4], *FAST)
-    report, (_, _, err) = Path("out/report.jsonl"), command(*words)
-    assert f"Note: 4 have notes on how they were read: see {report}\n" in err
-    assert f"Warning: 1 are from noisy or contradictory values: see {report}\n" in err
-    assert "Note" not in command(*words)[2]
-    for i in range(23):
-        shutil.copy("in/bad.npy", f"in/bad{i}.npy")
-    _, _, err = run_batch("in/bad*.npy", out="more")
-    assert err.count("Failed: ") == 20
-    assert f"and 4 more, see {Path('more/report.jsonl')}\n" in err
+def test_patterns_keep_the_folders_below_their_fixed_part_and_links_in_a_circle_end(batch):
+    for name in "abc":
+        Path("in", name).symlink_to(Path("in").absolute())
+        Path("in/deep", name).symlink_to("..")
+    for words in ("in/**/*.np?", "in"):
+        assert len(batch(words, "--dry-run")[1]["to_do"]) == 4
+    assert len(batch("in/a/*.npy", "--dry-run")[1]["to_do"]) == 2  # named: followed
+    Path("in/.hidden").mkdir()
+    shutil.copy("in/a.npy", "in/.hidden/a.npy")
+    assert len(batch("in/**", "--dry-run")[1]["to_do"]) == 4
+    jobs, _ = find_jobs(["in/de*/er/*.npy", "in/.h*/*.npy"], ".ply", Options())
+    assert [job.target for job in jobs] == ["deep/er/c.d.ply", ".hidden/a.ply"]
+    assert len(find_jobs(["in"], ".ply", Options())[0]) == 5
 
 
-def test_options_are_checked_before_the_work(run_batch, command):
-    code, _, err = command("batch", "in", "--out", "out", "--factor", 3)
-    assert code == 2 and err.startswith("Error: --factor is 3: give an even number")
-    assert command("batch", "in")[0] == 2
+def test_lists_name_files_from_where_they_lie_and_objects_have_options_of_their_own(batch, command):
+    Path("in/list.txt").write_bytes(b"\xef\xbb\xbf# some\r\n\r\n deep/b.npz\r\nnone.npy\n")
+    code, _, err = batch("in/list.txt")
+    assert code == 1 and contents().keys() == {"deep/b.ply"}
+    assert f"Failed: {Path('in/none.npy')} does not exist\n" in err
+    np.save("in/a.npy", -2 * ball(12, 3.0).values)
+    line = {"in": "in/a.npy", "out": "x/y.stl", "spacing": 2, "origin": [1, 2, 3], "factor": 4}
+    lines = [{**line, "inside": "positive", "offset": 1}, {"in": "in/deep/er/c.d.npy"}]
+    Path("list.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    assert batch("list.jsonl")[1]["done"] == 2
+    options = ("--spacing", 2, "--origin", "1,2,3", "--inside", "positive", "--offset", 1)
+    command("upsample", "in/a.npy", "single.stl", *options, "--quality", "fast")
+    assert Path("single.stl").read_bytes() == Path("out/x/y.stl").read_bytes()
+
+
+LISTS = {
+    "": "list.jsonl names no file: give a path a line",
+    "{": "list.jsonl, line 1: no JSON: Expecting property name enclosed in double quotes",
+    "[1]": 'list.jsonl, line 1: [1]: give an object, {"in": "a.npy"}',
+    "[" * 100_000: "list.jsonl, line 1: no JSON: maximum recursion depth exceeded",
+    '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
+    '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': give the path of a grid",
+    '{"in": "a.npy", "out": "report.jsonl/x.ply"}': "a.npy would become report.jsonl/x.ply, but",
+    '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: 'factor' is 3: give an even number",
+    '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
+    + BATCH_LISTS[0],
+    '{"in": "a.npy", "out": "a.xyz"}': "list.jsonl, line 1: 'out' is 'a.xyz': give a file, one of "
+    + MESH_SUFFIXES[0],
+    '{"in": "a.npy", "out": "a/../../b.ply"}': "list.jsonl, line 1: 'out' is 'a/../../b.ply': give",
+    '{"in": "a.npy", "offset": NaN}': "list.jsonl, line 1: 'offset' is nan: give a finite number",
+}
+
+
+@pytest.mark.parametrize("text", LISTS, ids=range(len(LISTS)))
+def test_a_list_without_meaning_is_refused_before_the_work(command, text):
+    Path("list.jsonl").write_text(text)
+    code, _, err = command("batch", "list.jsonl", "--out", "out")
+    assert code == 2 and err.startswith(f"Error: {LISTS[text]}") and err.count("\n") == 1
+    assert not Path("out").exists()
+
+
+def test_arguments_that_name_no_grid_are_refused(command):
+    Path("empty").mkdir()
+    Path("odd.raw").write_text("")
+    kinds = ", ".join(GRID_SUFFIXES)
+    for argument, why in {
+        "none.npy": "does not exist: give grids, folders, patterns or a list",
+        "in/*.raw": f"holds no grid ({kinds})",
+        "empty": f"holds no grid ({kinds})",
+        "odd.raw": f"is neither a grid ({kinds}) nor a list (.txt, .jsonl)",
+    }.items():
+        said = command("batch", "in", argument, "--out", "out")
+        assert said == (2, "", f"Error: {argument} {why}\n")
+
+
+def test_odd_files_and_names_fail_alone(batch):
+    os.mkfifo("in/pipe.npy")
+    Path("in/loop.npz").symlink_to("loop.npz")
+    os.link("in/bad.npy", b"in/bad\n\xff.npy")
+    long = 300 * "n"
+    Path("in/list.jsonl").write_text(
+        f'{{"in": "{long}.npy"}}\n{{"in": "a.npy", "out": "m{long}.ply"}}'
+    )
+    code, facts, err = batch("in", "in/list.jsonl")
+    assert code == 1 and facts["done"] == 3 and facts["failed"] == 6, err
+    assert "Failed: in/pipe.npy is a named pipe: give a file\n" in err
+    assert "Failed: in/loop.npz cannot be read: its links lead in a circle\n" in err
+    assert "Failed: in/bad\\n\\udcff.npy: every value is 1" in err
+    assert f"{Path('out', 'm' + long)}.ply cannot be written: File name too long\n" in err
+
+
+def test_folders_that_cannot_be_read_are_named(batch, monkeypatch):
+    scan = os.scandir
+
+    def refuse(path):
+        if str(path).endswith("deep"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scan(path)
+
+    monkeypatch.setattr(os, "scandir", refuse)
+    code, facts, err = batch("in/", "in/a.npy")
+    assert code == 1 and f"Failed: {Path('in/deep')} cannot be read: permission denied" in err
+    assert facts["done"] == 1 and facts["failures"][-1]["out"] is None
+
+
+# The report
+
+
+@pytest.mark.parametrize("torn", [b'{"in": "x", "out": "a.p', b"\xff\xfe"])
+def test_a_torn_line_is_cut_off_and_its_file_made_again(batch, torn):
+    batch("in")
+    lines = Path("out/report.jsonl").read_bytes().splitlines(keepends=True)
+    Path("out/report.jsonl").write_bytes(b"".join(lines[:-1]) + torn)
+    batch("in", "--force")
+    assert {row["out"] for row in rows()[:4]} == {row["out"] for row in map(json.loads, lines[:3])}
+    assert len(rows()) == 7
+
+
+def test_a_batch_that_was_killed_before_it_moved_a_mesh_makes_it_again(batch, monkeypatch):
+    right = os.replace
+
+    def die(part, path):
+        return sys.exit(9) if Path(path) == Path("out/a.ply") else right(part, path)
+
+    with monkeypatch.context() as patch, pytest.raises(json.JSONDecodeError):
+        patch.setattr(os, "replace", die)
+        batch("in/a.npy")
+    assert len(rows()) == 1 and not Path("out/a.ply").exists()
+    assert batch("in/a.npy")[1]["done"] == 1 and is_made(rows()[-1])
+
+
+@pytest.mark.parametrize("text", [b"a,b\n1,2\n", b'{"in": "a.npy"}\n{"in": "b', b"[]\n"])
+def test_a_report_of_others_is_left_alone(command, text):
+    Path("out").mkdir()
+    Path("out/report.jsonl").write_bytes(text)
+    said = command("batch", "in", "--out", "out", "--force")
+    assert said[0] == 1 and "out/report.jsonl is not a batch's report: move it, or give" in said[2]
+    assert Path("out/report.jsonl").read_bytes() == text and not list(Path("out").glob("*.ply"))
+
+
+def test_lines_of_others_are_passed_over(batch):
+    batch("in/a.npy")
+    report, (row,) = Path("out/report.jsonl"), rows()
+    wrong = {"in": 1, "out": ["a.ply"], "status": None, "retry": "no", "content": "x", "output": 3}
+    damaged = [json.dumps({**row, key: value}).encode() for key, value in wrong.items()]
+    lines = [b"nonsense", b"[1]", 100_000 * b"[", report.read_bytes().strip(), *damaged]
+    report.write_bytes(b"\n".join(lines) + b"\n")
+    assert batch("in/a.npy")[1]["done_before"] == 1
+
+
+def test_without_room_a_mesh_fails_by_its_name_and_a_row_is_an_error(batch):
+    def limited(size):
+        """Convert in a process whose files have so many bytes at most; return code and stderr."""
+        set_limit = "import resource as r, sys; r.setrlimit(r.RLIMIT_FSIZE, ({0}, {0})); "
+        run = "from super_sdf.cli.main import main; main()"
+        words = [sys.executable, "-c", set_limit.format(size) + run, "batch", "in/a.npy", "in/deep"]
+        words += map(str, ("--out", "out", *LONE))
+        done = subprocess.run(words, stderr=subprocess.PIPE, text=True)
+        return done.returncode, done.stderr
+
+    code, err = limited(4000)
+    assert code == 1 and "Traceback" not in err and not list(Path("out").rglob("*.p*"))
+    assert f"Failed: in/a.npy: {Path('out/a.ply')} cannot be written: File too large\n" in err
+    shutil.rmtree("out")
+    batch("in/a.npy")
+    report, mesh = Path("out/report.jsonl"), Path("out/a.ply")
+    row = report.read_bytes().replace(b'"in": "', b'"in": "' + 2 * mesh.stat().st_size * b"x")
+    report.write_bytes(row)  # now there is room for meshes, and not for rows
+    code, err = limited(len(row) + 100)
+    assert code == 1 and err == f"Error: {report} cannot be written: File too large\n"
+    assert report.read_bytes() == row and contents().keys() == {"a.ply"}
+    facts = batch("in/a.npy", "in/deep")[1]
+    assert (facts["done"], facts["done_before"]) == (2, 1)
+
+
+# Processes
+
+
+def answer(task):
+    """Answer a number by its square, and die at a word."""
+    if task == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if task == "ended":
+        os._exit(3)
+    if task == "no network":
+        raise SuperSdfError(task)
+    return task * task
+
+
+def worked(tasks, count=2):
+    """Return what came of tasks in processes."""
+    left = list(tasks)
+    return dict(work_in_processes(lambda: left.pop(0) if left else None, answer, count))
+
+
+def test_a_death_is_the_result_of_its_task_alone():
+    deaths = {
+        "killed": Death("was killed by SIGKILL (most likely out of memory)"),
+        "ended": Death("ended with exit code 3"),
+    }
+    assert worked([1, *deaths, 2, 3]) == {1: 1, 2: 4, 3: 9, **deaths}
+    with pytest.raises(SuperSdfError, match="no network"):
+        worked([1, "no network"])
+    with pytest.raises(SuperSdfError, match="5 processes in a row ended; the last one ended with"):
+        worked(5 * ["ended"], 1)
+
+
+def test_as_many_processes_as_cores_and_memory_allow(monkeypatch):
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 8)
+    monkeypatch.setattr("super_sdf.batch.run.free_memory", lambda: 3_500_000_000)
+    assert [count_workers(0, "cpu", jobs) for jobs in (0, 2, 100)] == [1, 2, 3]
+    assert [count_workers(asked, "cpu", 100) for asked in (6, 200)] == [6, 8]
+    assert count_workers(0, "cuda", 100) == 1
+    assert count_workers(3, "cpu", 100, 700_000_000) == 2
+
+
+def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
+    def deaths(take, work, count):
+        while (job := take()) is not None:
+            yield job, Death("was killed") if job.source.name == "a.npy" else work(job)
+
+    monkeypatch.setattr("super_sdf.batch.run.work_in_processes", deaths)
+    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 2)
+    code, _, err = command("batch", "in", "--out", "out", *SMALL, "--jobs", 2)
+    reason = "the process that converted it was killed, twice"
+    assert code == 1 and f"Failed: in/a.npy: {reason}\n" in err
+    assert [row["out"] for row in rows()][-1] == "a.ply" and len(rows()) == 4  # the others first
+
+
+def start_batch(*options):
+    """Start a batch as a process, and return it when its report has some lines."""
+    words = ("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL, *options)
+    process = start_command(*words)
+    wait_for_lines(process, Path("out/report.jsonl"))
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_batch_that_is_ended_or_killed_leaves_no_process_and_goes_on(number, batch):
+    larger_grids(8)
+    process = start_batch()
+    workers = psutil.Process(process.pid).children()
+    process.send_signal(number)
+    _, err = process.communicate(timeout=PATIENCE)
+    assert len(workers) >= 2 and all_end(workers)
+    if number != signal.SIGKILL:
+        assert process.returncode == 128 + number and err.strip().count("\n") == 0
+        assert err.startswith("Error: ") and err.endswith(
+            "are done and kept; run it again to go on\n"
+        )
+        assert not Path("out/.super-sdf-parts").exists()
+    finished = len(rows())
+    facts = batch("in", "--spacing", 1, "--origin", "0")[1]
+    assert facts["failed"] == 1 and facts["closed"] == 11
+    assert len(rows()) >= 12 and finished >= 2 and not Path("out/.super-sdf-parts").exists()
+
+
+def test_after_kills_at_random_moments_nothing_is_lost_and_nothing_made_twice():
+    """Workers and batches are killed; afterwards each mesh is as its only row says."""
+    larger_grids(20)
+    chance, killed, words = (
+        random.Random(0),
+        0,
+        ("batch", "in", "--out", "out", "--jobs", 2, *SMALL),
+    )
+    for _ in range(4):
+        process = start_command(*words)
+        wait_for_lines(process, Path("out/report.jsonl"), len(rows()) + 1 if killed else 1)
+        time.sleep(chance.uniform(0, 1))
+        if workers := psutil.Process(process.pid).children():
+            workers[-1].kill()
+        time.sleep(chance.uniform(0, 0.5))
+        process.kill()
+        process.communicate()
+        killed += 1
+    done = start_command(*words)
+    done.communicate(timeout=PATIENCE)
+    made = [row for row in rows() if row["status"] == "ok"]
+    assert len(made) - len({row["out"] for row in made}) <= killed  # rows before they were moved
+    assert len({row["out"] for row in made}) == 23 == len(contents())
+    assert all(is_made(row) for row in {row["out"]: row for row in made}.values())
+
+
+TWO_CORES = f"from super_sdf.batch import run\n\nrun.count_cores = lambda: 2\n{COMMAND}"
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="PYTHONSAFEPATH is of Python 3.11")
+def test_nothing_of_the_current_folder_is_run(tmp_path):
+    words = ("batch", "in", "--out", "out", "--jobs", 2, "--quality", "fast", "--factor", 2)
+    done, ran = run_beside_planted_files(tmp_path, TWO_CORES, *words)
+    assert "3 done, 1 failed" in done.stderr and not ran
+
+
+HOLD = "import sys; from pathlib import Path; from super_sdf.batch.record import folder_lock\n"
+HOLD += "with folder_lock(Path('out')): print('held', flush=True); sys.stdin.read()"
+
+
+def test_a_lock_is_exclusive_among_processes_and_ends_with_its_own(batch, command):
+    words = [sys.executable, "-c", HOLD]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout.readline() == b"held\n"
+        want = "Error: out is in use by another batch: wait for it, or give another\n"
+        assert command("batch", "in/a.npy", "--out", "out", *LONE) == (1, "", want)
+        assert batch("in/a.npy", "--dry-run")[0] == 0
+        holder.kill()
+        holder.wait()
+        assert batch("in/a.npy")[0] == 0
     Path("taken").write_text("")
     want = "Error: taken cannot be written: File exists\n"
-    assert run_batch("in", out="taken") == (1, "", want)
-    want = "Error: no model 'none': give an ONNX file or one of: fast, base, best\n"
-    assert run_batch("in", "--model", "none") == (1, "", want) and not Path("out").exists()
+    assert command("batch", "in", "--out", "taken", *LONE) == (1, "", want)
     Path("bad.onnx").write_text("x")
-    code, _, err = command("batch", "in", "--out", "out", "--jobs", 2, "--model", "bad.onnx")
-    assert code == 1 and err.startswith("Error: bad.onnx is no ONNX file that onnxruntime can run")
+    _, _, err = command("batch", "in", "--out", "new", "--model", "bad.onnx", *LONE[:2])
+    assert err.startswith("Error: bad.onnx is no ONNX file that onnxruntime can run")
 
 
-def test_progress_has_rate_and_time_left(run_batch, monkeypatch):
-    result = Result(None, {})
-    batch = Batch(Settings(Path("out")), done=[result] * 9, failed=[result], seconds=5.0)
-    batch.work, batch.work_done = 400.0, 100.0
-    assert describe_progress(batch, 30) == "10/30, 2 files/s, 15 s left, 1 failed"
-    assert [duration(s) for s in (0.04, 59, 200, 7300)] == ["0.0 s", "59 s", "3 min", "2 h 2 min"]
-    monkeypatch.setattr("super_sdf.cli.batch_report.sys.stderr.isatty", lambda: True)
-    _, _, err = run_batch("in")
-    assert err.startswith("0/4\r") and "\r1/4, " in err and "\r\x1b[KFailed: in/bad" in err
+# Labels
+
+
+@pytest.fixture
+def cases():
+    """Write six label images with three organs that touch; two have no third one."""
+    Path("cases").mkdir()
+    for number in range(6):
+        at = np.stack(np.indices((12,) * 3), -1)
+        middles = 6 + np.array([[-2, 0, 0], [2, 0, 0.2], [0, 2, number / 3 - 1]])
+        far = np.linalg.norm(at[..., None, :] - middles, axis=-1)
+        labels = np.where(far.min(-1) < 3, far.argmin(-1) + 1, 0).astype(np.uint8)
+        labels[(labels == 3) & (number % 3 == 2)] = 0
+        np.savez(f"cases/{number}.npz", values=labels, spacing=(1, 0.75, 2))
+    Path("organs.csv").write_text("1,liver\n2,spleen\n3,aorta\n")
+
+
+def test_each_case_has_the_files_of_upsample_and_a_row(cases, command):
+    def run(*words):
+        given = ("--names", "organs.csv", "--format", "stl", *FAST, "--factor", 2, "--json")
+        code, out, err = command("batch", *words, "--out", "out", "--labels", "all", *given)
+        return code, json.loads(out), err
+
+    code, facts, _ = run("cases")
+    assert code == 0 and (facts["done"], facts["closed"]) == (6, 16)
+    assert len(contents()) == 16 and all(map(is_made, rows()))
+    words = ("--labels", "all", "--names", "organs.csv", *FAST, "--factor", 2, "--json", "-q")
+    single = json.loads(command("upsample", "cases/2.npz", "one.stl", *words)[1])["labels"]
+    row = next(row for row in rows() if row["out"] == "2-*.stl")
+    assert [each["name"] for each in row["labels"]] == ["liver", "spleen"]
+    for ours, theirs in zip(row["labels"], single, strict=True):
+        assert Path("out", ours["output"]).read_bytes() == Path(theirs["output"]).read_bytes()
+        assert {**ours, "output": 0} == {**theirs, "output": 0}
+    assert run("cases")[1]["done_before"] == 6
+    Path("out/1-liver.stl").unlink()  # as if killed between two files
+    shutil.copy("cases/2.npz", "cases/0.npz")
+    facts = run("cases")[1]
+    assert (facts["done"], facts["done_before"]) == (2, 4) and Path("out/1-liver.stl").exists()
+    assert {row["out"]: row["beside"] for row in rows()[-2:]} == {
+        "0-*.stl": ["0-aorta.stl"],
+        "1-*.stl": [],
+    }
+    Path("out/3-spleen.stl").write_text("mine")
+    code, _, err = run("cases")
+    assert code == 1 and "out/3-spleen.stl exists and was changed after a batch made it" in err
+
+
+def test_formats_with_parts_listed_labels_and_names_in_lists(cases, command):
+    entries = [
+        {"in": "cases/0.npz", "out": "x/a.3mf", "labels": ["liver", 2]},
+        {"in": "cases/2.npz", "labels": ["aorta", 1]},
+        {"in": "cases/1.npz", "label": 2},
+    ]
+    Path("list.jsonl").write_text("\n".join(map(json.dumps, entries)))
+    words = ("batch", "list.jsonl", "--names", "organs.csv", "--format", "glb", *FAST)
+    code, _, err = command(*words, "--factor", 2, "--out", "out")
+    assert code == 0, err
+    assert contents().keys() == {"cases/1-label2.glb", "cases/2.glb", "x/a.3mf"}
+    missing = {row["out"]: row.get("missing") for row in rows()}
+    assert missing["cases/2.glb"] == [{"label": 3, "name": "aorta"}]
+    for line, why in {
+        '{"in": "cases/0.npz", "labels": ["lung"]}': "labels has 'lung': give numbers, or names of",
+        '{"in": "cases/0.npz", "labels": "all", "cap": false}': "open does not go with labels",
+    }.items():
+        Path("list.jsonl").write_text(line)
+        code, _, err = command(*words, "--out", "new")
+        assert code == 2 and f"list.jsonl, line 1: {why}" in err and not Path("new").exists()
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)])
+def test_two_inputs_that_make_the_same_file_are_not_lost(cases, command, force):
+    lines = (
+        {"in": "cases/0.npz", "out": "a-1.stl", "label": 1},
+        {"in": "cases/1.npz", "out": "a.stl", "labels": "all"},
+    )
+    Path("list.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    run = "batch", "list.jsonl", "--out", "out", *FAST, "--factor", 2, "--jobs", 1
+    code, _, err = command(*run, *force)
+    assert code == 1 and "1 done, 1 failed" in err
+    assert "was written while this batch ran: give its inputs other names (out)" in err

@@ -1,5 +1,7 @@
 """The mesher that keeps edges and corners: where they lie, and a manifold on anything."""
 
+import json
+
 import numpy as np
 import pytest
 from conftest import ball, count_fans, trilinear
@@ -8,93 +10,106 @@ from hypothesis import strategies as st
 from test_isosurface import dense_field
 
 from lab.methods import sharp_isosurface
-from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, upsample
+from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.check.samples import self_intersections
-from super_sdf.surface.cell_cases import loop_table, triangle_table
-from super_sdf.surface.marching import find_crossings
-from super_sdf.surface.sharp.features import Rule, is_sharp
-from super_sdf.surface.sharp.folds import without_folds
-from super_sdf.surface.sharp.patches import (Patches, Placed, find_patches, triangles_of, unfolded, voxels_near_kinks)
-from super_sdf.surface.sharp.planes import planes_at_crossings
-from super_sdf.surface.sharp.triangle_pairs import intersecting
+from super_sdf.surface.sharp import features
+from super_sdf.surface.sharp.folds import intersecting, without_folds
+from super_sdf.truth.mesh_files import read_mesh
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+BOX = np.array([6.2, 5.1, 4.3])
 
 
-def extract_sharp(field, grid) -> Mesh:
+def box_distance(half, samples, middle, turn=TURN):
+    """Return the distance to a box, at samples of spacing 1."""
+    ijk = np.indices((samples,) * 3).reshape(3, -1) - middle
+    beyond = np.abs(turn.T @ ijk) - np.array(half)[:, None]
+    distance = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
+    return distance.reshape((samples,) * 3)
+
+
+def turned_box(half=BOX, samples=22):
+    return SdfGrid.trusted(box_distance(half, samples, samples / 2 + 0.13), 1.0)
+
+
+def extract_sharp(field, grid):
     return extract_mesh(field, grid, mesher="sharp")
 
 
-def turned_box(half, samples=22):
-    """The distance to a box that does not stand along the axes, spacing 1."""
-    ijk = np.indices((samples,) * 3).reshape(3, -1) - (samples / 2 + 0.13)
-    beyond = np.abs(TURN.T @ ijk) - half[:, None]
-    distance = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
-    return SdfGrid.trusted(distance.reshape((samples,) * 3), 1.0)
-
-
-def test_loops_make_the_triangles_of_the_table():
-    loops, (counts, table) = loop_table(), triangle_table()
-    for case in range(len(counts)):
-        made = []
-        for loop in range(loops.first[case], loops.first[case] + loops.times[case]):
-            places = loops.triangles[loop, : loops.sides[loop] - 2]
-            made += loops.edges[loop][places].tolist()
-        assert made == table[case, : counts[case]].tolist()
-
-
 def test_a_smooth_surface_and_a_field_that_is_no_distance_stay_those_of_marching_cubes():
-    box = turned_box(np.array([6.2, 5.1, 4.3]))
-    for grid in (ball(), SdfGrid.trusted(3 * box.values, 1.0)):
+    for grid in (ball(), SdfGrid.trusted(3 * turned_box().values, 1.0)):
         field = upsample(grid, trilinear)
-        plain, sharp = extract_mesh(field, grid), extract_sharp(field, grid)
+        plain, sharp = extract_mesh(field, grid, mesher="marching"), extract_sharp(field, grid)
         np.testing.assert_array_equal(sharp.vertices, plain.vertices)
         assert set(map(tuple, sharp.faces)) == set(map(tuple, plain.faces))
 
 
 def test_edges_of_a_box_are_kept_and_most_corners():
     """A corner whose spheres are pierced by .04 spacings, as of two here, is left to the edges."""
-    half = np.array([6.2, 5.1, 4.3])
-    grid = turned_box(half)
+    grid = turned_box()
     sharp = extract_sharp(upsample(grid, load_network()), grid)
     assert sharp.is_closed() and (count_fans(sharp.faces) == 1).all()
     signs = np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1
-    corners = (half * signs) @ TURN.T + 11.13
-    nearest = np.linalg.norm(sharp.vertices[:, None] - corners, axis=2).min(0)
+    nearest = np.linalg.norm(
+        sharp.vertices[:, None] - ((BOX * signs) @ TURN.T + 11.13), axis=2
+    ).min(0)
     assert (nearest < 0.12).sum() >= 6 and nearest.max() < 0.3
-    assert sharp.volume() == pytest.approx(8 * half.prod(), rel=2e-3)
+    assert sharp.volume() == pytest.approx(8 * BOX.prod(), rel=2e-3)
     local, apart = np.abs((sharp.vertices - 11.13) @ TURN), []
     for axis in range(3):  # only across the edge: a vertex lies anywhere along it
         others = [a for a in range(3) if a != axis]
-        across = np.linalg.norm(local[:, others] - half[others], axis=1)
-        for at in np.linspace(0, half[axis] - 1, 20):
+        across = np.linalg.norm(local[:, others] - BOX[others], axis=1)
+        for at in np.linspace(0, BOX[axis] - 1, 20):
             apart.append(across[np.abs(local[:, axis] - at) < 0.3].min())
     assert np.mean(apart) < 0.02
 
 
-@pytest.mark.parametrize("factor", [2, 4, 8])
-def test_all_patches_that_turn_are_in_voxels_that_are_looked_at(factor):
-    grid = turned_box(np.array([4.2, 3.1, 2.3]), 14)
-    field = upsample(grid, load_network(), factor)
-    every = slice(0, len(field.voxel_ijk))
-    kinked, crossings = voxels_near_kinks(field, every), find_crossings(field, every)
-    patches, used = find_patches(field, crossings, np.ones(len(kinked), bool))
-    planes = planes_at_crossings(field, crossings, used)
-    sharp = is_sharp(patches, planes.normal, planes.trust)
-    assert sharp.sum() > 100 and kinked[patches.row[sharp]].all() and not kinked.all()
+@pytest.mark.parametrize("kind", ["mask", "noisy", "truncated"])
+def test_by_itself_it_is_sharp_where_samples_are_exact(kind):
+    values = turned_box().values
+    values = values < 0 if kind == "mask" else np.clip(values, -3, 3)
+    inside = "positive" if kind == "mask" else "auto"
+    grid, network = make_grid(values, spacing=1.0, field=kind, inside=inside), load_network("fast")
+    plain, sharp, auto = (
+        reconstruct(grid, network, 2, mesher=name) for name in ("marching", "sharp", "auto")
+    )
+    assert len(auto.vertices) == len((sharp if kind == "truncated" else plain).vertices)
+    assert (len(sharp.vertices) > len(plain.vertices)) == (kind == "truncated")
+
+
+def test_the_command_takes_a_mesher_and_says_which(folder, command):
+    np.save("in.npy", turned_box().values)
+    np.save("mask.npy", turned_box().values < 0)
+    words = ("--spacing", 1, "--quality", "fast", "--factor", 2, "--force")
+    sizes, note = {}, "mask values show no edges: the mesh is that of marching cubes"
+    for name in ("auto", "sharp", "marching"):
+        asked = () if name == "auto" else ("--mesher", name)
+        code, out, _ = command("upsample", "in.npy", "a.ply", *asked, *words, "--json")
+        assert code == 0 and json.loads(out)["asked"]["mesher"] == name
+        sizes[name] = len(read_mesh("a.ply").vertices)
+        code, _, err = command(
+            "upsample", "mask.npy", "m.ply", *asked, *words, "--inside", "positive"
+        )
+        assert code == 0 and (note in err) == (name == "sharp")
+    assert sizes["auto"] == sizes["sharp"] > sizes["marching"]
+    assert command("upsample", "in.npy", "x.ply", "--mesher", "dual", *words)[0] == 2
+
+
+def test_the_rule_of_the_package_has_a_weight_for_each_evidence():
+    rule = json.loads(features.RULE.read_text())
+    assert len(features.load_rule().weights) == len(rule["weights"]) == 10
+    assert features.load_rule().share(np.zeros((1, 10))) == np.clip(rule["bias"], 0, 1)
 
 
 @pytest.fixture
 def features_everywhere():
     """Let every patch be a feature: fans and turned sides, ambiguous faces among them."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (
-            ("SHARP_COSINE", 1.1),
-            ("LEAST_SLOPE_TRUST", 0),
-            ("LEAST_SPHERES", 0),
-            ("RULE", Rule(1.0, ())),
-        ):
-            patch.setattr(f"super_sdf.steps.sharp.features.{name}", value)
+        for name in ("LEAST_SLOPE_TRUST", "LEAST_SPHERES"):
+            patch.setattr(features, name, 0)
+        patch.setattr(features, "SHARP_COSINE", 1.1)
+        patch.setattr(features, "HALF_ANGLE_COSINE", 1.1)
+        patch.setattr(features, "load_rule", lambda: features.Rule(1.0, ()))
         yield patch
 
 
@@ -118,11 +133,11 @@ def test_any_lattice_gives_a_closed_manifold_with_features_everywhere(
 def test_no_triangles_intersect_with_features_everywhere(features_everywhere):
     """In noise, where marching cubes has none; and there are hundreds if folds are left."""
     fields = [noise(seed, 1.0) for seed in range(8)]
-    plain = [self_intersections(extract_mesh(*field)) for field in fields]
+    plain = [self_intersections(extract_mesh(*field, mesher="marching")) for field in fields]
     assert plain.count(0) > 4
     for field, already in zip(fields, plain):
         assert self_intersections(extract_sharp(*field)) <= already
-    features_everywhere.setattr("super_sdf.steps.sharp.mesher.without_folds", lambda *of: of[1])
+    features_everywhere.setattr(features, "without_folds", lambda *of: of[1])
     assert self_intersections(extract_sharp(*fields[0])) > 100
 
 
@@ -130,25 +145,33 @@ def test_a_blade_and_a_gap_do_not_intersect():
     """Sheets half a fine spacing apart, turned: each of the fans reaches into the other's cells."""
     for half in ([0.9, 5.1, 4.3], [0.3, 5.1, 4.3], [6.2, 0.15, 0.15]):
         lattice = turned_box(4 * np.array(half), 49).values.astype(np.float32) / 4
-        for sign in (1, -1):
-            field = sign * (lattice if sign > 0 else np.minimum(lattice, 5.0))
-            mesh = sharp_isosurface(field, 0.25, 0.0)
-            assert self_intersections(mesh) == 0
+        for field in (lattice, -np.minimum(lattice, 5.0)):
+            assert self_intersections(sharp_isosurface(field, 0.25, 0.0)) == 0
 
 
 def test_features_of_a_box_along_the_lattice_are_kept(monkeypatch):
     """Its triangles lie in common planes, and some of its vertices on nodes."""
-    half, kept = np.array([3.0, 2.5, 2.0]), []
-    beyond = np.abs(np.indices((49,) * 3).reshape(3, -1) / 4 - 6.125) - half[:, None]
-    distance = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
+    kept = []
 
     def counting(*of):
         kept.append((len(of[1].feature), len(without_folds(*of).feature)))
         return without_folds(*of)
 
-    monkeypatch.setattr("super_sdf.steps.sharp.mesher.without_folds", counting)
-    sharp_isosurface(distance.reshape((49,) * 3).astype(np.float32), 0.25, 0.0)
+    monkeypatch.setattr(features, "without_folds", counting)
+    box = box_distance(4 * np.array([3.0, 2.5, 2.0]), 49, 24.5, np.eye(3)) / 4
+    sharp_isosurface(box.astype(np.float32), 0.25, 0.0)
     assert kept[0][0] == kept[0][1] > 100
+
+
+def test_the_true_distance_is_meshed_on_its_edges():
+    """Of a dense field, as for the bound in evaluations."""
+    half = np.array([3.1, 2.5, 2.1])
+    lattice = turned_box(4 * half, 49).values.astype(np.float32) / 4
+    mesh = sharp_isosurface(lattice, 0.25, 0.0)
+    assert mesh.is_closed() and mesh.volume() == pytest.approx(8 * half.prod(), rel=1e-3)
+    for signs in np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1:
+        corner = TURN @ (half * signs) + (49 / 2 + 0.13) / 4
+        assert np.linalg.norm(mesh.vertices - corner, axis=1).min() < 0.03
 
 
 # A triangle, and others over it: beside it, through it, flat on it, at a common corner.
@@ -165,60 +188,6 @@ PAIRS = [
 @pytest.mark.parametrize("corners, want", PAIRS)
 def test_which_triangles_intersect(corners, want):
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], *corners])
-    second = [0 if not any(corners[0]) else 3, 4, 5]
-    first, _ = intersecting(points, np.array([[0, 1, 2]]), np.array([second]))
-    turned, _ = intersecting(points, np.array([second]), np.array([[0, 1, 2]]))
-    assert len(first) == len(turned) == want
-
-
-def test_the_true_distance_is_meshed_on_its_edges():
-    """Of a dense field, as for the bound in evaluations."""
-    half = np.array([3.1, 2.5, 2.1])
-    lattice = turned_box(4 * half, 49).values.astype(np.float32) / 4
-    mesh = sharp_isosurface(lattice, 0.25, 0.0)
-    assert mesh.is_closed() and (count_fans(mesh.faces) == 1).all()
-    middle = (49 / 2 + 0.13) / 4
-    for signs in np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1:
-        corner = TURN @ (half * signs) + middle
-        assert np.linalg.norm(mesh.vertices - corner, axis=1).min() < 0.03
-    assert mesh.volume() == pytest.approx(8 * half.prod(), rel=1e-3)
-
-
-# Fans round the vertices of features, on two squares in a plane.
-SQUARES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]], float)
-
-
-def patches(*loops):
-    """Return patches with four crossings each; fans do not need more."""
-    zeros, four = np.zeros(len(loops), np.int64), np.full(len(loops), 4, np.int64)
-    middles = np.zeros((len(loops), 3))
-    return Patches(zeros.astype(np.int32), middles, zeros, four, np.array(loops))
-
-
-def placed(*peaks):
-    """Return vertices on the squares, whose planes face upwards, and on as many patches."""
-    upwards = np.tile([0.0, 0.0, 1.0], (len(SQUARES), 1))
-    return Placed(SQUARES, upwards, np.arange(len(peaks)), np.array(peaks, float))
-
-
-@pytest.mark.parametrize(
-    ("peak", "want"),
-    [
-        ([0.9, 0.2, 0], [0.9, 0.2, 0]),
-        ([0.9, 0.2, 5], [0.9, 0.2, 5]),
-        ([2.5, 0.5, 0], [1.5, 0.5, 0]),
-    ],
-)
-def test_a_vertex_beyond_a_side_of_its_fan_goes_half_way_to_the_middle(peak, want):
-    """One over its patch stays."""
-    np.testing.assert_allclose(unfolded(patches([0, 1, 2, 3]), placed(peak)).peak, [want])
-
-
-@pytest.mark.parametrize("height, is_turned", [(0.5, True), (2, False)])
-def test_the_side_of_two_fans_joins_their_vertices_where_that_does_not_fold(height, is_turned):
-    two = patches([0, 1, 2, 3], [1, 4, 5, 2])
-    _, triangles = triangles_of(two, placed([0.5, 0.5, 0], [1.5, height, 0]))
-    edges = {(int(t[k]), int(t[k - 2])) for t in triangles for k in range(3)}
-    turned, kept = {(6, 7), (7, 6)}, {(1, 2), (2, 1)}
-    there, absent = (turned, kept) if is_turned else (kept, turned)
-    assert there <= edges and not absent & edges
+    second = np.array([[0 if not any(corners[0]) else 3, 4, 5]])
+    for pair in ((np.array([[0, 1, 2]]), second), (second, np.array([[0, 1, 2]]))):
+        assert len(intersecting(points, *pair)[0]) == want

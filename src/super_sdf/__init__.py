@@ -25,12 +25,12 @@ if TYPE_CHECKING:
     from .grid.sdf_grid import make_grid as make_grid
     from .labels.reconstruct import reconstruct_labels as reconstruct_labels
     from .network.network import load_network as load_network
+    from .pipeline import extract_mesh as extract_mesh
     from .pipeline import reconstruct as reconstruct
     from .pipeline import upsample as upsample
     from .refine.field import FineField as FineField
     from .refine.field import fine_grid as fine_grid
     from .simplify.simplify import simplify_mesh as simplify_mesh
-    from .surface.extract import extract_mesh as extract_mesh
     from .surface.mesh import Mesh as Mesh
 
 MODULES = {
@@ -43,11 +43,10 @@ MODULES = {
     "grid.sdf_grid": "SdfGrid make_grid",
     "labels.reconstruct": "reconstruct_labels",
     "network.network": "load_network",
-    "pipeline": "reconstruct upsample",
+    "pipeline": "extract_mesh reconstruct upsample",
     "refine.field": "FineField fine_grid",
     "simplify.simplify": "simplify_mesh",
     "surface.mesh": "Mesh",
-    "surface.extract": "extract_mesh",
 }
 HOMES = {name: module for module, names in MODULES.items() for name in names.split()}
 __all__ = ["__version__", *HOMES]

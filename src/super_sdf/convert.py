@@ -20,7 +20,7 @@ from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.cubic import cubic_grid
 from .grid.placement import as_triple
-from .grid.sdf_grid import SdfGrid, describe_place
+from .grid.sdf_grid import SdfGrid, describe_place, mean_spacing, volume_of_samples
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP, Options
 from .pipeline import mesh_grid
@@ -89,31 +89,14 @@ def convert(
 ) -> Conversion:
     """Convert a grid file to a mesh file, in formats of ``read_grid`` and ``write_mesh``.
 
-    Parameters
-    ----------
-    source, target : path
-        The grid file and the mesh file.
-    network : Network
-        From ``load_network``.
-    options : Options
-        All that the mesh depends on.
-    force : bool
-        Replace the target, and the field's file, if they exist.
-    progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
-    save_field : path, optional
-        A file for the refined field, in a format of ``write_field``: it and the mesh file are both
-        complete at the end, or neither is written.
-    before_rename : callable, optional
-        Called with the path of the finished temporary file, before it gets the name ``target``.
-    how
-        Passed to ``mesh_grid``, such as ``map_tiles``.
+    ``force`` replaces the target, and the field's file, if they exist. ``progress`` is called with
+    (done, total), see ``progress.Progress``; an exception in it ends the work. ``save_field`` is a
+    file for the refined field, in a format of ``write_field``: it and the mesh file are both
+    complete at the end, or neither is written. ``before_rename`` is called with the path of the
+    finished temporary file, before it gets the name ``target``. ``how`` is passed to ``mesh_grid``.
 
-    Raises
-    ------
-    SuperSdfError
-        As in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``. Nothing is
-        written then.
+    SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
+    Nothing is written then.
     """
     watch, files = Stopwatch(), files_of(source)
     if options.goals():
@@ -134,7 +117,7 @@ def convert(
 
         check_apart(save_field, files)
         shape = lattice_shape(grid.shape, options.factor)
-        check_field_fits(Path(save_field), shape, options.max_memory)
+        check_field_fits(Path(save_field), shape)
         saving = saving_field(save_field, force=force)
     watch.lap("read")
     shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
@@ -166,7 +149,9 @@ def convert(
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     no_edges = []
     if options.mesher == SHARP and not lattice.field.has_exact:
-        no_edges = [f"{lattice.field.kind} values show no edges: the mesh is that of marching cubes"]
+        no_edges = [
+            f"{lattice.field.kind} values show no edges: the mesh is that of marching cubes"
+        ]
     return Conversion(
         grid,
         mesh,
@@ -188,7 +173,7 @@ def reworked(
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
     simplified, off = None, list[str]()
     if options.keep_volume:
-        from .labels.volumes import keep_volumes, mean_spacing, volume_notes, volume_of_samples
+        from .labels.volumes import keep_volumes, volume_notes
 
         volume = volume_of_samples(grid)
         (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))

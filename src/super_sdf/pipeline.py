@@ -20,13 +20,13 @@ from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import OutOfMemoryError
+from .errors import OptionTypeError, OutOfMemoryError, seen
 from .functions.function import Function, as_function, sampled
 from .grid.cubic import cubic_grid
 from .grid.sdf_grid import SdfGrid, check_grid, crop
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import given_or_loaded, network_for
-from .options import Options
+from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
@@ -171,6 +171,49 @@ def upsample(
     return field
 
 
+def extract_mesh(
+    field: FineField,
+    grid: SdfGrid | None = None,
+    *,
+    mesher: options.MesherName = options.DEFAULT_MESHER,
+    cap: bool = True,
+    function: Function | None = None,
+) -> Mesh:
+    """Return the zero level of a field as triangles in world coordinates; a node of 0 is inside.
+
+    Parameters
+    ----------
+    field : FineField
+        From ``upsample`` or ``read_field``.
+    grid : SdfGrid, optional
+        A coarse grid for spacing, origin and direction. Default: the one that the field was made
+        from. A field that was made without its grid stays open.
+    mesher, cap, function
+        As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
+
+    Raises
+    ------
+    OptionError
+        If there is no such mesher; if there are more vertices than 32-bit numbers.
+    OptionTypeError
+        If an argument is something else.
+    """
+    if not isinstance(field, FineField):
+        raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
+    grid = field.placed if grid is None else grid
+    check_grid(grid)
+    samples = field.spheres
+    chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
+    cap = options.check_cap(cap) and field.grid is not None
+    check_can_close(grid, cap=cap)
+    mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
+    if function is None:
+        return mesh
+    from .functions.zero import put_on_zero  # imported here, as few call it
+
+    return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)
+
+
 def reconstruct(
     grid: SdfGrid | None = None,
     network: Decoder | None = None,
@@ -267,7 +310,7 @@ class Task:
     shape: tuple[int, int, int]  # samples of the whole grid
     whole: BandSummary | None  # None of a tile that is the whole grid
     options: Options
-    mesher: options.MesherName
+    mesher: MesherName
     threads: int
 
 
@@ -338,7 +381,7 @@ def mesh_grid(
     ends = lattice.field.unseen is not None
     count = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
     steps.finish("isosurface")
-    return Result(mesh, count, counts, leaves, is_cut, steps.take_seconds(), len(tiles))
+    return Result(mesh, count, counts, leaves, is_cut, steps.seconds, len(tiles))
 
 
 def make_tile(

@@ -146,7 +146,7 @@ def _job(
 ) -> Job:
     """Return the job that a line describes."""
     source, target = entry.pop("in", None), entry.pop("out", None)
-    if not isinstance(source, str) or PurePath(source).name in ("", ".."):
+    if not isinstance(source, str) or PurePath(source).name in ("", "..") or "\0" in source:
         raise OptionError(f"'in' is {source!r}: give the path of a grid")
     if unknown := sorted(entry.keys() - set(BATCH_LISTS)):
         raise OptionError(f"{unknown[0]!r} is unknown: give in, out, {', '.join(BATCH_LISTS)}")

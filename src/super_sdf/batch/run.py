@@ -177,7 +177,7 @@ class Batch:
             if owner != job.target:
                 way_out = "give its inputs other names (out)"
                 return f"{path} was written while this batch ran: {way_out}"
-            if path.is_symlink():
+            if os.path.islink(path):
                 return f"{path} is a link: remove it"
             if os.path.realpath(path) in self.inputs:
                 return f"{path} is an input: give another folder, or another name (out)"

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,42 +19,33 @@ from ..errors import OptionError, OutOfMemoryError
 from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
-from ..files.regular import check_regular_file
 from ..grid.cubic import cubic_grid
-from ..grid.sdf_grid import SdfGrid
-from ..labels.volumes import volume_of_samples
+from ..grid.sdf_grid import SdfGrid, volume_of_samples
 from ..options import LENGTHS, MASK, Options, check_distance, check_max_memory
 from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh
 from ..threads import give_back, held_memory, in_words, memory_bound, useful_threads
 from ..truth.mesh_files import merged, read_mesh
-from .samples import (
-    NOTICEABLE,
-    REACH,
-    Strays,
-    Touching,
-    exact_samples,
-    find_strays,
-    search,
-    touch,
-    vertex_residuals,
-)
-from .surface import Surface, examine_surface
+from .samples import NOTICEABLE, Strays, Touching, find_strays, touch, vertex_residuals
+from .surface import Surface
 
-# Bytes for each triangle and each exact sample, beside mesh and band, at the most: search trees.
+# Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
 BYTES_PER_TRIANGLE = 420
 BYTES_PER_SAMPLE = 150
 OFF_OF_MASKS = 0.5  # voxels by which the distances that are made of a mask may be off
-HEADER_BYTES = 4096  # of a PLY file, in which the number of faces is looked for
 NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
 AS_GIVEN = Options()
 FULL = 0.1  # voxels: residual at which a colour is saturated
-TOUCHING, PIERCED, NOT_TOUCHING, UNKNOWN = (
-    (240, 240, 240),
-    (190, 20, 30),
-    (20, 70, 190),
-    (120, 120, 60),
-)
+TOUCHING, PIERCED = (240, 240, 240), (190, 20, 30)
+NOT_TOUCHING, UNKNOWN = (20, 70, 190), (120, 120, 60)
+WORLD = "in world units"
+LIMITS = {
+    "max_residual": ("largest", "the largest residual is", "voxels"),
+    "tolerance": ("largest", "the largest residual is", WORLD),
+    "max_mean": ("mean", "the mean residual is", "voxels"),
+    "max_share": ("share_above_tenth", "above 0.1 voxel is", ""),
+}
+"""Options, the figures that they limit, and how these are named, with their unit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,15 +83,14 @@ class Certificate:
 
     def faults(self) -> list[str]:
         """Return what is wrong with the mesh whatever the limits, in words."""
-        wrong, found = int(self.touching.wrong_side.sum()), self.surface.faults()
-        found += [f"{wrong:,} samples on the wrong side"] * (wrong > 0)
-        if self.strays and self.strays.count:
-            found.append(f"{self.strays.count:,} vertices where the grid has no surface")
-        return found
+        wrong, strays = int(self.touching.wrong_side.sum()), self.strays.count if self.strays else 0
+        found = [f"{wrong:,} samples on the wrong side"] * (wrong > 0)
+        found += [f"{strays:,} vertices where the grid has no surface"] * (strays > 0)
+        return self.surface.faults() + found
 
     def lines(self) -> list[str]:
         """Return the certificate as lines for users."""
-        surface, touching = self.surface, self.touching
+        surface, touching, faults = self.surface, self.touching, self.faults()
         pieces = f"{surface.components:,} component" + "s" * (surface.components != 1)
         lines = [
             f"mesh: {surface.vertices:,} vertices, {surface.triangles:,} triangles, {pieces}, "
@@ -124,29 +113,23 @@ class Certificate:
             lines.append("residual: unknown, since no sample is exact")
         if self.sample_volume:
             lines.append(f"volume of the samples inside: {self.sample_volume:.6g}; {self._off()}")
-        return [*lines, *self._fault_lines()]
+        counted = surface.self_intersections is not None
+        sound = "closed, oriented, manifold" + ", no self-intersections" * counted
+        lines.append("faults: " + "; ".join(faults or [f"none ({sound})"]))
+        lines += ["self-intersections: not counted"] * (not counted)
+        if self.strays and self.strays.beyond:
+            lines.append(f"{self.strays.beyond:,} vertices lie beyond the grid and are unchecked")
+        return lines
 
     def _off(self) -> str:
         share = self.surface.volume / (self.sample_volume or 1) - 1
         return f"the mesh's volume is {share:+.2%} off that of the samples"
 
-    def _fault_lines(self) -> list[str]:
-        """Return the faults in one line, and what was not looked for."""
-        counted = self.surface.self_intersections is not None
-        sound = "closed, oriented, manifold" + ", no self-intersections" * counted
-        lines = ["faults: " + "; ".join(self.faults() or [f"none ({sound})"])]
-        if not counted:
-            lines.append("self-intersections: not counted")
-        if self.strays and self.strays.beyond:
-            lines.append(f"{self.strays.beyond:,} vertices lie beyond the grid and are unchecked")
-        return lines
-
     def summary(self) -> str:
         """Return the certificate in one line."""
         if not self.has_evidence:
             said = ["no sample is exact, so the residual is unknown"]
-            if self.sample_volume:
-                said.append(self._off())
+            said += [self._off()] if self.sample_volume else []
             return "; ".join([*said, *self.faults()])
         figures = self.touching.summary()
         residual = (
@@ -157,18 +140,8 @@ class Certificate:
         return "; ".join([residual, *(self.faults() or ["no faults"])])
 
     def residuals_at(self, vertices: NDArray[Any]) -> FloatArray:
-        """Return ``touching.vertex_residuals`` at positions on the mesh."""
+        """Return ``vertex_residuals`` at positions on the mesh."""
         return vertex_residuals(vertices, self.touching, self.grid)
-
-
-WORLD = "in world units"
-LIMITS = {
-    "max_residual": ("largest", "the largest residual is", "voxels"),
-    "tolerance": ("largest", "the largest residual is", WORLD),
-    "max_mean": ("mean", "the mean residual is", "voxels"),
-    "max_share": ("share_above_tenth", "above 0.1 voxel is", ""),
-}
-"""Options, the figures that they limit, and how these are named, with their unit."""
 
 
 def check_limits(limits: Mapping[str, float | None]) -> None:
@@ -183,12 +156,12 @@ def check_limits(limits: Mapping[str, float | None]) -> None:
 
 def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> list[str]:
     """Return a sentence for each of ``LIMITS`` that a certificate exceeds."""
-    asked = [name for name in LIMITS if limits[name] is not None]
+    asked = {name: limit for name in LIMITS if (limit := limits[name]) is not None}
     if asked and not certificate.has_evidence:
         return [NO_EVIDENCE]
     figures, found = certificate.touching.summary() if asked else {}, []
-    for name in asked:
-        (key, words, unit), limit = LIMITS[name], limits[name] or 0.0
+    for name, limit in asked.items():
+        key, words, unit = LIMITS[name]
         figure = figures[key] * (certificate.voxel_size if unit == WORLD else 1)
         if figure > limit:
             value = f"{figure:.4g} {unit}".rstrip()
@@ -219,7 +192,6 @@ def read_for_check(
     """Return a mesh and its grid: those that were ``made``, else read from their files."""
     if made is not None:
         return merged(made.mesh), made.grid
-    check_room(stated_triangles(check_regular_file(mesh)), 0, options.max_memory)
     samples, read = read_grid(grid, **options.reading()), read_mesh(mesh, options.max_memory)
     if options.unit and Path(mesh).suffix.lower() == ".glb":  # it is in metres
         read = Mesh(read.vertices / LENGTHS[options.unit], read.faces)
@@ -237,15 +209,19 @@ def check_mesh(
     not fit in memory.
     """
     band, offset = band_of(grid, options), options.offset
-    check_room(len(mesh.faces), len(band.voxel_ijk), options.max_memory)
-    lattice, rows = cubic_grid(grid, offset), exact_samples(band)
-    reach, points = REACH * lattice.voxel_size, lattice.to_world(band.voxel_ijk[rows])
-    found = search(mesh, points, reach, intersections=intersections)
-    surface = examine_surface(mesh, found.intersections)
+    bound, triangles = memory_bound(check_max_memory(options.max_memory)), len(mesh.faces)
+    need = triangles * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
+    need += held_memory() or 0
+    if bound is not None and need > bound:
+        raise OutOfMemoryError(
+            f"checking {triangles:,} triangles needs {in_words(need)} of memory, "
+            f"{in_words(bound)} may be taken in all; allow more (--max-memory)"
+        )
+    lattice = cubic_grid(grid, offset)
+    touching, surface = touch(mesh, band, lattice, intersections=intersections)
     give_back()
-    touching = touch(mesh, band, lattice, rows, found, simple=surface.is_simple)
     is_mask, strays = lattice.field.kind == MASK, None
-    if is_mask or len(rows):
+    if is_mask or len(touching.values):
         strays = find_strays(mesh.vertices, lattice, offset, OFF_OF_MASKS * is_mask)
     volume = volume_of_samples(grid, offset) if is_mask else None
     return Certificate(mesh, lattice, surface, touching, strays, volume)
@@ -258,29 +234,6 @@ def band_of(grid: SdfGrid, options: Options = AS_GIVEN) -> Band:
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)
     return band
-
-
-def stated_triangles(path: Path) -> int:
-    """Return how many triangles a mesh file has, by its header; 0 if that does not tell."""
-    with path.open("rb") as file:
-        header = file.read(HEADER_BYTES)
-    if path.suffix.lower() == ".ply":
-        found = re.search(rb"^element face (\d{1,12})\s*$", header, re.MULTILINE)
-        return int(found.group(1)) if found else 0
-    count = int.from_bytes(header[80:84], "little")
-    is_stl = path.suffix.lower() == ".stl" and path.stat().st_size == 84 + 50 * count
-    return count if is_stl else 0
-
-
-def check_room(triangles: int, samples: int, max_memory: int | None) -> None:
-    """Raise OutOfMemoryError if checking a mesh of ``triangles`` would exceed the memory bound."""
-    bound = memory_bound(check_max_memory(max_memory))
-    need = triangles * BYTES_PER_TRIANGLE + samples * BYTES_PER_SAMPLE + (held_memory() or 0)
-    if bound is not None and need > bound:
-        raise OutOfMemoryError(
-            f"checking {triangles:,} triangles needs {in_words(need)} of memory, "
-            f"{in_words(bound)} may be taken in all; allow more (--max-memory)"
-        )
 
 
 def check_coloured(path: Path, *, force: bool = False) -> None:

@@ -24,6 +24,7 @@ from ..surface.mesh import Mesh
 from ..threads import chunks_of
 from ..truth.mesh_files import without_unused
 from ..truth.solid import Distances, Points, Solid
+from .surface import Surface, examine_surface
 
 FACES_IN_SLAB = 1 << 19  # search trees of small meshes are quicker and take less memory
 REACH = 2.0  # how far slabs look: the samples near the surface are within 1.4 of it
@@ -34,16 +35,6 @@ STRAY = 0.5  # within a ball, from which on a vertex is counted
 NEAREST_FEET = 8  # foot points that a vertex looks at
 SMOOTHING = 0.02  # distance of a foot point that halves its weight
 FARTHEST = 1.5  # foot points farther away say nothing of a vertex
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """Where points are nearest to a mesh."""
-
-    intersections: int | None  # pairs of triangles of the mesh; None if they were not counted
-    distances: Distances  # (k,), to the nearest triangle, in world units
-    feet: Points  # (k, 3), the nearest points of the mesh
-    cosines: Distances  # (k,), between the ways from there and the normals of the triangles
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,26 +92,20 @@ class Strays:
     deepest: float  # of a vertex in the ball of its nearest sample; 0 if there is none
 
 
-def exact_samples(band: Band) -> IntArray:
-    """Return which voxels of a band have exact samples, as rows, (n,)."""
-    values = band.patches[:, CENTRE]
-    # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
-    trusted = band.exact & (values > values.min()) & (values < values.max())
-    if band.sampled is not None:
-        trusted &= band.sampled  # of a resampled grid, what is interpolated promises nothing
-    return np.flatnonzero(trusted).astype(np.int32)
+def search(
+    mesh: Mesh, points: Points, reach: float, *, intersections: bool
+) -> tuple[Distances, Points, Distances, int | None]:
+    """Return where points are nearest to a mesh, and the number of its self-intersections.
 
-
-def search(mesh: Mesh, points: Points, reach: float, *, intersections: bool) -> Found:
-    """Return the nearest points of a mesh, and the number of its self-intersections.
-
-    The mesh is cut into slabs along its longest axis, in which about equally many triangles begin.
-    In a slab, points are looked up in the triangles within ``reach`` of it; those that are farther
-    away than that in the whole mesh.
+    That is their distances (k,), the nearest points of the mesh (k, 3), and the cosines (k,) of the
+    ways from there to the normals of the triangles. The number is None if it is not counted, or if
+    libigl has no test. The mesh is cut into slabs along its longest axis, in which about
+    equally many triangles begin. In a slab, points are looked up in the triangles within ``reach``
+    of it; those that are farther away than that in the whole mesh.
     """
     import igl.predicates  # here, so that pages are made without it
 
-    counts = intersections and hasattr(igl.predicates, "find_self_intersections")  # in new versions
+    counts = intersections and hasattr(igl.predicates, "find_self_intersections")
     axis = int(np.ptp(mesh.vertices, axis=0).argmax())
     along = mesh.vertices[:, axis][mesh.faces]
     low, high, place, n = along.min(1), along.max(1), points[:, axis], len(points)
@@ -130,19 +115,24 @@ def search(mesh: Mesh, points: Points, reach: float, *, intersections: bool) -> 
     for first, last in itertools.pairwise([-np.inf, *inner.tolist(), np.inf]):
         near = (low < last + reach) & (high >= first - reach)
         part = without_unused(mesh.vertices, mesh.faces[near])
-        part = Mesh(part.vertices.astype(np.float64), part.faces)
         rows = np.flatnonzero((place >= first) & (place < last))
         distances[rows], feet[rows], cosines[rows] = _nearest(part, points[rows])
-        if counts:
-            total += _count_intersections(part, axis, first, last)
+        if counts:  # those whose common range begins in the slab, of triangles with an area
+            begin, faces = low[near], part.faces.astype(np.int64)
+            whole = (faces != np.roll(faces, 1, axis=1)).all(1)
+            some = np.flatnonzero(whole & (begin < last) & (high[near] >= first))
+            vertices = part.vertices.astype(np.float64)
+            pairs = igl.predicates.find_self_intersections(vertices, faces[some])[1]
+            common = begin[some][pairs].max(1, initial=-np.inf)
+            total += int(np.count_nonzero((common >= first) & (common < last)))
     far = np.flatnonzero(distances > reach)
     if len(far):
         distances[far], feet[far], cosines[far] = _nearest(mesh, points[far])
-    return Found(total if counts else None, distances, feet, cosines)
+    return distances, feet, cosines, total if counts else None
 
 
 def _nearest(mesh: Mesh, points: Points) -> tuple[Distances, Points, Distances]:
-    """Return distances, feet and cosines: see ``Found``; the cosine at no triangle's side is 0."""
+    """Return distances, feet and cosines: see ``search``; the cosine at distance 0 is 0."""
     distances, faces, feet = Solid(mesh).nearest(points)
     a, b, c = mesh.vertices[mesh.faces[faces].T].astype(np.float64)
     normals, ways = np.cross(b - a, c - a), points - feet
@@ -151,52 +141,43 @@ def _nearest(mesh: Mesh, points: Points) -> tuple[Distances, Points, Distances]:
     return distances, feet, np.divide(dots, sizes, out=np.zeros(len(points)), where=sizes > 0)
 
 
-def _count_intersections(mesh: Mesh, axis: int, first: float, last: float) -> int:
-    """Return the number of pairs that intersect, whose common range on an axis begins in a slab."""
-    along = mesh.vertices[:, axis][mesh.faces]
-    low, high = along.min(1), along.max(1)
-    whole = (mesh.faces != np.roll(mesh.faces, 1, axis=1)).all(1)  # with an area
-    rows = np.flatnonzero(whole & (low < last) & (high >= first))
-    faces = mesh.faces[rows].astype(np.int64)
-    import igl.predicates
-
-    pairs = igl.predicates.find_self_intersections(mesh.vertices, faces)[1]
-    begin = low[rows][pairs].max(1, initial=-np.inf)
-    return int(np.count_nonzero((begin >= first) & (begin < last)))
-
-
 def self_intersections(mesh: Mesh) -> int | None:
     """Return the number of pairs of a mesh's triangles that intersect; None if libigl has no test.
 
     Vertices at the same position must be one vertex.
     """
-    return search(mesh, np.empty((0, 3)), 0.0, intersections=True).intersections
+    return search(mesh, np.empty((0, 3)), 0.0, intersections=True)[3]
 
 
 def touch(
-    mesh: Mesh, band: Band, grid: SdfGrid, rows: IntArray, found: Found, *, simple: bool
-) -> Touching:
-    """Return where the balls of the exact samples of a band, by their rows, meet a mesh.
+    mesh: Mesh, band: Band, grid: SdfGrid, *, intersections: bool
+) -> tuple[Touching, Surface]:
+    """Return where the balls of the exact samples of a band meet a mesh, and what this is.
 
-    ``found`` is by ``search`` for these samples. On which side of the mesh a sample lies is by its
-    winding number; but if the mesh is ``simple``, see ``Surface``, not where the nearest triangle
-    agrees with the sample.
+    On which side of the mesh a sample lies is by its winding number; but if the mesh is simple, not
+    where the nearest triangle agrees with the sample.
     """
+    values = band.patches[:, CENTRE]
+    # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
+    trusted = band.exact & (values > values.min()) & (values < values.max())
+    sampled = np.ones(len(values), bool) if band.sampled is None else band.sampled
+    rows = np.flatnonzero(trusted & sampled)  # what is interpolated promises nothing
     # if none is exact, too many are no distances for any to be taken for one
-    count = len(band.exact) if band.sampled is None else int(np.count_nonzero(band.sampled))
-    noisy = band.count_noisy() if len(rows) else count
-    ijk = band.voxel_ijk[rows]
-    points, values = grid.to_world(ijk), band.patches[rows, CENTRE] * np.float32(0.5)
-    distances, size = found.distances / grid.voxel_size, np.abs(values)
-    residuals = (distances - size).astype(np.float32)
-    solid, wrong = Solid(mesh), np.zeros(len(size), bool)
-    agreed = simple & (np.where(values > 0, 1, -1) * found.cosines > CLEAR)
+    noisy = band.count_noisy() if len(rows) else int(np.count_nonzero(sampled))
+    cut_off = int(np.count_nonzero(sampled)) - len(rows) - noisy
+    ijk, values = band.voxel_ijk[rows], values[rows] * np.float32(0.5)
+    points, reach = grid.to_world(ijk), REACH * grid.voxel_size
+    found, feet, cosines, crossing = search(mesh, points, reach, intersections=intersections)
+    distances, size = found / grid.voxel_size, np.abs(values)
+    residuals, wrong = (distances - size).astype(np.float32), np.zeros(len(size), bool)
+    surface = examine_surface(mesh, crossing)
+    agreed = surface.is_simple & (np.where(values > 0, 1, -1) * cosines > CLEAR)
     apart = np.flatnonzero((distances + size > NOTICEABLE) & ~agreed)  # where the side matters
+    solid = Solid(mesh)
     for chunk in chunks_of(len(apart), WIDTH):
         some = apart[chunk]
         wrong[some] = solid.is_inside(points[some]) != (values[some] <= 0)
-    cut_off = count - len(rows) - noisy
-    return Touching(cut_off, noisy, ijk, points, values, residuals, found.feet, wrong)
+    return Touching(cut_off, noisy, ijk, points, values, residuals, feet, wrong), surface
 
 
 def find_strays(

@@ -11,21 +11,14 @@ from ..surface.mesh import Mesh
 
 
 @dataclass(frozen=True)
-class Edges:
-    """Numbers of edges that are not shared by exactly two triangles of the same orientation."""
+class Surface:
+    """What a mesh is as a surface; triangles that have the same vertex twice are left out."""
 
     open_edges: int  # of an odd number of triangles
     crowded_edges: int  # of more than two triangles: not manifold
     flipped_edges: int  # of two triangles that pass them in the same direction
-
-
-@dataclass(frozen=True)
-class Surface:
-    """What a mesh is as a surface; triangles that have the same vertex twice are left out."""
-
     vertices: int
     triangles: int
-    edges: Edges
     pinched_vertices: int  # at which several fans of triangles meet: not manifold
     components: int  # that share no vertex
     self_intersections: int | None  # pairs that meet off a common vertex or edge; None: not counted
@@ -33,32 +26,16 @@ class Surface:
     area: float
 
     @property
-    def closed(self) -> bool:
-        """Whether no edge is open."""
-        return self.edges.open_edges == 0
-
-    @property
-    def oriented(self) -> bool:
-        """Whether neighbouring triangles have the same orientation, and the volume is positive."""
-        return self.edges.flipped_edges == 0 and self.volume > 0
-
-    @property
-    def manifold(self) -> bool:
-        """Whether all edges and vertices are manifold; open edges are allowed."""
-        return self.edges.crowded_edges == 0 and self.pinched_vertices == 0
-
-    @property
     def is_simple(self) -> bool:
         """Whether the mesh is one closed sheet with an inside, known not to meet itself."""
-        whole = self.closed and self.oriented and self.manifold and self.components == 1
-        return whole and self.self_intersections == 0
+        return not self.faults() and self.components == 1 and self.self_intersections == 0
 
     def faults(self) -> list[str]:
         """Return what keeps the mesh from being the boundary of a solid, in words."""
         counts = {
-            "open edges": self.edges.open_edges,
-            "edges of more than two triangles": self.edges.crowded_edges,
-            "edges between triangles of opposite orientation": self.edges.flipped_edges,
+            "open edges": self.open_edges,
+            "edges of more than two triangles": self.crowded_edges,
+            "edges between triangles of opposite orientation": self.flipped_edges,
             "vertices where several fans of triangles meet": self.pinched_vertices,
             "pairs of triangles that intersect": self.self_intersections or 0,
         }
@@ -67,10 +44,12 @@ class Surface:
 
     def report(self) -> dict[str, Any]:
         """Return the figures as they stand in JSON."""
-        figures = asdict(self)
-        edges = figures.pop("edges")
-        said = {"closed": self.closed, "oriented": self.oriented, "manifold": self.manifold}
-        return {**said, **edges, **figures}
+        return {
+            "closed": self.open_edges == 0,
+            "oriented": self.flipped_edges == 0 and self.volume > 0,
+            "manifold": self.crowded_edges == 0 and self.pinched_vertices == 0,
+            **asdict(self),
+        }
 
 
 def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surface:
@@ -78,13 +57,7 @@ def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surfac
     a, b, c = mesh.faces.T
     whole = Mesh(mesh.vertices, mesh.faces[(a != b) & (b != c) & (c != a)])
     opposite, uses, flipped = whole.pair_edges()
-    return Surface(
-        len(whole.vertices),
-        len(whole.faces),
-        Edges(int((uses % 2).sum()), int((uses > 2).sum()), flipped),
-        int(np.count_nonzero(whole.count_fans(opposite) > 1)),
-        whole.components()[0],
-        self_intersections,
-        whole.volume(),
-        whole.area(),
-    )
+    pinched = int(np.count_nonzero(whole.count_fans(opposite) > 1))
+    edges = int((uses % 2).sum()), int((uses > 2).sum()), flipped
+    counts = len(whole.vertices), len(whole.faces), pinched, whole.components()[0]
+    return Surface(*edges, *counts, self_intersections, whole.volume(), whole.area())

@@ -1,1 +1,1 @@
-"""Reading grid files and writing mesh files. It may import ``grid``, ``mesh`` and ``machine``."""
+"""Grid files in, mesh files and refined fields out: one module a library, complete files only."""

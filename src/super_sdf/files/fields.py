@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from ..errors import OptionError, OptionTypeError, OutOfMemoryError, WriteError, seen
+from ..errors import OptionError, OptionTypeError, seen
 from ..options import check_path
 from ..refine.field import FineField, fine_grid, lattice_planes, lattice_shape
 from ..surface.cap import check_all_seen
-from ..threads import held_memory, in_words, memory_bound
-from .output import check_free, free_space, naming, replacing
+from ..threads import check_fits
+from .output import check_free, naming, replacing
 from .sparse import write_sparse
 from .vdb_writer import write_level_set
 
@@ -39,8 +39,12 @@ def write_vti(field: FineField, path: Path) -> None:
     for first, planes in lattice_planes(field):
         values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
     extent = " ".join(f"0 {nodes - 1}" for nodes in grid.shape)
-    place = {"Origin": grid.origin, "Spacing": grid.spacing, "Direction": np.ravel(grid.direction)}
-    placed = " ".join(f'{n}="{" ".join(map(repr, map(float, at)))}"' for n, at in place.items())
+    place: dict[str, Any] = {
+        "Origin": grid.origin,
+        "Spacing": grid.spacing,
+        "Direction": np.ravel(grid.direction),
+    }
+    placed = " ".join(f'{n}="{" ".join(f"{x:.17g}" for x in at)}"' for n, at in place.items())
     head = (
         '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
         f'<ImageData WholeExtent="{extent}" {placed}>\n<Piece Extent="{extent}">\n'
@@ -71,27 +75,12 @@ def check_field_target(path: str | Path, *, force: bool = False) -> Path:
     return check_free(path, force=force)
 
 
-def check_field_fits(
-    path: Path, shape: tuple[int, int, int], max_memory: int | None = None
-) -> None:
-    """Raise an error if a dense file of a lattice does not fit on the disk, or .vti in memory."""
-    suffix = path.suffix.lower()
-    if suffix not in (".npy", ".vti"):
-        return
-    size = 4 * prod(shape)
-    what = f"{' x '.join(map(str, shape))} values take {in_words(size)}"
-    free, bound = free_space(path), memory_bound(max_memory)
-    if size > free:
-        raise WriteError(
-            f"{path} cannot be written: {what}, {in_words(free)} are free there; write .npz, which "
-            "is sparse"
-        )
-    left = None if bound is None else bound - (held_memory() or 0)
-    if suffix == ".vti" and left is not None and size > left:
-        raise OutOfMemoryError(
-            f"{path} cannot be written: {what} of memory, {in_words(max(left, 0))} are left; "
-            "write .npy, which is written plane by plane, or .npz, which is sparse"
-        )
+def check_field_fits(path: Path, shape: tuple[int, int, int]) -> None:
+    """Raise OutOfMemoryError if the fine lattice must be held for a file, and does not fit."""
+    if path.suffix.lower() == ".vti":
+        size = " x ".join(map(str, shape))
+        way_out = "write .npy, which is written plane by plane, or .npz, which is sparse"
+        check_fits(4 * prod(shape), f"{path}, {size} values,", way_out)
 
 
 @dataclass

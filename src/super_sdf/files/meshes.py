@@ -11,7 +11,6 @@ mesh.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from pathlib import Path
@@ -208,12 +207,8 @@ def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> None:
         reach = float((np.abs(grid.direction) @ sides).max())
         if tells_vertices_apart(np.float32, reach, grid, factor):
             return
-    apart, limits = CLEARANCE * grid.voxel_size / factor, np.finfo(np.float32)
-    step = max(math.ulp(reach) * 2**29, float(limits.smallest_subnormal))  # 29 bits fewer
-    limit = f"in steps of {step:.2g} at {reach:.6g}"
-    if reach > float(limits.max):
-        limit = f"numbers up to {limits.max:.2g}, the mesh reaches {reach:.2g}"
+    apart = CLEARANCE * grid.voxel_size / factor
     raise FileError(
-        f"{path} cannot hold the mesh: {suffix} has single precision, {limit}, and vertices are "
-        f"down to {apart:.2g} apart; write .ply or .obj"
+        f"{path} cannot hold the mesh: {suffix} has single precision, too coarse at {reach:.6g} "
+        f"for vertices down to {apart:.2g} apart; write .ply or .obj"
     )

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -53,12 +52,6 @@ def check_apart(path: str | Path, others: Iterable[str | Path]) -> None:
     for other in others if os.path.exists(path) else ():
         if os.path.exists(other) and os.path.samefile(path, other):
             raise WriteError(f"{path} is the same file as {other}: give another file")
-
-
-def free_space(path: Path) -> int:
-    """Return the free bytes on the disk of a file."""
-    with naming(path):
-        return shutil.disk_usage(_behind_links(path).parent).free
 
 
 def _mode_of(path: Path) -> int | None:

@@ -352,3 +352,15 @@ def describe_place(grid: SdfGrid) -> dict[str, Any]:
         "direction": [list(row) for row in grid.direction],
         "space": grid.space,
     }
+
+
+def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
+    """Return the volume of the samples inside, each of which counts as a box."""
+    planes = (grid.planes(nth, nth + 1) for nth in range(grid.shape[0]))
+    inside = sum(int(np.count_nonzero(plane <= offset)) for plane in planes)
+    return inside * float(np.prod(grid.spacing))
+
+
+def mean_spacing(grid: SdfGrid) -> float:
+    """Return the edge of a cube with the volume of a box round a sample."""
+    return float(np.prod(grid.spacing) ** (1 / 3))

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
-
 
 from ..errors import MeshError, OptionError, seen
 from ..files.mesh_writers import World
@@ -22,7 +21,7 @@ from ..files.meshes import (
 from ..files.output import check_apart
 from ..files.regular import files_of
 from ..files.volume import PLACE
-from ..grid.sdf_grid import SdfGrid, describe_place
+from ..grid.sdf_grid import SdfGrid, describe_place, mean_spacing
 from ..network.decoder import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..progress import Progress, Stopwatch
@@ -30,7 +29,7 @@ from ..surface.mesh import Mesh
 from .image import find_image, in_order
 from .names import LabelName, Names, in_file_name, numbers_of
 from .reconstruct import label_meshes
-from .volumes import keep_volumes, mean_spacing, volume_notes
+from .volumes import keep_volumes, volume_notes
 
 MOST_FILES = 500
 
@@ -53,7 +52,8 @@ class LabelConversion:
 
     def remarks(self) -> list[str]:
         """Return a note on the labels that the image lacks, if there are some."""
-        return missing_note(self.missing)
+        names = ", ".join(row["name"] for row in self.missing)
+        return [f"no sample has a label that was asked for: {names}"] * bool(names)
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -61,7 +61,7 @@ class LabelConversion:
             **describe_place(self.grid),
             "labels": self.labels,
             "missing": self.missing,
-            "inferred": [*self.grid.notes, *self.notes],
+            "inferred": list(self.notes),
         }
 
 
@@ -104,7 +104,7 @@ def convert_labels(
         check_apart(path, files_of(source))
     check_format_holds(target, grid, options.factor)
     watch.lap("read")
-    meshes = label_meshes(image, network, options.factor, max_memory=bound, progress=progress)
+    meshes = label_meshes(image, network, options.factor, bound, progress)
     torn = [label for label, mesh in zip(called, meshes) if mesh.open_edges()]
     if torn:
         raise MeshError(f"the mesh of label {torn[0]} is torn: run it again, and report it")
@@ -131,7 +131,7 @@ def convert_labels(
         grid,
         rows,
         [{"label": label, "name": entry.name} for label, entry in missing.items()],
-        (*local_origin_note(target, meshes), *off),
+        (*grid.notes, *local_origin_note(target, meshes), *off),
         watch.seconds,
     )
 
@@ -150,12 +150,6 @@ def names_of(labels: list[int], known: Names) -> Names:
     entries = {label: known.get(label, LabelName(f"label {label}")) for label in labels}
     names = told_apart({label: entry.name for label, entry in entries.items()}, " ")
     return {label: entries[label]._replace(name=name) for label, name in names.items()}
-
-
-def missing_note(missing: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a note on the labels that an image lacks, if there are some."""
-    names = ", ".join(row["name"] for row in missing)
-    return [f"no sample has a label that was asked for: {names}"] if missing else []
 
 
 def told_apart(names: dict[int, str], mark: str) -> dict[int, str]:
@@ -183,13 +177,12 @@ def label_paths(target: str | Path, labels: Sequence[Any]) -> list[Path]:
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:
     """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
-    others = [name for name in vars(options) if name not in LABELS]
-    given = [
-        name for name in others if getattr(options, name) not in (OPTIONS[name].default, MARCHING)
-    ]
+    given = {}
+    for name, value in vars(options).items():
+        if name not in LABELS and value not in (OPTIONS[name].default, MARCHING):
+            given[name] = f" {seen(value)}"
     for name in (*given, *more):
-        value = f" {seen(getattr(options, name))}" if name in given else ""
-        text = "open" if name == "cap" else f"{name.replace('_', '-')}{value}"
+        text = "open" if name == "cap" else name.replace("_", "-") + given.get(name, "")
         raise OptionError(
             f"{text} does not go with labels, which share their walls: "
             "leave it out, or mesh one label (--label)"

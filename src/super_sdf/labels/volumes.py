@@ -33,28 +33,15 @@ Rows = NDArray[np.intp]
 
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
+    kind, said = grid.field.kind, ""
     if offset:
-        raise OptionError(
-            f"keep-volume is for the surface of the samples, offset is {offset:g}: give one only"
-        )
-    if grid.field.kind != MASK:
-        raise OptionError(
-            f"keep-volume is for masks and labels, the values are {grid.field.kind}: leave it out"
-        )
-    if not cap:
-        raise OptionError("keep-volume needs a closed mesh: leave out --open")
-
-
-def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
-    """Return the volume of the samples inside, each of which counts as a box."""
-    planes = (grid.planes(nth, nth + 1) for nth in range(grid.shape[0]))
-    inside = sum(int(np.count_nonzero(plane <= offset)) for plane in planes)
-    return inside * float(np.prod(grid.spacing))
-
-
-def mean_spacing(grid: SdfGrid) -> float:
-    """Return the edge of a cube with the volume of a box round a sample."""
-    return float(np.prod(grid.spacing) ** (1 / 3))
+        said = f" is for the surface of the samples, offset is {offset:g}: give one only"
+    elif kind != MASK:
+        said = f" is for masks and labels, the values are {kind}: leave it out"
+    elif not cap:
+        said = " needs a closed mesh: leave out --open"
+    if said:
+        raise OptionError(f"keep-volume{said}")
 
 
 def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -67,15 +54,8 @@ def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
 def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: float) -> list[Mesh]:
     """Return closed meshes moved along their normals until they have the given volumes.
 
-    Parameters
-    ----------
-    meshes : sequence of Mesh
-        With the same vertices where they touch; triangles stay as they are.
-    volumes : sequence of float
-        In cubic world units.
-    spacing : float
-        Mean spacing of the samples, in world units. No surface moves by more than an eighth of it,
-        so the volume of a speck may stay another one.
+    Meshes have the same vertices where they touch; triangles stay as they are. No surface moves by
+    more than an eighth of the ``spacing``, so the volume of a speck may stay another one.
     """
     kind = meshes[0].vertices.dtype
     vertices = np.concatenate([mesh.vertices for mesh in meshes]) + 0  # -0 is 0
@@ -110,8 +90,7 @@ def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: floa
 
 def _slopes(points: Vectors, faces: NDArray[Any]) -> Vectors:
     """Return by how much a volume grows as its vertices move, (n, 3)."""
-    normals = np.repeat(face_normals(points, faces), 3, axis=0)
-    return sums_at(faces.ravel(), normals, len(points)) / 6
+    return sums_at(faces.ravel(), face_normals(points, faces).repeat(3, 0), len(points)) / 6
 
 
 def _mean_normals(

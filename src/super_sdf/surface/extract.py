@@ -8,16 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import IntArray
-from ..errors import OptionTypeError, seen
-from ..functions.function import Function, as_function
-from ..grid.cubic import cubic_grid
-from ..grid.sdf_grid import SdfGrid, check_grid
-from ..options import AUTO, DEFAULT_MESHER, MARCHING, SHARP, MesherName, check_cap, check_mesher
+from ..grid.sdf_grid import SdfGrid
+from ..options import AUTO, MARCHING, SHARP, MesherName, check_mesher
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk
 from ..threads import check_count, map_chunks
 from . import marching
-from .cap import check_can_close, close
+from .cap import close
 from .mesh import Mesh, vertex_type
 
 TEMPORARIES = 16  # numbers per vertex in the computation of its position
@@ -120,8 +117,7 @@ def keys_of(node_ijk: IntArray, shape: NDArray[Any], factor: int) -> NDArray[np.
     """Return the keys of nodes (n, 3), counted from the first of the whole: see ``extract``."""
     _, ny, nz = (factor * (shape + 2) + 1).tolist()
     i, j, k = node_ijk.T.astype(np.int64) + factor
-    keys: NDArray[np.int64] = KEYS_PER_NODE * ((i * ny + j) * nz + k)
-    return keys
+    return np.asarray(KEYS_PER_NODE * ((i * ny + j) * nz + k))
 
 
 def to_world(positions: NDArray[np.float64], factor: int, lattice: SdfGrid) -> NDArray[np.float64]:
@@ -133,53 +129,3 @@ def to_world(positions: NDArray[np.float64], factor: int, lattice: SdfGrid) -> N
     for axis, sample in enumerate(samples):
         world[:, axis] = sample * lattice.spacing[axis] + lattice.origin[axis]
     return world
-
-
-def extract_mesh(
-    field: FineField,
-    grid: SdfGrid | None = None,
-    *,
-    mesher: MesherName = DEFAULT_MESHER,
-    cap: bool = True,
-    function: Function | None = None,
-) -> Mesh:
-    """Return the zero level of a field as triangles in world coordinates.
-
-    A node with value 0 is inside.
-
-    Parameters
-    ----------
-    field : FineField
-        From ``upsample`` or ``read_field``.
-    grid : SdfGrid, optional
-        A coarse grid for spacing, origin and direction. Default: the one that the field was made
-        from.
-    mesher : str
-        As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
-    cap : bool
-        Close a surface that leaves the grid, as in ``reconstruct``. A field that was made without
-        its grid stays open.
-    function : callable or DistanceFunction, optional
-        What the grid has samples of; vertices are then put where it is 0, as in ``reconstruct``.
-
-    Raises
-    ------
-    OptionError
-        If there is no such mesher; if there are more vertices than 32-bit numbers.
-    OptionTypeError
-        If an argument is something else.
-    """
-    if not isinstance(field, FineField):
-        raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
-    grid = field.placed if grid is None else grid
-    check_grid(grid)
-    samples = field.spheres
-    chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
-    cap = check_cap(cap) and field.grid is not None
-    check_can_close(grid, cap=cap)
-    mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
-    if function is None:
-        return mesh
-    from ..functions.zero import put_on_zero  # imported here, as few call it
-
-    return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import warnings
 import zipfile
@@ -34,7 +35,16 @@ def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
     """
     path = check_regular_file(path)
     try:
-        _check_archive(path, max_memory)
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                size = sum(info.file_size for info in archive.infolist())
+            need = XML_BYTES * size
+            left = (memory_bound(max_memory) or math.inf) - (held_memory() or 0)
+            if need > left:
+                raise OutOfMemoryError(
+                    f"{path} unpacks to {in_words(size)}, and to read it takes {in_words(need)} of "
+                    f"memory, {in_words(int(max(left, 0)))} are left; save it as .ply or .stl"
+                )
         vertices, faces = _load(path)
     except OutOfMemoryError:
         raise
@@ -84,52 +94,25 @@ def merged(mesh: Mesh) -> Mesh:
     return Mesh(vertices[first], place.astype(np.int32)[faces])
 
 
-def _check_archive(path: Path, max_memory: int | None) -> None:
-    """Raise OutOfMemoryError if a zip file, by its entries, unpacks to more than fits in memory."""
-    bound = memory_bound(max_memory)
-    if bound is None or not zipfile.is_zipfile(path):
-        return
-    with zipfile.ZipFile(path) as archive:
-        size = sum(info.file_size for info in archive.infolist())
-    need, left = XML_BYTES * size, max(bound - (held_memory() or 0), 0)
-    if need > left:
-        raise OutOfMemoryError(
-            f"{path} unpacks to {in_words(size)}, and to read it takes {in_words(need)} of memory, "
-            f"{in_words(left)} are left; save it as binary .ply or .stl"
-        )
-
-
 def _load(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return vertices (n, 3) and faces (m, 3) as they stand, without warnings on the way."""
     import trimesh
-
-    log, handler = logging.getLogger("trimesh"), logging.NullHandler()
-    log.addHandler(handler)  # without a handler, Python prints warnings to stderr
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            # unprocessed: otherwise faces with non-finite vertices would be dropped silently
-            found = trimesh.load_mesh(path, process=False, resolver=_file_resolver(path))
-            vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
-            faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
-    finally:
-        log.removeHandler(handler)
-    return vertices, faces
-
-
-def _file_resolver(path: Path) -> Any:
-    """Return a resolver for trimesh that opens the materials and buffers of a mesh file."""
     from trimesh.resolvers import FilePathResolver
 
     class RegularFileResolver(FilePathResolver):
-        """Opens regular files only: a mesh may refer to a pipe, which never ends."""
+        """Opens materials and buffers if they are regular files: a pipe would never end."""
 
         def get(self, name: str) -> Any:
-            """Return the content of a file."""
-            for candidate in (name.strip(), name.strip().lstrip("/"), os.path.split(name)[-1]):
-                named = os.path.join(self.parent, candidate)
-                if os.path.exists(named):
-                    check_regular_file(named)
+            for candidate in (name.strip(), name.strip().lstrip("/"), os.path.basename(name)):
+                if os.path.exists(beside := os.path.join(self.parent, candidate)):
+                    check_regular_file(beside)
             return super().get(name)
 
-    return RegularFileResolver(str(path))
+    logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python prints them
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        # unprocessed: otherwise faces with non-finite vertices would be dropped silently
+        found = trimesh.load_mesh(path, process=False, resolver=RegularFileResolver(str(path)))
+        vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
+        faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
+    return vertices, faces

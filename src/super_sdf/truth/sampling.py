@@ -38,17 +38,14 @@ Layout = tuple[tuple[int, int, int], float, NDArray[np.float64]]
 
 
 def check_numbers(
-    *,
     n: int | None = None,
     spacing: float | None = None,
     padding: float = 2.0,
     band: float | None = None,
 ) -> None:
     """Raise OptionError if a number that is given is out of range, whatever the mesh."""
-    if n is not None and n < 2:
-        raise OptionError(f"n is {n}: give at least 2 samples along the longest axis")
-    if n is not None and n >= MOST_ALONG_AXIS:
-        raise OptionError(f"n is {seen(n)}: give fewer than {MOST_ALONG_AXIS:g} samples")
+    if n is not None and not 2 <= n < MOST_ALONG_AXIS:
+        raise OptionError(f"n is {seen(n)}: give 2 to {MOST_ALONG_AXIS:g} samples along an axis")
     if spacing is not None and not 0 < spacing < np.inf:
         raise OptionError(f"spacing is {spacing:g}: it must be greater than 0")
     if not 0 <= padding < np.inf:
@@ -71,8 +68,7 @@ def fitted_layout(
     """Return the layout of a grid around a mesh, in the units of the mesh.
 
     Give the samples ``n`` along the longest axis of its bounding box, or the ``spacing``.
-    ``padding`` is the least number of voxels between the box and the outermost samples. OptionError
-    if not exactly one of n and spacing is given, or a number is out of range.
+    ``padding`` is the least number of voxels between the box and the outermost samples.
     """
     if (n is None) == (spacing is None):
         raise OptionError("give either the number of samples or the spacing")
