@@ -44,9 +44,8 @@ def at_least(least: int) -> Callable[[str], int]:
     """Return a parser for whole numbers of at least ``least``."""
 
     def whole(text: str) -> int:
-        number = int(text)
-        if number < least:
+        if int(text) < least:
             raise argparse.ArgumentTypeError(f"{text}: give at least {least}")
-        return number
+        return int(text)
 
     return whole

@@ -14,14 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from export.dataset import Sample, fill_shard
+from export.dataset import Sample, fill_shard, parser_of_options
 from super_sdf.grid import derived
 from super_sdf.network import contract, neighbourhood
 from super_sdf.refine import band
 
 DISTANCES = "distances"  # of which some were noisy: what a card without an entry says
 INPUTS = (DISTANCES, contract.MASKS)
-THIN = 0.05  # share of thin solids among those drawn for calibration, as in training
 
 
 @dataclass(frozen=True)
@@ -77,19 +76,21 @@ def turned(sample: Prepared, number: int) -> Prepared:
 
 
 def change(rng: np.random.Generator, sample: Sample, inputs: str, shares: Shares) -> Prepared:
-    """Make a mask of a sample, or shift, roughen and truncate some, and gather it."""
+    """Make a mask of a sample, or shift, roughen and truncate some; then gather it."""
     if inputs == contract.MASKS:
         return prepare(masked(rng, sample))
-    return truncated(rng, prepare(noisy(rng, shifted(rng, sample, shares), shares)), shares)
-
-
-def shifted(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
-    """Move the zero level by up to half a voxel (Sec. 5.3)."""
-    if rng.random() >= shares.shifted:
-        return sample
-    level = np.float32(rng.uniform(-1, 1))
-    targets = sample.targets.astype(np.float32) - level
-    return replace(sample, window=sample.window - level, targets=targets)
+    window, targets = sample.window, sample.targets.astype(np.float32)
+    if rng.random() < shares.shifted:  # another zero level, up to half a voxel away (Sec. 5.3)
+        level = np.float32(rng.uniform(-1, 1))
+        window, targets = window - level, targets - level
+    if rng.random() < shares.noisy:  # by up to half a voxel; small amplitudes are more frequent
+        noise = rng.uniform(-1, 1, window.shape) * rng.random() ** 1.5
+        window = window + noise.astype(np.float32)
+    prepared = prepare(replace(sample, window=window, targets=targets))
+    if rng.random() < shares.truncated:  # at 1.5 to 3 voxels
+        limit = rng.uniform(3, 6)
+        return replace(prepared, patches=prepared.patches.clamp(-limit, limit))
+    return prepared
 
 
 def masked(rng: np.random.Generator, sample: Sample) -> Sample:
@@ -104,25 +105,10 @@ def masked(rng: np.random.Generator, sample: Sample) -> Sample:
     return replace(sample, window=window, targets=targets)
 
 
-def noisy(rng: np.random.Generator, sample: Sample, shares: Shares) -> Sample:
-    """Add uniform noise of up to half a voxel; small amplitudes are more frequent."""
-    if rng.random() >= shares.noisy:
-        return sample
-    noise = rng.uniform(-1, 1, sample.window.shape) * rng.random() ** 1.5
-    return replace(sample, window=sample.window + noise.astype(np.float32))
-
-
-def truncated(rng: np.random.Generator, sample: Prepared, shares: Shares) -> Prepared:
-    """Truncate the values at 1.5 to 3 voxels."""
-    if rng.random() >= shares.truncated:
-        return sample
-    limit = rng.uniform(3, 6)
-    return replace(sample, patches=sample.patches.clamp(-limit, limit))
-
-
 def draw_samples(count: int = 200, inputs: str = DISTANCES) -> list[Prepared]:
     """Return samples of procedural shapes, some noisy, some truncated; or masks of them."""
     rng = np.random.default_rng(0)
-    samples = fill_shard(rng, [], 1.0, THIN, count)
+    options = parser_of_options().parse_args(["--out", "none"])  # the usual shares and sizes
+    samples = fill_shard(rng, [], count, options)
     shown = [change(rng, sample, inputs, USUAL) for sample in samples]
     return [sample for sample in shown if len(sample.voxels)]  # thin ones may vanish in masks

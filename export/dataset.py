@@ -1,7 +1,6 @@
 """Training samples: windows of coarse grids with exact distances at fine query points.
 
     python -m export.dataset --meshes DIR --procedural 0.3 --out training/store --count 5000
-    python -m export.dataset --families sculpture creature --out training/store --seed 9
     python -m export.dataset --smooth --slices 6 --out training/store --seed 20 --count 2000
 
 A sample is one shape in one pose at one resolution. It holds a window of the coarse grid and, for
@@ -11,13 +10,9 @@ x, y and z (the loss takes the gradient from their differences), then some nodes
 lattice (which includes those of 2 and 8), then some points anywhere in the voxel. Values are
 rescaled (half voxels, Eqs. 4 and 5).
 
-Samples are stored in shards, ``shard-<seed>-<number>.npz``, as concatenated flat arrays:
-``windows`` (float32) with ``window_shape``, ``offsets`` (n, Q, 3), ``voxel_ijk`` (D, 3) and
-``targets`` (D, Q) float16 with ``voxel_count``. Without ``--meshes`` all shapes are procedural.
-With it, each mesh is used once before any is repeated, except that simple prisms are limited to a
-sixth, and ``--procedural`` is the share of procedural shapes among them. A share ``--thin`` of the
-samples are of solids so thin that hardly any sample lies inside. With ``--smooth`` all are of
-smooth bodies, in shards ``smooth-<seed>-<number>.npz``.
+Samples are stored in shards as concatenated flat arrays: ``windows`` (float32) with
+``window_shape``, ``offsets`` (n, Q, 3), ``voxel_ijk`` (D, 3) and ``targets`` (D, Q) float16 with
+``voxel_count``. Each mesh is used once before any is repeated, but simple prisms are a sixth.
 """
 
 from __future__ import annotations
@@ -104,9 +99,9 @@ def draw_offsets(rng: np.random.Generator) -> np.ndarray:
 def make_sample(
     rng: np.random.Generator,
     mesh: Mesh,
-    lowest: tuple[float, float] = (-np.inf, np.inf),
     sizes: tuple[float, float] = SIZES,
     slices: float = 1.0,
+    lowest: tuple[float, float] = (-np.inf, np.inf),
 ) -> Sample | None:
     """Sample a shape; return None if no sample is near the surface, or all are inside.
 
@@ -215,29 +210,23 @@ def read_shard(path: Path) -> Iterator[Sample]:
         yield Sample(windows[n].reshape(shape), shard["offsets"][n], voxels[n], targets[n])
 
 
-def find_meshes(folder: Path | None) -> tuple[list[Path], list[Path]]:
-    """Return the files of simple prisms (under 128 faces, by file size) and all others."""
+def mesh_order(folder: Path | None, count: int, seed: int) -> list[Path]:
+    """Return ``count`` files at least, or none: each mesh once before any is repeated.
+
+    A sixth are simple prisms (under 128 faces, by file size), unless there is nothing else.
+    """
     if folder is None:
-        return [], []
+        return []
     if not folder.is_dir():
         raise FileError(f"--meshes {folder} is not a folder: give one with closed .ply meshes")
     files = [file for file in sorted(folder.glob("*.ply")) if file.is_file()]
     if not files:
         raise FileError(f"--meshes {folder} has no .ply file: other formats are not read here")
     prisms = [file for file in files if file.stat().st_size < 3000]
-    return prisms, sorted(set(files) - set(prisms))
-
-
-def mesh_order(seed: int, prisms: list[Path], others: list[Path], count: int) -> list[Path]:
-    """Return ``count`` files: each mesh once before any is repeated, a sixth of them prisms.
-
-    If there are only prisms, all files are.
-    """
-    rng = np.random.default_rng(seed)
-    others, prisms = (others, prisms) if others else (prisms, [])
-    order: list[Path] = []
-    while others and len(order) < count:
-        few = rng.permutation(prisms)[: len(others) // 5].tolist()
+    others = sorted(set(files) - set(prisms)) or prisms
+    rng, order = np.random.default_rng(seed), list[Path]()
+    while len(order) < count:
+        few = [] if others is prisms else rng.permutation(prisms)[: len(others) // 5].tolist()
         order += rng.permutation([*others, *few]).tolist()
     return order
 
@@ -251,43 +240,29 @@ def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
     return Mesh(draw_sway(rng, 0.6)(mesh.vertices / diagonal), mesh.faces)
 
 
-def make_thin_sample(rng: np.random.Generator, families: Sequence[str] = ()) -> Sample:
-    """Squeeze random procedural shapes along their axes until one is thin in its window."""
-    sample = None
-    while sample is None:
-        drawn = random_solid(rng, families)
-        squeezed = drawn.transformed(np.diag(np.exp(rng.normal(0, 1, 3))), np.zeros(3))
-        sample = make_sample(rng, squeezed, THIN)
-    return sample
-
-
 def fill_shard(
-    rng: np.random.Generator,
-    files: Sequence[Path],
-    procedural: float,
-    thin: float,
-    count: int = SHARD,
-    families: Sequence[str] = (),
-    sizes: tuple[float, float] = SIZES,
-    slices: float = 1.0,
+    rng: np.random.Generator, files: Sequence[Path], count: int, options: argparse.Namespace
 ) -> list[Sample]:
     """Make the samples of a shard; a procedural shape replaces a mesh without a usable sample."""
     samples: list[Sample] = []
     for number in range(count):
-        if rng.random() < thin:
-            samples.append(make_thin_sample(rng, families))
-            continue
-        drawn = not files or rng.random() < procedural
-        mesh = random_solid(rng, families) if drawn else draw_mesh(rng, files[number])
-        sample = make_sample(rng, mesh, sizes=sizes, slices=slices)
+        thin = rng.random() < options.thin
+        sample, file = None, files[number] if files and not thin else None
+        if options.smooth:
+            sample = make_smooth_sample(rng, options.slices)
+        elif file and rng.random() >= options.procedural:
+            sample = make_sample(rng, draw_mesh(rng, file), options.sizes, options.slices)
         while sample is None:
-            sample = make_sample(rng, random_solid(rng, families), sizes=sizes, slices=slices)
+            mesh = random_solid(rng, options.families)
+            if thin:  # squeezed along its axes until hardly any sample lies inside
+                mesh = mesh.transformed(np.diag(np.exp(rng.normal(0, 1, 3))), np.zeros(3))
+            lowest = THIN if thin else (-np.inf, np.inf)
+            sample = make_sample(rng, mesh, options.sizes, options.slices, lowest)
         samples.append(sample)
     return samples
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    """Fill a store; existing shards are kept."""
+def parser_of_options() -> Parser:
     parser = Parser(description=__doc__.split("\n")[0])
     add = parser.add_argument
     add("--meshes", type=Path, help="folder of closed .ply meshes")
@@ -303,31 +278,24 @@ def main(words: Sequence[str] | None = None) -> None:
     add("--out", type=Path, required=True, help="folder for the shards")
     add("--count", type=at_least(1), default=5000, help="samples to make")
     add("--seed", type=at_least(0), default=0)
+    return parser
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Fill a store; existing shards are kept."""
+    parser = parser_of_options()
     options = parser.parse_args(words)
-    with parser.one_line_errors():
-        fill_store(options)
-
-
-def fill_store(options: argparse.Namespace) -> None:
-    files = mesh_order(options.seed, *find_meshes(options.meshes), options.count + SHARD)
-    options.out.mkdir(parents=True, exist_ok=True)
-    shares, sizes = (options.procedural, options.thin), tuple(options.sizes)
     kind = "smooth" if options.smooth else "shard"
-    for number in range(-(-options.count // SHARD)):
-        path = options.out / f"{kind}-{options.seed}-{number:04d}.npz"
-        if path.exists():
-            continue
-        rng = np.random.default_rng([options.seed, number])
-        drawn = files[number * SHARD : (number + 1) * SHARD]
-        count = min(SHARD, options.count - number * SHARD)
-        if options.smooth:
-            samples = [make_smooth_sample(rng, options.slices) for _ in range(count)]
-        else:
-            samples = fill_shard(
-                rng, drawn, *shares, count, options.families, sizes, options.slices
-            )
-        write_shard(path, samples)
-        print(f"{path.name}: {sum(len(s.voxel_ijk) for s in samples)} voxels", flush=True)
+    with parser.one_line_errors():
+        files = mesh_order(options.meshes, options.count + SHARD, options.seed)
+        options.out.mkdir(parents=True, exist_ok=True)
+        for start in range(0, options.count, SHARD):
+            number, count = start // SHARD, min(SHARD, options.count - start)
+            path = options.out / f"{kind}-{options.seed}-{number:04d}.npz"
+            if not path.exists():
+                rng = np.random.default_rng([options.seed, number])
+                write_shard(path, fill_shard(rng, files[start : start + count], count, options))
+                print(path.name, flush=True)
 
 
 if __name__ == "__main__":

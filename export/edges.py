@@ -1,39 +1,32 @@
 """Fit the rule that tells edges from rounded ground: see ``super_sdf.surface.sharp.features``.
 
     python -m export.edges --meshes FOLDER_OF_PLY --procedural 0.4 --count 200 --out edges.npz
+    python -m export.edges --fit --write --out edges.npz   # into the package
 
 Shapes for training are sampled on a grid and refined by the shipped network. For every candidate
 of the mesher the surfaces there are compared with the true one, with vertices that go some shares
 of the way to the edge. The rule is the linear one of the evidence that loses least in the mean. The
-rows are kept in ``--out``; with ``--fit`` alone they are fitted again. ``--write`` puts the rule
-into the package.
+rows are kept in ``--out``; with ``--fit`` they are fitted again.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from export.arguments import Parser, at_least, share
-from export.dataset import draw_mesh, find_meshes
+from export.dataset import draw_mesh, mesh_order
 from export.shapes.solid import random_solid
-from lab.metrics import face_vectors
-from lab.shapes import Case, Setting, Shape
+from super_sdf import Mesh, load_network, upsample
 from super_sdf.errors import SuperSdfError
-from super_sdf.grid.sdf_grid import SdfGrid
-from super_sdf.network.network import Network, load_network
-from super_sdf.pipeline import upsample
-from super_sdf.refine.field import FineField
-from super_sdf.surface.cap import close
-from super_sdf.surface.extract import to_world
-from super_sdf.surface.marching import find_crossings
-from super_sdf.surface.sharp.features import RULE, Rule, find_candidates, place
-from super_sdf.surface.sharp.patches import Placed, Triangles, find_patches, triangles_of
-from super_sdf.surface.sharp.planes import planes_at_crossings
-from super_sdf.truth.solid import Solid
+from super_sdf.network.decoder import Decoder
+from super_sdf.surface import cap, extract, marching
+from super_sdf.surface.sharp import features, patches, planes
+from super_sdf.truth import sampling, solid
 
 SIZES = (24, 32, 32, 48)  # drawn from, samples along an axis
 FACTOR = 4
@@ -43,8 +36,7 @@ MOST = 5.0  # that one candidate may lose beyond the best share
 AT = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.2, 0.6]])  # points of a triangle
 MOST_OF_SHAPE = 2000  # candidates that one shape counts for
 PENALTY = 1e-4  # of the squares of the weights of the standardised evidence
-STEPS = 300  # of gradient descent
-RATE = 0.02
+STEPS, RATE = 300, 0.02  # of gradient descent
 # Shares that lose least are made 0 and 1 from here on: that costs a twentieth of the gain
 # and more edges are whole.
 KNEE = 0.3, 0.7
@@ -56,67 +48,60 @@ The loss is how far the surface there is from the true one, and turned from it, 
 """
 
 
-def draw_case(rng: np.random.Generator, paths: list[Path], procedural: float, number: int) -> Case:
-    """Return a shape for training, turned at random, sampled on a grid."""
-    drawn = not paths or rng.random() < procedural
-    mesh = random_solid(rng) if drawn else draw_mesh(rng, paths[rng.integers(len(paths))])
-    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    rotation *= np.sign(np.linalg.det(rotation))
-    shape = Shape(f"drawn-{number}", mesh.transformed(rotation, np.zeros(3)))
-    return Case(shape, Setting(int(rng.choice(SIZES)), FACTOR))
-
-
-def rows_of(case: Case, network: Network) -> tuple[np.ndarray, np.ndarray]:
-    """Return the evidence (f, e) and the losses (f, s) of all candidates of a case."""
-    field = close(upsample(case.grid, network, FACTOR), cap=True)
-    every = np.ones(len(field.voxel_ijk), bool)
-    crossings = find_crossings(field)
+def rows_of(mesh: Mesh, size: int, network: Decoder) -> tuple[np.ndarray, np.ndarray]:
+    """Return the evidence (f, e) and the losses (f, s) of all candidates of a shape."""
+    truth = solid.Solid(mesh)
+    grid = sampling.sample_solid(truth, sampling.unit_layout(size))
+    field = cap.close(upsample(grid, network, FACTOR), cap=True)
+    every, crossings = np.ones(len(field.voxel_ijk), bool), marching.find_crossings(field)
+    found, used = patches.find_patches(field, crossings, every)
     border = np.array([(0, 0, 0), field.shape])
-    patches, used = find_patches(field, crossings, every)
-    own = planes_at_crossings(field, crossings, used, border)
-    candidates = find_candidates(patches, own, every, field)
+    own = planes.planes_at_crossings(field, crossings, used, border)
+    candidates = features.find_candidates(found, own, every, field)
     losses = []
     for way in SHARES:
-        placed = place(patches, own, candidates, np.full(len(candidates.patch), way))
-        made = triangles_of(patches, placed, np.ones(len(patches.row), bool))
-        errors = errors_of(case.shape.solid, made, placed, field, case.grid)
-        losses.append((errors[candidates.patch] / (DISTANCE, TURN)).sum(1))
+        placed = features.place(found, own, candidates, np.full(len(candidates.patch), way))
+        patch, corners = patches.triangles_of(found, placed, np.ones(len(found.row), bool))
+        points = extract.to_world(placed.points[corners].reshape(-1, 3).T, FACTOR, grid)
+        errors = errors_of(truth, patch, points.reshape(-1, 3, 3), len(found.row))
+        losses.append((errors[candidates.patch] / (DISTANCE / size, TURN)).sum(1))
     return candidates.evidence, np.stack(losses, 1)
 
 
-def errors_of(
-    solid: Solid, triangles: Triangles, placed: Placed, field: FineField, grid: SdfGrid
-) -> np.ndarray:
-    """Return the mean distance to the true surface of each patch, and 1 - cosine, (P, 2).
+def errors_of(truth: solid.Solid, patch: np.ndarray, corners: np.ndarray, count: int) -> np.ndarray:
+    """Return the mean distance to the true surface of each patch, and 1 - cosine, (count, 2).
 
-    Distances are in coarse voxels. Patches without triangles have 0.
+    Triangles (t, 3, 3) belong to patches (t,); patches without any have 0.
     """
-    patch, corners = triangles
-    corners = placed.points[corners]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal = normals_of(corners)
     area = np.linalg.norm(normal, axis=1)
-    normal /= np.maximum(area, 1e-12)[:, None]
+    normal /= np.maximum(area, 1e-18)[:, None]
     points = np.einsum("pk,tkd->ptd", AT, corners).reshape(-1, 3)
-    world = to_world(points.T, field.factor, grid)
-    distance = solid.distance(world).reshape(len(AT), -1).mean(0) / grid.spacing[0]
-    true = face_vectors(solid.mesh)[solid.nearest_face(world)]
-    true /= np.maximum(np.linalg.norm(true, axis=1), 1e-15)[:, None]
+    distance = truth.distance(points).reshape(len(AT), -1).mean(0)
+    true = normals_of(truth.mesh.vertices[truth.mesh.faces[truth.nearest_face(points)]])
+    true /= np.maximum(np.linalg.norm(true, axis=1), 1e-18)[:, None]
     turned = 1 - np.einsum("ptd,td->pt", true.reshape(len(AT), -1, 3), normal).mean(0)
-    total = np.maximum(np.bincount(patch, area), 1e-12)
-    sums = [np.bincount(patch, area * error) for error in (distance, turned)]
-    return np.stack(sums, 1) / total[:, None]
+    sums = [np.bincount(patch, area * error, count) for error in (distance, turned)]
+    return np.stack(sums, 1) / np.maximum(np.bincount(patch, area, count), 1e-18)[:, None]
+
+
+def normals_of(corners: np.ndarray) -> np.ndarray:
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def gather(options: argparse.Namespace) -> Rows:
     """Return the rows of as many shapes as are asked for, leaving out those without a mesh."""
     rng, network = np.random.default_rng(options.seed), load_network(device="cpu", threads=1)
-    prisms, others = find_meshes(options.meshes)
-    paths = [*prisms[: len(others) // 5], *others]
+    paths = mesh_order(options.meshes, 1, options.seed)
     parts: list[tuple[np.ndarray, ...]] = []
     while (number := len(parts)) < options.count:
+        drawn = not paths or rng.random() < options.procedural
+        mesh = random_solid(rng) if drawn else draw_mesh(rng, paths[rng.integers(len(paths))])
+        turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        turn *= np.sign(np.linalg.det(turn))
         try:
-            case = draw_case(rng, paths, options.procedural, number)
-            evidence, loss = rows_of(case, network)
+            turned = solid.normalise(mesh.transformed(turn, np.zeros(3)))
+            evidence, loss = rows_of(turned, int(rng.choice(SIZES)), network)
         except SuperSdfError:
             continue
         parts.append((np.full(len(evidence), number), evidence, loss))
@@ -126,11 +111,11 @@ def gather(options: argparse.Namespace) -> Rows:
     return rows
 
 
-def fit_rule(rows: Rows) -> Rule:
+def fit_rule(rows: Rows) -> features.Rule:
     """Return the rule of the least loss, by Adam's descent, made steeper at ``KNEE``."""
-    mean, spread = rows["evidence"].mean(0), np.maximum(rows["evidence"].std(0), 1e-9)
-    design = np.c_[np.ones(len(mean_rows := rows["evidence"])), (mean_rows - mean) / spread]
-    weight, loss = weights_of(rows), capped(rows["loss"])
+    evidence, (loss, weight) = rows["evidence"], capped(rows)
+    mean, spread = evidence.mean(0), np.maximum(evidence.std(0), 1e-9)
+    design = np.c_[np.ones(len(evidence)), (evidence - mean) / spread]
     found, first, second = np.zeros((3, design.shape[1]))
     found[0] = 0.5
     for step in range(1, STEPS + 1):
@@ -142,20 +127,7 @@ def fit_rule(rows: Rows) -> Rule:
         found -= RATE * (1 - step / STEPS) * fair[0] / (np.sqrt(fair[1]) + 1e-12)
     weights, (low, high) = found[1:] / spread, KNEE
     bias = found[0] - weights @ mean
-    return Rule(float(bias - low) / (high - low), tuple((weights / (high - low)).tolist()))
-
-
-def write_rule(rule: Rule) -> None:
-    """Write the rule into the package; the evidence keeps its names."""
-    names = json.loads(RULE.read_text())["weights"]
-    weights = {name: round(weight, 4) for name, weight in zip(names, rule.weights)}
-    RULE.write_text(json.dumps({"bias": round(rule.bias, 4), "weights": weights}, indent=2) + "\n")
-
-
-def weights_of(rows: Rows) -> np.ndarray:
-    """Return what candidates count for, (n,): less where their shape has many more than others."""
-    weight = np.minimum(1, MOST_OF_SHAPE / np.bincount(rows["shape"])[rows["shape"]])
-    return weight / weight.sum()
+    return features.Rule(float(bias - low) / (high - low), tuple((weights / (high - low)).tolist()))
 
 
 def loss_of(loss: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -167,34 +139,42 @@ def loss_of(loss: np.ndarray, share: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return loss[row, low] + (place - low) * slope, slope * (len(SHARES) - 1)
 
 
-def capped(loss: np.ndarray) -> np.ndarray:
-    """Return losses over that of the best share, (n, s), so that none counts for too much."""
-    return np.minimum(loss - loss.min(1, keepdims=True), MOST)
+def capped(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Return losses over that of the best share, (n, s), and what candidates count for, (n,).
+
+    None counts for too much, and less where its shape has many more than others.
+    """
+    loss = np.minimum(rows["loss"] - rows["loss"].min(1, keepdims=True), MOST)
+    weight = np.minimum(1, MOST_OF_SHAPE / np.bincount(rows["shape"])[rows["shape"]])
+    return loss, weight / weight.sum()
 
 
-def report(rows: Rows, rule: Rule) -> str:
-    """Return the mean loss with vertices in the middle, by a rule, and on the edge."""
-    share, loss, weight = rule.share(rows["evidence"]), capped(rows["loss"]), weights_of(rows)
-    shares = {"middle": 0 * share, "rule": share, "edge": 0 * share + 1}
-    return "\n".join(
-        f"{name}: {weight @ loss_of(loss, some)[0]:.4f}" for name, some in shares.items()
-    )
+def write_rule(rule: features.Rule) -> None:
+    """Write the rule into the package, each weight under the name that it has there."""
+    names = json.loads(features.RULE.read_text())["weights"]
+    weights = {name: round(weight, 4) for name, weight in zip(names, rule.weights, strict=True)}
+    stored = json.dumps({"bias": round(rule.bias, 4), "weights": weights}, indent=2)
+    features.RULE.write_text(stored + "\n")
 
 
-def main() -> None:
-    """Gather rows, or read those of a file, and fit the rule."""
+def main(words: Sequence[str] | None = None) -> None:
+    """Gather rows, or read those of a file, fit the rule, and print what is lost."""
     parser = Parser(description=__doc__.split("\n")[0])
-    parser.add_argument("--meshes", type=Path, help="folder of closed .ply meshes")
-    parser.add_argument("--procedural", type=share, default=0.4, help="share of procedural shapes")
-    parser.add_argument("--count", type=at_least(1), default=200, help="shapes to draw")
-    parser.add_argument("--out", type=Path, required=True, help="file of the rows, .npz")
-    parser.add_argument("--fit", action="store_true", help="fit the rows in --out again")
-    parser.add_argument("--write", action="store_true", help="write the rule into the package")
-    parser.add_argument("--seed", type=at_least(0), default=0)
-    options = parser.parse_args()
-    rows = dict(np.load(options.out)) if options.fit else gather(options)
-    rule = fit_rule(rows)
-    print(report(rows, rule))
+    add = parser.add_argument
+    add("--meshes", type=Path, help="folder of closed .ply meshes")
+    add("--procedural", type=share, default=0.4, help="share of procedural shapes")
+    add("--count", type=at_least(1), default=200, help="shapes to draw")
+    add("--out", type=Path, required=True, help="file of the rows, .npz")
+    add("--fit", action="store_true", help="fit the rows in --out again")
+    add("--write", action="store_true", help="write the rule into the package")
+    add("--seed", type=at_least(0), default=0)
+    options = parser.parse_args(words)
+    with parser.one_line_errors():
+        rows = dict(np.load(options.out)) if options.fit else gather(options)
+    rule, (loss, weight) = fit_rule(rows), capped(rows)
+    ways = rule.share(rows["evidence"])
+    for name, some in {"middle": 0 * ways, "rule": ways, "edge": 0 * ways + 1}.items():
+        print(f"{name}: {weight @ loss_of(loss, some)[0]:.4f}")
     if options.write:
         write_rule(rule)
 

@@ -1,8 +1,7 @@
 """Rows of a matrix that indices name: a kernel for a GPU.
 
-The convolution spends most of its time on this in training. For the 27 neighbours of 64,000 voxels
-of 96 channels in bfloat16 ``index_select`` takes 1.05 ms on an H100 and this kernel 0.14, as long
-as the matrix product of what is gathered. It needs Triton, which PyTorch's CUDA builds bring.
+For the 27 neighbours of 64,000 voxels of 96 channels in bfloat16 ``index_select`` takes 1.05 ms on
+an H100 and this kernel 0.14, as long as the matrix product of what is gathered.
 """
 
 from __future__ import annotations
@@ -36,11 +35,3 @@ def gather_rows(matrix: Tensor, indices: Tensor) -> Tensor:
     grid = (triton.cdiv(count, ROWS),)
     copy_rows[grid](source, indices, out, count, width, triton.next_power_of_2(width), ROWS)
     return out.view(matrix.dtype)
-
-
-def check() -> None:
-    """Raise RuntimeError if the kernel does not return what PyTorch does on this GPU."""
-    matrix = torch.randn(1000, 96, device="cuda").bfloat16()
-    indices = torch.randint(1000, (27 * 1000,), device="cuda")
-    if not torch.equal(gather_rows(matrix, indices), matrix[indices]):
-        raise RuntimeError("the kernel of export/gpu_gather.py returns wrong rows on this GPU")

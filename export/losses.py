@@ -180,16 +180,6 @@ def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
     return sums / torch.tensor(batch.counts, device=loss.device)
 
 
-def relative_weights(voxels: list[int], recipe: Recipe) -> Tensor:
-    """Return the weights of the losses of samples by their numbers of voxels, (B,); the sum is 1.
-
-    Small shapes have few voxels and large errors. With equal weights they make up more than half of
-    the loss, and of its noise; weighted by voxels they would hardly count.
-    """
-    weights = torch.tensor(voxels, dtype=torch.float32) ** recipe.voxel_power
-    return weights / weights.sum()
-
-
 NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
 
 

@@ -19,7 +19,6 @@ from export.arguments import Parser
 from export.augment import CLEAN, DISTANCES, Prepared, change
 from export.dataset import sample_field
 from export.losses import measure
-from export.network import SuperSdfNet
 from export.shapes.smooth import Field, ellipsoid, mapped, rounded_box, tilted, torus
 from export.store import HELD_OUT, held_out
 from export.to_onnx import load_run, read_network
@@ -47,10 +46,6 @@ def masks_of(field: Field, *, turned: bool) -> list[Prepared]:
     return masks
 
 
-def read(path: Path) -> SuperSdfNet:
-    return load_run(path) if path.is_dir() else read_network(path)
-
-
 def main(words: Sequence[str] | None = None) -> None:
     """Print the tables."""
     parser = Parser(description=__doc__.split("\n")[0])
@@ -58,7 +53,8 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--store", type=Path, required=True, help="folder of shards")
     options = parser.parse_args(words)
     with parser.one_line_errors():
-        nets = {path: read(path) for path in options.files}
+        files = options.files
+        nets = {f: load_run(f) if f.is_dir() else read_network(f) for f in files}
         masks = not all(net.config.keeps_samples for net in nets.values())
         samples = held_out(options.store, contract.MASKS if masks else DISTANCES, HELD_OUT)
         print("| network | everywhere | near | normal |\n| --- | ---: | ---: | ---: |")

@@ -21,7 +21,7 @@ can be distances. The distances of a mask are right to half a voxel only, and no
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -224,8 +224,7 @@ class Encoded:
     features: Tensor  # (V, C)
     patches: Tensor  # (V, 27)
     noisy: Tensor  # (V, 1) of 0 and 1
-    first: Tensor | None = None  # (V, C) features after the first blocks ...
-    early: Tensor | None = None  # ... and after the block for voxels that go no deeper
+    early: Tensor | None = None  # (V, C) features after the block for voxels that go no deeper
     doubts: Tensor | None = None  # (V,) logarithm of what is lost with these
 
     def some(self, rows: Tensor) -> Encoded:
@@ -294,13 +293,9 @@ class SuperSdfNet(nn.Module):
             return Encoded(first, patches, noisy)
         early = self.early(first, table)
         doubts = self.gate(early.detach())
-        encoded = Encoded(early, patches, noisy, first, early, doubts)
-        return self.blend(encoded, table, self.gate.rows(doubts, patches, share))
-
-    def blend(self, encoded: Encoded, table: Tensor, rows: Tensor) -> Encoded:
-        """Return voxels of which some, (n,), have been through the last blocks."""
-        deep = self.deepen(encoded.first, table, rows)
-        return replace(encoded, features=encoded.early.index_copy(0, rows, deep))
+        rows = self.gate.rows(doubts, patches, share)
+        features = early.index_copy(0, rows, self.deepen(first, table, rows))
+        return Encoded(features, patches, noisy, early, doubts)
 
     @property
     def device(self) -> torch.device:
@@ -311,11 +306,7 @@ class SuperSdfNet(nn.Module):
 
     def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of voxels at offsets (Q, 3)."""
-        with in_float32(offsets):
-            features = voxels.features.float()
-            residual = self.coefficients(features) @ self.trunk(offsets).T
-            base = voxels.patches @ interpolation_weights(offsets).T
-            return residual + base + self.correction(features) * voxels.noisy
+        return self.decode_parts(voxels, [len(voxels.features)], offsets[None])
 
     def decode_parts(self, voxels: Encoded, counts: list[int], offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of samples side by side, each at its offsets, (B, Q, 3).
@@ -324,15 +315,12 @@ class SuperSdfNet(nn.Module):
         """
         with in_float32(offsets):
             features, at = voxels.features.float(), offsets.flatten(0, 1)
-            inputs = torch.cat([self.coefficients(features), voxels.patches], 1)
+            branch = torch.relu(self.branch(features))
+            inputs = torch.cat([features, branch, voxels.patches], 1)
             functions = torch.cat([self.trunk(at), interpolation_weights(at)], 1)
             parts = zip(inputs.split(counts), functions.view(*offsets.shape[:2], -1))
             values = torch.cat([some @ weights.T for some, weights in parts])
             return values + self.correction(features) * voxels.noisy
-
-    def coefficients(self, features: Tensor) -> Tensor:
-        """Return the coefficients of the functions of the offset, (D, functions)."""
-        return torch.cat([features, torch.relu(self.branch(features))], 1)
 
     def forward(self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""

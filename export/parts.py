@@ -1,34 +1,32 @@
 """Procedural CAD parts to measure edges on: chamfers, fillets, drillings, ribs and pockets.
 
-    python -m export.parts OUT [--count 24] [--seed 0] [--detail usual]
+    python -m export.parts OUT [--count 24] [--seed 0]
     python -m lab figures --shapes FOLDER --parts OUT --only edges
 
 Writes closed meshes, PLY, with a box diagonal of 1. Part n is of kind n modulo 6, its measures
 drawn from a generator seeded by (seed, n): the same seed gives the same files. None of the kinds is
 one of ``shapes``, which trains the network.
 
-With the detail "usual" the smallest features are a tenth of the diagonal. In a grid of 32^3 the
-diagonal of a part that is turned at random takes 22 to 30 voxels, so these are 2.5 voxels. With
-"fine", 16 such parts on a plate, they are under a voxel. Lengths are in tenths of the diagonal,
-about: 1 is the least width of chamfers, ribs, pockets and most walls (0.65 of those beside the
-pocket of a rod), the least arc of fillets and diameter of drillings.
+The smallest features are a tenth of the diagonal. In a grid of 32^3 the diagonal of a part that is
+turned at random takes 22 to 30 voxels, so these are 2.5 voxels. Lengths are in tenths of the
+diagonal, about: 1 is the least width of chamfers, ribs, pockets and most walls (0.65 of those
+beside the pocket of a rod), the least arc of fillets and diameter of drillings.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold
 
+from export.arguments import Parser, at_least
 from export.shapes.draws import joined, unit_sized
 from export.shapes.edges import CHAMFER, SIMPLIFIED, can_move, slab, smooth
 from export.shapes.solid import mesh_of
 from super_sdf import Mesh, write_mesh
 
-COUNT = 24
 TOLERANCE = 2e-6  # of the diagonal: shorter edges are removed
 SEGMENTS = 192  # of a circle: facets meet at 2 degrees, which tells little from a smooth surface
 OVERLAP = 0.01  # a tool starts that far outside the part
@@ -199,44 +197,25 @@ def drawn(rng: np.random.Generator, kind: Kind) -> Manifold:
             continue
 
 
-def crowded(rng: np.random.Generator, kind: Kind) -> Manifold:
-    """Draw 16 parts of a kind on a plate: their features are a fiftieth of its diagonal."""
-    plate, pitch = Manifold.cube([4, 4, 0.2], True).translate([0, 0, -0.1]), 0.95
-    parts = []
-    for place in (np.indices((4, 4)).reshape(2, -1).T - 1.5) * pitch:
-        part = drawn(rng, kind).rotate([90.0 * n for n in rng.integers(4, size=3)])
-        parts.append(part.translate([*place, -part.bounding_box()[2] - 0.1]))
-    return joined([plate, *parts])
-
-
-def draw_part(number: int, seed: int = 0, detail: str = "usual") -> tuple[str, Mesh]:
+def draw_part(number: int, seed: int = 0) -> tuple[str, Mesh]:
     """Return the name and the mesh of a part, its box centred and of diagonal 1."""
     kind, rng = KINDS[number % len(KINDS)], np.random.default_rng((seed, number))
-    solid = drawn(rng, kind) if detail == "usual" else unit_sized(crowded(rng, kind))
-    solid = unit_sized(solid.simplify(TOLERANCE))
+    solid = unit_sized(drawn(rng, kind).simplify(TOLERANCE))
     return f"part-{number:02d}-{kind.__name__}", mesh_of(solid)
-
-
-def write_parts(out: Path, count: int = COUNT, seed: int = 0, detail: str = "usual") -> list[Path]:
-    out.mkdir(parents=True, exist_ok=True)
-    parts = [draw_part(number, seed, detail) for number in range(count)]
-    paths = [out / f"{name}.ply" for name, _ in parts]
-    for path, (_, mesh) in zip(paths, parts):
-        write_mesh(mesh, path)
-    return paths
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Write the parts."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("out", type=Path, help="folder")
-    parser.add_argument("--count", type=int, default=COUNT, help="number of parts (default: 24)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of all measures (default: 0)")
-    sizes = "smallest features: a tenth of the diagonal (usual, the default) or a fiftieth (fine)"
-    parser.add_argument("--detail", choices=("usual", "fine"), default="usual", help=sizes)
+    parser.add_argument("--count", type=at_least(1), default=24, help="number of parts")
+    parser.add_argument("--seed", type=at_least(0), default=0, help="seed of all measures")
     options = parser.parse_args(words)
-    paths = write_parts(options.out, options.count, options.seed, options.detail)
-    print(f"{len(paths)} parts in {options.out}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    for number in range(options.count):
+        name, mesh = draw_part(number, options.seed)
+        write_mesh(mesh, options.out / f"{name}.ply")
+    print(f"{options.count} parts in {options.out}")
 
 
 if __name__ == "__main__":

@@ -130,9 +130,7 @@ class IntBlock:
 
     step: np.float32
     zero: np.uint8
-    conv: IntLayer
-    expand: IntLayer
-    reduce: IntLayer
+    layers: dict[str, IntLayer]
 
 
 def whole_block(block: Block, ranges: Ranges) -> IntBlock:
@@ -141,13 +139,10 @@ def whole_block(block: Block, ranges: Ranges) -> IntBlock:
     zero = np.uint8(np.rint(-low / step).clip(0, LEVELS))
     mixed, expanded = steps_of(ranges.mixed), steps_of(ranges.expanded)
     plain, steps = np.ones(len(ranges.low)), np.full(len(block.conv.weight), step)
-    return IntBlock(
-        step,
-        zero,
-        whole_layer(block.conv.weight, block.conv.bias, steps, mixed, float(zero)),
-        whole_layer(block.expand.weight.T, block.expand.bias, mixed, expanded),
-        whole_layer(block.reduce.weight.T, block.reduce.bias, expanded, plain),
-    )
+    conv = whole_layer(block.conv.weight, block.conv.bias, steps, mixed, float(zero))
+    expand = whole_layer(block.expand.weight.T, block.expand.bias, mixed, expanded)
+    reduce = whole_layer(block.reduce.weight.T, block.reduce.bias, expanded, plain)
+    return IntBlock(step, zero, {"conv": conv, "expand": expand, "reduce": reduce})
 
 
 def steps_of(width: Tensor) -> Array:
@@ -208,13 +203,13 @@ def add_rounded(body: onnx.GraphProto, block: IntBlock) -> str:
     rounded = writer.op("QuantizeLinear", body.output[0].name, step, zero)
     body.node.extend(writer.nodes)
     body.initializer.extend(writer.constants)
-    body.output.append(rows_of(rounded, TensorProto.UINT8, len(block.reduce.scales)))
+    body.output.append(rows_of(rounded, TensorProto.UINT8, len(block.layers["reduce"].scales)))
     return f"{rounded}_chunks"
 
 
 def keep_absent(graph: onnx.GraphProto, read: onnx.NodeProto, block: IntBlock) -> None:
     """Set the last row that a block reads, which index -1 refers to, to the zero point."""
-    name, width = read.output[0], len(block.reduce.scales)
+    name, width = read.output[0], len(block.layers["reduce"].scales)
     writer = Writer(f"{read.name}_absent_")
     read.output[0] = f"{name}_written"
     row = writer.constant(np.full((1, width), block.zero))
@@ -233,10 +228,9 @@ def replace_layers(scan: onnx.NodeProto, block: IntBlock) -> None:
     table, gather, reshape, *_, kept, added = body.node
     shape = next(array for array in body.initializer if array.name == reshape.input[1])
     writer, value = Writer(f"{body.name}_int8_"), reshape.output[0]
-    for label in ("conv", "expand", "reduce"):
+    for label, layer in block.layers.items():
         if label != "conv":
             value = writer.op("QuantizeLinear", value, ONE, NONE)  # what is negative becomes 0
-        layer: IntLayer = getattr(block, label)
         scales = writer.constant(layer.scales, f"{label}.scales")
         operands = [writer.op("DequantizeLinear", value, ONE, NONE)]
         # onnxruntime fuses the operators only if the zero points, all 0, are explicit

@@ -136,12 +136,6 @@ class Store:
     def __len__(self) -> int:
         return len(self.samples["shard"])
 
-    def show(self, rng: np.random.Generator, sample: Sample | Prepared) -> Prepared:
-        """Return a sample changed, unless it was before, and turned."""
-        if isinstance(sample, Sample):
-            sample = change(rng, sample, self.inputs, self.shares)
-        return turned(sample, int(rng.integers(48)))
-
     def draw_batch(self, rng: np.random.Generator, recipe: Recipe) -> tuple[list[int], Batch]:
         """Return windows with about ``batch_voxels`` voxels, and which they are, -1 if smooth."""
         drawn: list[int] = []
@@ -149,12 +143,15 @@ class Store:
         smooth = self.samples["smooth"]
         while sum(len(sample.patches) for sample in shown) < recipe.batch_voxels:
             if smooth and rng.random() < recipe.smooth:
-                index, sample = -1, self.show(rng, smooth[rng.integers(len(smooth))])
+                index, sample = -1, smooth[rng.integers(len(smooth))]
             else:
                 index = self.sampler.draw(rng, recipe.spread)
-                sample = self.show(rng, self.samples["shard"][index])
+                sample = self.samples["shard"][index]
+            if isinstance(sample, Sample):
+                sample = change(rng, sample, self.inputs, self.shares)
             if len(sample.voxels):
-                drawn, shown = [*drawn, index], [*shown, sample]
+                drawn.append(index)
+                shown.append(turned(sample, int(rng.integers(48))))
             elif index >= 0:
                 self.sampler.losses[index] = 0.0
         return drawn, batch_of(shown)

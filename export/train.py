@@ -1,7 +1,6 @@
 """Train the network; resumable, with a log and a plot of the loss.
 
-    python -m export.train --store training/store --run training/run --minutes 90
-    python -m export.train --store training/store --run training/run --minutes 90     # resumes
+    python -m export.train --store training/store --run training/run --minutes 90   # or resume
     python -m export.train --store training/store --run training/run --device cuda --by-clock
     python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
     python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 14  # more blocks
@@ -18,6 +17,7 @@ from __future__ import annotations
 import argparse
 import copy
 import csv
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
@@ -30,14 +30,7 @@ from torch import Tensor
 
 from export.arguments import Parser, at_least, positive, share
 from export.augment import DISTANCES, INPUTS, USUAL
-from export.losses import (
-    RECIPE,
-    Batch,
-    Recipe,
-    measure,
-    relative_weights,
-    window_losses,
-)
+from export.losses import RECIPE, Batch, Recipe, measure, window_losses
 from export.network import SIZES, SuperSdfNet
 from export.store import HELD_OUT, Store, check_store
 from export.to_onnx import read_weights
@@ -111,12 +104,17 @@ class Run:
 
     def advance(self, batch: Batch, spent: float) -> tuple[float, list[float]]:
         """Take one step at the rate for this share of the budget; return the loss, and each's."""
+        cosine = 0.5 * (1 + math.cos(math.pi * min(spent, 1)))  # after the warm-up
         for optimiser, peak in zip(self.optimisers, self.peaks):
-            optimiser.param_groups[0]["lr"] = peak * rate_factor(spent, self.recipe)
+            rate = peak * (min(spent / self.recipe.warm_up, cosine) + 1e-3)
+            optimiser.param_groups[0]["lr"] = rate
             optimiser.zero_grad()
         with autocast(self.device):
             losses = window_losses(self.net, batch, self.recipe)
-        total = (relative_weights(batch.counts, self.recipe).to(self.device) * losses).sum()
+        # Small shapes have few voxels and large errors. With equal weights they make up more than
+        # half of the loss, and of its noise; weighted by voxels they would hardly count.
+        weights = losses.new_tensor(batch.counts) ** self.recipe.voxel_power
+        total = (weights * losses).sum() / weights.sum()
         total.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
@@ -145,12 +143,6 @@ def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimi
         torch.optim.AdamW(others, lr=recipe.outer_rate, weight_decay=1e-3),
         torch.optim.Muon(hidden, weight_decay=1e-3, **rate),
     ]
-
-
-def rate_factor(spent: float, recipe: Recipe) -> float:
-    """Return the rate over its peak after this share of the budget: warm-up, then half a cosine."""
-    cosine = 0.5 * (1 + np.cos(np.pi * min(spent, 1.0)))
-    return float(min(spent / recipe.warm_up, cosine) + 1e-3)
 
 
 def train(run: Run, store: Store, minutes: float, seed: int, began: float | None = None) -> None:
@@ -267,10 +259,6 @@ def run_training(options: argparse.Namespace) -> None:
     if weights:
         run.start_from(weights)
     run.resume()
-    if options.device == "cuda":
-        import export.gpu_gather  # only CUDA builds of PyTorch have Triton
-
-        export.gpu_gather.check()
     train(run, store, options.minutes, options.seed, began)
 
 

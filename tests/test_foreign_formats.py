@@ -29,7 +29,6 @@ import xarray as xr
 from conftest import refusal
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 from test_formats import (
-    CENTRE,
     DATA,
     OBLIQUE,
     ORIENTED,
@@ -46,7 +45,7 @@ from vtkmodules.vtkIOHDF import vtkHDFWriter
 
 from super_sdf import read_grid
 from super_sdf.errors import SuperSdfError
-from super_sdf.files.formats import DICOM, FORMATS, find_format, is_grid, split_member
+from super_sdf.files.formats import DICOM, find_format, is_grid
 from super_sdf.files.grids import open_volume
 
 STEPS = np.array([0.5, 0.7, 0.9])
@@ -225,15 +224,6 @@ def test_what_mrc_files_say_that_no_grid_has():
     assert "it is a stack of volumes of 5 sections: save one of them" in said_of("stack.mrc")
 
 
-@pytest.mark.parametrize("kind", [np.int8, np.int16, np.uint16, np.float16])
-def test_modes_of_mrc(kind):
-    mask = (sampled(AFFINE) < 0).astype(kind)
-    with mrcfile.new("a.mrc", overwrite=True) as file:
-        file.set_data(np.ascontiguousarray(mask.T))
-        file.voxel_size = tuple(STEPS.tolist())
-    assert np.array_equal(read_grid("a.mrc", field="mask").values < 0, mask > 0)
-
-
 # VTK
 
 
@@ -252,36 +242,6 @@ def test_legacy_vtk(name):
     else:
         image.save(path, binary=name == "binary")
     check(read_grid(path), STEPS)
-
-
-def test_one_of_several_arrays_of_vtk():
-    image = image_of(AFFINE)
-    image["other"] = image["distance"] + 1
-    image["vector"] = image.points
-    image.save("a.vtk")
-    check(read_grid("a.vtk:distance"), STEPS)
-    said = "a.vtk holds several arrays, distance, other: give a.vtk:distance, say"
-    assert said_of("a.vtk") == said
-    said = "its array 'vector' has 3 numbers per sample: give an array of one"
-    assert said in said_of("a.vtk:vector")
-
-
-def test_uneven_coordinates_are_refused_with_a_line_that_resamples():
-    x, y, z = (CORNER[a] + STEPS[a] * np.arange(SIZES[a]) for a in range(3))
-    y = np.linspace(0, 1, len(y)) ** 1.3 * (y[-1] - y[0]) + y[0]
-    image = pyvista.RectilinearGrid(x, y, z)
-    image["distance"] = part(image.points)
-    image.save("a.vtk")
-    said = said_of("a.vtk")
-    assert said.startswith("a.vtk: its coordinates along y are uneven: make .npz with python -c ")
-    run_line(said)
-    check(read_grid("a.npz"), STEPS, 0.25)  # linear, in steps of up to 0.9
-
-
-def test_meshes_in_vtk_files_are_no_grids():
-    pyvista.Sphere().save("a.vtk")
-    said = "a.vtk: it holds vtkPolyData, no image data: sample its distances on a lattice, and"
-    assert said_of("a.vtk").startswith(said) or "holds no array" in said_of("a.vtk")
 
 
 # NetCDF
@@ -325,23 +285,6 @@ def test_netcdf_packed_with_units_a_time_and_named_axes():
         array[name].attrs["axis"] = axis.upper()
     array.to_netcdf("c.nc")
     check(read_grid("c.nc"), STEPS)
-
-
-def test_one_of_several_variables_and_uneven_ones():
-    array = array_of()
-    xr.Dataset({"a": array, "b": array + 1, "flat": array[0]}).to_netcdf("a.nc")
-    check(read_grid("a.nc:a"), STEPS)
-    assert said_of("a.nc") == "a.nc holds several arrays, /a, /b: give a.nc:/a, say"
-    array = array.assign_coords(z=array["z"] ** 2)
-    array.to_netcdf("uneven.nc")
-    assert re.fullmatch(
-        r"uneven\.nc: coordinates of 'z' are not evenly spaced: \S+ is followed by \S+, a step of "
-        r"\S+ among steps of \S+; resample the array \(array\.interp\(z=\.\.\.\)\)",
-        said_of("uneven.nc"),
-    )
-    array = array_of().drop_vars(list("xyz"))
-    array.to_netcdf("bare.nc")
-    check(read_grid("bare.nc", spacing=STEPS, origin=CORNER), STEPS)
 
 
 # MATLAB
@@ -483,20 +426,6 @@ def test_blocks_that_open3d_saved():
     assert stored.shape == grid.shape and "samples are unknown" in grid.notes[0]
 
 
-def test_blocks_that_open3d_did_not_save_whole():
-    whole = dict(np.load(DATA / "open3d-blocks.npz"))
-    for key in ("value_001", "attr_name_weight"):
-        np.savez("a.npz", **{name: value for name, value in whole.items() if name != key})
-        want = f"a.npz is Open3D's VoxelBlockGrid, but has no key {key!r}"
-        assert said_of("a.npz") == want
-    np.savez("a.npz", **{**whole, "key": whole["key"][:5]})
-    assert "its keys have shape (5, 3), its values (138, 4, 4, 4, 1)" in said_of("a.npz")
-    far = whole["key"].copy()
-    far[0] += 10**6
-    np.savez("a.npz", **{**whole, "key": far})
-    assert "a.npz" in said_of("a.npz", max_memory=10**9)
-
-
 def test_files_of_other_programs_are_refused_with_the_line_that_converts_them():
     affine = affine_of(np.eye(3))
     head = np.array([*SIZES, *affine[:3, 3], 0.5, 2.5], "<f4")
@@ -572,55 +501,7 @@ def test_another_kind_of_file_is_refused_in_one_line(name, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_truncated_slices_and_samples():
-    save_dicom("in", AFFINE)
-    Path("in/IM021").write_bytes(Path("in/IM021").read_bytes()[:-100])
-    assert said_of("in").startswith("in ")
-    save_pair("a.hdr", AFFINE)
-    Path("a.img").write_bytes(Path("a.img").read_bytes()[:-1])
-    assert "a.img is truncated: its header promises 24 x 20 x 17 float32" in said_of("a.hdr")
-
-
-def test_headers_that_state_too_much_are_refused_before_anything_is_unpacked():
-    save_mrc("a.mrc", AFFINE)
-    whole = bytearray(Path("a.mrc").read_bytes())
-    whole[:12] = np.array([30000] * 3, "<i4").tobytes()
-    Path("a.mrc").write_bytes(whole)
-    assert "is truncated" in said_of("a.mrc")
-    Path("a.mrc.gz").write_bytes(gzip.compress(whole))
-    assert "a.mrc.gz" in said_of("a.mrc.gz")
-    save_mgh("a.mgh", AFFINE)
-    whole = bytearray(Path("a.mgh").read_bytes())
-    whole[4:16] = np.array([30000] * 3, ">i4").tobytes()
-    Path("a.mgh").write_bytes(whole)
-    assert said_of("a.mgh").startswith("a.mgh")
-    Path("a.mgz").write_bytes(gzip.compress(whole))
-    assert "is truncated: its header promises" in said_of("a.mgz")
-
-
 # Commands
-
-
-def test_a_folder_of_slices_becomes_a_mesh_at_its_place(command):
-    save_dicom("in", AFFINE)
-    code, _, err = command("upsample", "in", "out.ply", "--quality", "fast")
-    assert code == 0, err
-    vertices = pyvista.read("out.ply").points
-    assert np.abs(part(vertices)).max() < 0.1 and abs(vertices - CENTRE).max() < 5
-    code, out, _ = command("info", "in", "--json")
-    assert code == 0 and "DICOM" in out
-    code, _, err = command("batch", "in", "--out", "out")
-    assert code == 2 and err.startswith("Error: in holds no grid (")
-
-
-def test_a_changed_pair_of_files_is_converted_again(command):
-    save_pair("a.hdr", AFFINE)
-    run = ("batch", "a.hdr", "--out", "out", "--quality", "fast", "--jobs", "1")
-    assert command(*run)[0] == 0
-    before = Path("out/a.ply").read_bytes()
-    nibabel.save(nibabel.Nifti1Pair(sampled(AFFINE) + 0.2, AFFINE), "a.hdr")
-    assert command(*run)[0] == 0
-    assert Path("out/a.ply").read_bytes() != before
 
 
 def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatch):
@@ -632,11 +513,3 @@ def test_a_missing_library_is_named_with_the_command_that_installs_it(monkeypatc
         format_, said = find_format(name), said_of(name)
         wanted = f"pip install -e '.[{format_.extra}]' in a clone of super-sdf"
         assert said.startswith(f"{format_.name} (") and said.endswith(wanted)
-
-
-def test_names_of_series_and_of_files():
-    os.mkdir("in")
-    assert split_member("in:1.2") == (Path("in"), "1.2")
-    assert split_member("no:1.2") == (Path("no:1.2"), None)
-    assert split_member("a.nc:/g/v") == (Path("a.nc"), "/g/v")
-    assert len({format_.key for format_ in (*FORMATS, DICOM)}) == len(FORMATS) + 1

@@ -21,12 +21,12 @@ import SimpleITK as sitk  # noqa: N813
 import tifffile
 import trimesh
 import zarr
-from conftest import refusal
+from conftest import ball
 from numpy.typing import ArrayLike
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from super_sdf import SdfGrid, read_grid
-from super_sdf.errors import FileError, GridError, OptionError
+from super_sdf.errors import GridError
 from super_sdf.files import formats
 
 DATA = Path(__file__).parent / "data"
@@ -174,47 +174,6 @@ def test_a_direction_is_given_where_the_file_has_none():
     assert read_grid("a.npz", direction=np.eye(3)).is_straight
 
 
-def test_nifti_by_qform_and_slope():
-    affine = affine_of(TURNS[5])
-    raw = nibabel.Nifti1Image(sampled(affine), None)
-    raw.set_qform(affine, code=1)
-    raw.header.set_data_dtype(np.int16)  # nibabel chooses slope and intercept
-    nibabel.save(raw, "scaled.nii")
-    assert nibabel.load("scaled.nii").dataobj.slope != 1
-    check(read_grid("scaled.nii"), tolerance=1e-3)
-
-
-@pytest.mark.parametrize("options", [{"compression": "zlib"}, {"bigtiff": True}])
-def test_tiff_stacks(options):
-    affine = affine_of(np.eye(3))
-    for axes, values in (("zyx", sampled(affine).T), ("xyz", sampled(affine))):
-        tifffile.imwrite("a.tif", values, photometric="minisblack", **options)
-        check(read_grid("a.tif", spacing=SPACING, origin=affine[:3, 3], axes=axes))
-    assert read_grid("a.tif", spacing=SPACING).origin == (0, 0, 0)
-
-
-def test_hdf5_datasets():
-    affine = affine_of(np.eye(3))
-    with h5py.File("a.h5", "w") as file:
-        file["deep/field"] = sampled(affine).T
-        packed = {"chunks": (4, 5, 6), "compression": "gzip"}
-        file.create_dataset("xyz", data=sampled(affine), **packed)
-        file["xyz"].attrs["spacing"] = [SPACING] * 3
-        file["xyz"].attrs["origin"] = affine[:3, 3]
-        file["flat"] = np.zeros((3, 3))
-        file.create_dataset("um", data=sampled(affine).T)
-        file["um"].attrs["element_size_um"] = [SPACING] * 3
-    check(read_grid("a.h5:/deep/field", spacing=SPACING, origin=affine[:3, 3]))
-    check(read_grid("a.h5:xyz", axes="xyz"))
-    check(read_grid("a.h5:/um", origin=affine[:3, 3]))
-    assert refusal(FileError, read_grid, "a.h5") == (
-        "a.h5 holds several arrays, /deep/field, /um, /xyz: give a.h5:/deep/field, say"
-    )
-    assert refusal(FileError, read_grid, "a.h5:no") == (
-        "a.h5 has no 3D dataset 'no': it holds /deep/field, /um, /xyz"
-    )
-
-
 def text_sdf(affine: np.ndarray) -> str:
     """Return the text that SDFGen's main.cpp writes: endl after each value, i fastest."""
     origin = " ".join(map(str, affine[:3, 3]))
@@ -255,22 +214,6 @@ def test_a_mesh_as_input_is_told_to_be_sampled_first(command):
     )
 
 
-STATED = "but {} files state their axes: leave it out"
-
-
-@pytest.mark.parametrize(
-    "name, options, said",
-    [
-        ("a.nii", {"axes": "zyx"}, "axes is 'zyx', " + STATED.format("NIfTI")),
-        ("a.nii", {"direction": np.eye(3)}, "direction is given, " + STATED.format("NIfTI")),
-        ("a.vdb", {"direction": np.eye(3)}, "direction is given, " + STATED.format("OpenVDB")),
-        ("a.npy", {"axes": "yxz"}, "axes is 'yxz': give one of xyz, zyx"),
-    ],
-)
-def test_axes_that_the_file_states_are_not_overruled(name, options, said):
-    assert refusal(OptionError, read_grid, name, **options).startswith(said)
-
-
 def test_special_files_and_folders_are_refused(command):
     os.mkdir("a.nii")
     os.mkdir("a.zarr")
@@ -292,17 +235,6 @@ def test_components_and_missing_axes_are_refused():
     for name in ("v.mha", "rgb.tif", "two.nrrd", "time.nii"):
         with pytest.raises(GridError, match=f"{name} has .*: give a (file|stack) of three axes"):
             read_grid(name)
-
-
-def test_the_command_makes_the_mesh_at_its_place(command):
-    with h5py.File("a.h5", "w") as file:
-        file["field"] = sampled(affine_of(np.eye(3))).T
-    origin = ",".join(map(str, affine_of(np.eye(3))[:3, 3]))
-    place = "--spacing", "0.5", f"--origin={origin}"
-    code, _, err = command("upsample", "a.h5:/field", "out.ply", "--quality", "fast", *place)
-    mesh = trimesh.load("out.ply")
-    assert code == 0 and mesh.is_watertight and mesh.volume > 0, err
-    assert np.abs(part(mesh.vertices)).max() < 0.06
 
 
 def test_batch_takes_the_same_inputs(command):
@@ -335,3 +267,19 @@ def test_the_page_on_formats_lists_those_of_the_table():
     for format_ in (*formats.FORMATS, formats.DICOM):
         start = f"| {format_.name} | `{'`, `'.join(format_.suffixes)}` | "
         assert start + (f"`{format_.extra}`" if format_.extra else "none") in page
+
+
+@pytest.mark.parametrize("dtype", [">f4", "<f8", "f2", ">i4", "i8", "i1"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_every_dtype_and_order_is_read(dtype, order):
+    values = np.clip(ball().values * 8, -120, 120).astype(dtype)
+    np.save("in.npy", np.asarray(values, order=order))
+    np.testing.assert_array_equal(read_grid("in.npy", spacing=8).values, values)
+
+
+def test_options_go_before_the_keys_of_an_npz():
+    np.savez("in.npz", values=ball().values, spacing=1.0, origin=[1, 2, 3])
+    grid = read_grid("in.npz")
+    assert grid.origin == (1.0, 2.0, 3.0) and grid.notes == ()
+    other = read_grid("in.npz", origin=(4, 5, 6), spacing=1.01)
+    assert other.origin == (4.0, 5.0, 6.0) and other.spacing == (1.01,) * 3

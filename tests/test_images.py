@@ -11,10 +11,8 @@ import pyvista
 from conftest import refusal, trilinear
 from vtkmodules.vtkCommonDataModel import vtkImageData
 
-from super_sdf.functions import pyvista as _accessor
 from super_sdf import grid_from_image, load_network, read_grid, reconstruct
 from super_sdf.errors import GridError, OptionError, OptionTypeError
-from super_sdf.truth.mesh_files import read_mesh
 
 ROOT = Path(__file__).parent.parent
 SIZES = 20, 22, 24
@@ -68,24 +66,6 @@ def test_the_surface_is_the_one_of_the_file(direction, where, folder):
     assert np.array_equal(surface.regular_faces, mesh.faces)
 
 
-def test_the_surface_is_the_one_of_the_command(folder, command):
-    image, _ = sphere("turned")
-    image.save("image.vti")
-    given = {"factor": 2, "offset": 0.6, "scale": 1.0, "field": "exact"}
-    words = [f"--{name}={value}" for name, value in given.items()]
-    assert command("upsample", "image.vti", "mesh.ply", *words)[0] == 0
-    mesh, surface = read_mesh("mesh.ply"), image.super_sdf.contour(**given)
-    assert surface.points.tobytes() == mesh.vertices.astype(surface.points.dtype).tobytes()
-    assert np.array_equal(surface.regular_faces, mesh.faces)
-
-
-def test_positions_far_away_are_in_double_precision():
-    image, _ = sphere()
-    image.origin = (5e6, 0, 0)
-    surface = image.super_sdf.contour(2, network=trilinear)
-    assert surface.points.dtype == np.float64 and surface.is_manifold
-
-
 def test_where_the_solid_runs_out_of_the_image_the_surface_is_closed_unless_left_open():
     image, _ = sphere()
     half = image.extract_subset((0, 19, 0, 21, 0, 10))
@@ -103,16 +83,6 @@ def test_residuals_are_those_of_the_certificate():
     assert bare.point_data.keys() == [] and bare.points.tobytes() == surface.points.tobytes()
     moved = image.super_sdf.contour(2, residuals=True, offset=0.5)
     assert np.nanmax(np.abs(moved.point_data["residual"])) < 0.05  # of the offset, too
-
-
-def test_masks_of_booleans_are_meshed():
-    image, centre = sphere()
-    inside = image.point_data["distance"] < 0
-    image.clear_data()
-    image.point_data["mask"] = inside
-    assert image.super_sdf.grid().field.kind == "mask"
-    points = image.super_sdf.contour(2).points
-    assert np.abs(np.linalg.norm(points - centre, axis=1) - RADIUS).max() < 0.3
 
 
 def test_the_active_scalars_are_taken_or_those_with_a_name():
@@ -138,17 +108,6 @@ def plain(**arrays: np.ndarray) -> vtkImageData:
         array = pyvista.convert_array(values, name=name)
         image.GetPointData().AddArray(array)
     return image
-
-
-def test_image_data_of_vtk_is_taken_too():
-    image, _ = sphere()
-    values = np.asarray(image.point_data["distance"])
-    bare, several = plain(distance=values), plain(a=values, b=values)
-    assert np.array_equal(grid_from_image(bare).values, image.super_sdf.grid().values)
-    assert refusal(GridError, grid_from_image, several) == (
-        "the image holds several arrays, a, b: give scalars='a', say"
-    )
-    assert grid_from_image(several, "b").shape == SIZES
 
 
 OF_NO_SAMPLES = {
@@ -180,18 +139,6 @@ def test_other_mistakes_are_one_line():
     assert said == "values have shape (20, 22, 1): give at least 2 samples on each axis"
     image.spacing = (0.2, 0.2, 0.2)
     assert refusal(GridError, contour).endswith("multiply the values, --scale 0.40123")
-
-
-def test_an_old_pyvista_is_named(monkeypatch):
-    script = (
-        "import pyvista; del pyvista.register_dataset_accessor; pyvista.__version__ = '0.44.1'\n"
-        "try:\n    import super_sdf.functions.pyvista\nexcept OSError as error:\n    print(error)"
-    )
-    done = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
-    assert done.stdout.decode() == (
-        "super_sdf.functions.pyvista needs PyVista 0.48 or later, this is 0.44.1: "
-        "pip install -e '.[pyvista]' in a clone of super-sdf\n"
-    )
 
 
 def test_pyvista_finds_the_accessor_and_super_sdf_does_not_load_pyvista(tmp_path):

@@ -7,7 +7,6 @@ from conftest import refusal, trilinear
 
 from super_sdf import SdfGrid, make_grid, reconstruct
 from super_sdf.errors import GridError, OutOfMemoryError
-from super_sdf.grid import placement
 
 SHAPE = 18, 20, 22  # along x, y, z
 STEP = 0.5, 0.5, 0.5
@@ -56,24 +55,6 @@ def test_without_coordinates_it_is_an_array_with_named_axes():
     assert np.array_equal(grid.values, unnamed.values)
 
 
-def test_coordinates_in_single_precision_are_even_up_to_their_rounding():
-    places = np.float32(1e5) + np.arange(18, dtype=np.float32) / 7
-    steps = np.diff(places)
-    assert steps.max() > 1.03 * steps.min()  # float32 does not hold them
-    found = placement.placed(sphere().assign_coords(x=places))
-    assert found.origin[0] == 1e5 and found.spacing[0] == pytest.approx(1 / 7, rel=0.01)
-    assert "'x' are not evenly spaced" in refusal(
-        GridError, make_grid, sphere().assign_coords(x=places.astype(float))
-    )
-
-
-def test_integers_and_unequal_steps_are_coordinates():
-    array = sphere().isel(z=slice(None, None, 2))
-    assert make_grid(array).spacing == (0.5, 0.5, 1.0)
-    whole = (sphere() * 2).assign_coords({name: np.arange(n) for name, n in zip("xyz", SHAPE)})
-    assert make_grid(whole).spacing == (1.0, 1.0, 1.0)
-
-
 def test_arrays_of_dask_are_computed_if_they_fit(monkeypatch):
     array = sphere("zyx").chunk({"z": 5})
     assert np.array_equal(make_grid(array).values, sphere().values)
@@ -117,8 +98,3 @@ REFUSED = {
 @pytest.mark.parametrize("said", REFUSED)
 def test_what_has_no_place_is_refused(said):
     assert refusal(GridError, make_grid, REFUSED[said]) == said
-
-
-def test_a_step_is_even_up_to_a_thousandth():
-    assert make_grid(uneven(13.5 + 0.5 * placement.EVEN / 2)).spacing[1] == 0.5
-    assert "a step of 0.502 among" in refusal(GridError, make_grid, uneven(13.502))

@@ -6,7 +6,6 @@ grid that is read is then its distance there. Files are written by the format's 
 
 from __future__ import annotations
 
-import gzip
 import json
 import re
 from collections.abc import Callable
@@ -26,9 +25,8 @@ from conftest import refusal
 from numpy.typing import ArrayLike
 
 from super_sdf import SdfGrid, read_grid
-from super_sdf.errors import FileError, GridError
-from super_sdf.files.formats import find_format
-from super_sdf.files.grids import describe_grid_file, open_volume
+from super_sdf.errors import FileError
+from super_sdf.files.grids import describe_grid_file
 from super_sdf.files.readers.axes import in_metres
 
 SIZES = 24, 20, 17  # along x, y, z
@@ -102,14 +100,6 @@ def test_imagej_has_a_unit_for_each_axis_and_origins_in_pixels(name, with_origin
     assert grid.notes[0].endswith(f", {unit}") or grid.notes[0].endswith(f"are in {unit}")
 
 
-def test_a_stack_without_calibration_states_no_spacing():
-    tifffile.imwrite("a.tif", sampled(0.5).T, imagej=True, metadata={"axes": "ZYX"})
-    tifffile.imwrite("b.tif", sampled(0.5).T, photometric="minisblack")
-    for name in ("a.tif", "b.tif"):
-        assert describe_grid_file(name)["spacing"] is None
-        assert not describe_grid_file(name)["notes"]
-
-
 @pytest.mark.parametrize("options", [{}, {"imagej": True, "metadata": {"axes": "ZYX"}}])
 def test_a_resolution_of_x_and_y_alone_is_told(options):
     options = {"resolution": (100, 50), "resolutionunit": "CENTIMETER", **options}
@@ -120,13 +110,6 @@ def test_a_resolution_of_x_and_y_alone_is_told(options):
         "its pixels are 0.01 x 0.02 cm, but it does not state how far its pages are apart: no "
         "spacing is taken from it (give --spacing X,Y,Z)"
     ]
-
-
-def test_a_spacing_in_the_metadata_of_tifffile():
-    about = {"axes": "ZYX", "spacing": 0.6, "unit": "mm"}
-    options = {"resolution": (1 / 0.3, 1 / 0.4), "photometric": "minisblack"}
-    tifffile.imwrite("a.tif", sampled().T, metadata=about, **options)
-    check(read_grid("a.tif"), first=None)
 
 
 OME = {
@@ -206,48 +189,6 @@ def test_zarr_by_xarray_has_names_and_coordinates(order, down, version):
     check(read_grid("b.zarr", spacing=STEPS, origin=FIRST))
 
 
-@pytest.mark.parametrize("dtype, offset, version", [("i2", 0.5, 2), ("u2", -40.0, 3)])
-def test_numbers_that_stand_for_values(dtype, offset, version):
-    """As xarray packs values: whole numbers, with a scale and an offset, one of them NaN."""
-    array = placed("zxy").where(placed("zxy") < 2.5)
-    packed = {"dtype": dtype, "scale_factor": 0.002, "add_offset": offset, "_FillValue": 0}
-    about = {"encoding": {"sdf": packed}, "zarr_format": version}
-    array.to_dataset().to_zarr("a.zarr", **about)
-    want = xarray.open_zarr("a.zarr").sdf.values
-    path = Path("a.zarr")
-    with open_volume(path, find_format(path), "zyx", None) as (volume, _):
-        values = volume.read()
-    assert 1000 < np.isnan(want).sum() < want.size - 1000
-    np.testing.assert_allclose(values, want, rtol=0, atol=1e-6)
-    placed("zxy").to_dataset().to_zarr("b.zarr", **about)
-    grid = read_grid("b.zarr")
-    assert np.abs(grid.values - sampled()).max() < 0.0011 and np.allclose(grid.spacing, STEPS)
-
-
-def test_names_that_are_not_x_y_z_are_told():
-    array = placed("zyx").rename(x="column", y="row", z="slice").to_dataset()
-    array.to_zarr("a.zarr", zarr_format=3)
-    grid = read_grid("a.zarr")
-    check(grid)
-    assert grid.notes[0] == "its axes are named slice, row, column: taken as z, y, x"
-    some = {"dimension_names": ["z", None, None], "zarr_format": 3, "dtype": "f4"}
-    zarr.create_array("b.zarr", shape=SIZES[::-1], **some)[...] = sampled().T
-    grid = read_grid("b.zarr", spacing=STEPS, origin=FIRST)
-    check(grid)
-    assert grid.notes[0] == "its axes are named z, ?, ?: taken as z, y, x"
-
-
-def test_a_direction_that_is_given_holds_for_named_axes():
-    turn = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
-    options = {"spacing": STEPS, "origin": FIRST, "direction": turn}
-    np.save("a.npy", sampled())
-    bare = placed("yxz").drop_vars(["x", "y", "z"])
-    bare.to_dataset().to_zarr("a.zarr", zarr_format=2)
-    want, grid = read_grid("a.npy", **options), read_grid("a.zarr", **options)
-    assert np.array_equal(grid.values, want.values)
-    assert (grid.origin, grid.spacing) == (want.origin, want.spacing)
-
-
 # HDF5
 
 
@@ -283,17 +224,6 @@ def test_hdf5_labels_and_scales(order):
     check(read_grid("c.h5:/m"))
 
 
-def test_netcdf_names_without_coordinates_are_no_coordinates():
-    """As the netCDF library writes a dimension that has none: zeros under a name that says so."""
-    with h5py.File("a.h5", "w") as file:
-        file["m"] = sampled()
-        attach(file, "xyz", {name: np.zeros(n) for name, n in zip("xyz", SIZES)}, {})
-        for name, count in zip("xyz", SIZES):
-            text = f"This is a netCDF dimension but not a netCDF variable.{count:10d}"
-            file[f"scales/{name}"].attrs["NAME"] = np.bytes_(text)
-    check(read_grid("a.h5", spacing=STEPS, origin=FIRST))
-
-
 @pytest.mark.parametrize(
     "order, resolution", [("zyxc", 0.0), ("xyzc", 1.0), ("tzyxc", 1.0), ("cyzx", 0.0)]
 )
@@ -321,55 +251,6 @@ def test_a_size_of_elements_is_in_the_order_of_the_axes():
 
 
 # Axes of length 1
-
-
-def write_ones(name: str, shape: tuple[int, ...]) -> None:
-    """Write the part with axes of length 1 among its own."""
-    array = sampled() if name[0] == "n" else sampled().T
-    array = array.reshape(shape)
-    if name.endswith(".npy"):
-        np.save(name, np.asfortranarray(array) if name == "nf.npy" else array)
-    elif name.endswith(".npz"):
-        np.savez(name, values=array)
-    elif name.endswith(".h5"):
-        with h5py.File(name, "w") as file:
-            file.create_dataset("m", data=array, chunks=tuple(min(n, 7) for n in shape))
-    else:
-        made = zarr.create_array(name, shape=shape, dtype="f4", chunks=(5,) * len(shape))
-        made[...] = array
-
-
-@pytest.mark.parametrize("where", [(3,), (1,), (0, 1, 5)])
-@pytest.mark.parametrize("name", ["n.npy", "nf.npy", "n.npz", "a.h5", "a.zarr"])
-def test_axes_of_length_1_are_dropped(name, where):
-    sizes = SIZES if name[0] == "n" else SIZES[::-1]
-    shape = np.expand_dims(np.empty(sizes), where).shape
-    write_ones(name, shape)
-    check(read_grid(name, spacing=STEPS, origin=FIRST))
-    assert describe_grid_file(name)["shape"] == list(SIZES)
-
-
-def test_more_than_three_longer_axes_are_refused():
-    for name, shape in (("n.npy", (4, 6, *SIZES[1:])), ("a.h5", (17, 20, 6, 4))):
-        write_ones(name, shape)
-    said = "n.npy: values have shape (4, 6, 20, 17): give three axes (x, y, z)"
-    assert refusal(GridError, read_grid, "n.npy") == said
-    assert refusal(FileError, read_grid, "a.h5") == "a.h5 holds no 3D dataset"
-    assert "its axis 3 has 4 entries, and a grid" in refusal(GridError, read_grid, "a.h5:m")
-
-
-def test_metaimage_of_four_axes_keeps_its_place():
-    for k, packed in enumerate((False, True)):
-        image = sitk.GetImageFromArray(sampled().T)
-        image.SetSpacing(STEPS.tolist())
-        image.SetOrigin(FIRST.tolist())
-        series = sitk.JoinSeries([image], 7.0, 2.0)
-        assert series.GetDimension() == 4
-        sitk.WriteImage(series, f"{k}.mha", packed)
-        check(read_grid(f"{k}.mha"))
-    turned = sitk.Flip(image, [True, False, True])
-    sitk.WriteImage(sitk.JoinSeries([turned]), "t.mha")
-    check(read_grid("t.mha"))
 
 
 def header_of(**fields: object) -> dict[str, object]:
@@ -456,18 +337,6 @@ def test_nrrd_places_without_directions():
     check(read_grid("f.nrrd"))
 
 
-def test_units_of_an_nrrd_space():
-    factors = np.array([1, 1, 1000])
-    header = header_of() | {"space directions": np.diag(STEPS * factors)}
-    header |= {"space origin": FIRST * factors, "space units": ["mm", "mm", "um"]}
-    nrrd.write("a.nrrd", sampled(), header)
-    grid = read_grid("a.nrrd")
-    check(grid)
-    assert grid.notes[0] == ("its axes have different units (x mm, y mm, z um): lengths are in mm")
-    nrrd.write("b.nrrd", sampled(), header_of(**{"space units": ["um"] * 3}))
-    assert read_grid("b.nrrd").notes[0] == "lengths are in the unit of its axes, um"
-
-
 # NIfTI
 
 
@@ -476,19 +345,6 @@ def affine() -> np.ndarray:
     found = np.diag([*STEPS, 1.0])
     found[:3, 3] = FIRST
     return found
-
-
-@pytest.mark.parametrize("order, name", [("<", "a.nii.gz"), (">", "a.nii"), (">", "a.nii.gz")])
-@pytest.mark.parametrize("version", [nibabel.Nifti1Image, nibabel.Nifti2Image])
-def test_both_versions_of_nifti_in_both_orders_of_bytes(version, name, order):
-    header = version.header_class(endianness=order)
-    for key, value in version(sampled(), affine()).header.items():
-        header[key] = value
-    nibabel.save(version(sampled().astype(f"{order}f4"), affine(), header), name)
-    with (gzip.open if name.endswith(".gz") else open)(name, "rb") as file:
-        size = int.from_bytes(file.read(4), {"<": "little", ">": "big"}[order])
-    assert size == {nibabel.Nifti1Image: 348, nibabel.Nifti2Image: 540}[version]
-    check(read_grid(name))
 
 
 def test_nifti_without_a_place_is_not_mirrored():
@@ -525,17 +381,6 @@ def test_sform_and_qform_that_disagree_are_told(codes):
     image.set_qform(affine(), codes[1])
     nibabel.save(image, "a.nii")
     assert not [note for note in read_grid("a.nii").notes if "form" in note]
-
-
-@pytest.mark.parametrize(
-    "unit, named", [("micron", "micrometre"), ("meter", "metre"), ("mm", ""), ("unknown", "")]
-)
-def test_the_unit_of_nifti_is_told(unit, named):
-    image = nibabel.Nifti1Image(sampled(), affine())
-    image.header.set_xyzt_units(unit)
-    nibabel.save(image, "a.nii")
-    told = [note for note in read_grid("a.nii").notes if "unit" in note]
-    assert told == ([f"lengths are in the unit that it states, {named}"] if named else [])
 
 
 # MetaImage
@@ -589,11 +434,28 @@ def test_arrays_of_cells_beside_those_of_points():
     assert read_grid("b.vti:field").shape == tuple(n + 1 for n in SIZES)
 
 
-def test_vectors_and_marks_are_read_only_by_name():
-    image = image_of_both(normal=lambda points: points)
-    image.cell_data["vtkGhostType"] = np.zeros(image.n_cells, np.uint8)
-    image.save("a.vti")
-    check(read_grid("a.vti"))
-    said = refusal(GridError, read_grid, "a.vti:normal")
-    said_ = "a.vti:normal: its array 'normal' has 3 numbers per sample: give an array of one"
-    assert said == said_
+@pytest.mark.parametrize("where", [(3,), (1,), (0, 1, 5)])
+def test_axes_of_length_1_are_dropped(where):
+    shape, turned = (np.expand_dims(each, where).shape for each in (sampled(), sampled().T))
+    np.save("c.npy", sampled().reshape(shape))
+    np.save("f.npy", np.asfortranarray(sampled().reshape(shape)))
+    np.savez("a.npz", values=sampled().reshape(shape))
+    with h5py.File("a.h5", "w") as file:
+        file.create_dataset("m", data=sampled().T.reshape(turned), chunks=(1,) * len(turned))
+    zarr.create_array("a.zarr", shape=turned, dtype="f4")[...] = sampled().T.reshape(turned)
+    for name in ("c.npy", "f.npy", "a.npz", "a.h5", "a.zarr"):
+        check(read_grid(name, spacing=STEPS, origin=FIRST))
+        assert describe_grid_file(name)["shape"] == list(SIZES)
+
+
+def test_one_of_several_arrays_is_named():
+    with h5py.File("a.h5", "w") as file:
+        file["deep/field"], file["other"] = sampled().T, sampled()
+        file["other"].attrs.update(spacing=STEPS, origin=FIRST)
+        file["flat"] = np.zeros((3, 3))
+    check(read_grid("a.h5:/deep/field", spacing=STEPS, origin=FIRST))
+    check(read_grid("a.h5:other", axes="xyz"))
+    said = "a.h5 holds several arrays, /deep/field, /other: give a.h5:/deep/field, say"
+    assert refusal(FileError, read_grid, "a.h5") == said
+    said = "a.h5 has no 3D dataset 'no': it holds /deep/field, /other"
+    assert refusal(FileError, read_grid, "a.h5:no") == said

@@ -18,7 +18,7 @@ from conftest import ball, refusal
 from test_formats import affine_of, sampled, save_vti, text_sdf
 
 from super_sdf import read_grid
-from super_sdf.errors import FileError, GridError, SuperSdfError, seen
+from super_sdf.errors import GridError, SuperSdfError, seen
 from super_sdf.files.readers.zarr import CODECS
 
 VALUES = sampled(affine_of(np.eye(3)))
@@ -166,18 +166,6 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
     assert read_grid(name, spacing=0.5).shape == (24, 20, 17)
 
 
-@pytest.mark.parametrize("name", DETACHED)
-def test_a_header_that_is_a_link_has_its_data_beside_what_it_leads_to(name):
-    os.makedirs("store")
-    os.makedirs("links")
-    write("store/a.raw", RAW)
-    DETACHED[name]("a.raw")
-    os.rename(name, f"store/{name}")
-    for file in ("a.raw", name):
-        os.symlink(f"../store/{file}", f"links/{file}")
-    assert read_grid(f"links/{name}", spacing=0.5).shape == (24, 20, 17)
-
-
 def test_lists_and_patterns_of_metaimage_are_what_itk_reads():
     for number, plane in enumerate(np.ascontiguousarray(VALUES.T)):
         write(f"p{number + 3:03d}.raw", plane.tobytes())
@@ -238,19 +226,6 @@ def test_raw_data_of_hdf5_is_read_beside_the_file(values, tmp_path, monkeypatch)
     with h5py.File("deep/a.h5", "w") as file:
         file.create_dataset("d", **about, external=[("a.raw", 0, len(raw))])
     assert said_of("deep/a.h5").endswith("deep/a.raw is a named pipe: give a file")
-
-
-def test_virtual_datasets_are_refused(values):
-    with h5py.File("b.h5", "w") as file:
-        file["d"] = values
-    layout = h5py.VirtualLayout(values.shape, values.dtype)
-    layout[:] = h5py.VirtualSource("b.h5", "d", values.shape)
-    with h5py.File("a.h5", "w") as file:
-        file.create_virtual_dataset("d", layout)
-    assert said_of("a.h5") == (
-        "a.h5:/d is a virtual dataset, put together of others: save its values as a dataset of "
-        "their own"
-    )
 
 
 def test_links_and_pipes_in_a_store(values):
@@ -334,13 +309,6 @@ def test_chunks_that_are_not_stored_are_counted(values, kind):
             )
 
 
-def test_a_fill_value_of_nan_is_unknown(values):
-    deep = np.where(np.arange(len(values))[:, None, None] < 24, values, np.nan)
-    store(deep.astype("f4"), fill_value=np.nan)
-    grid = read_grid("a.zarr", spacing=1)
-    assert np.isfinite(grid.values).all() and np.array_equal(grid.values.T[:24], values[:24])
-
-
 def test_background_of_a_mask_need_not_be_stored(values):
     mask = (values < 0).astype(np.uint8)
     store(mask)
@@ -376,15 +344,6 @@ def test_a_codec_that_is_not_in_the_list_is_refused_by_its_name(values, place):
         "a.zarr names the codec 'pickle', which is not among those that are read "
         f"({', '.join(sorted(CODECS))}): store it with one of these"
     )
-
-
-def test_only_the_array_that_is_read_must_have_known_codecs(values):
-    zarr.open_group("g.zarr", mode="w")
-    store(values, "g.zarr/a")
-    store(values, "g.zarr/b")
-    edited("g.zarr/b/zarr.json", PICKLE_AT["codecs"])
-    assert np.array_equal(read("g.zarr:/a"), values)
-    assert "names the codec 'pickle'" in said_of("g.zarr:/b")
 
 
 @pytest.mark.parametrize("path", ["../a", "a//b", "./a", "c"])

@@ -149,14 +149,6 @@ def test_inactive_values_as_a_leaf_states_them(tmp_path, state, stated, selected
     np.testing.assert_array_equal(values, whole[tuple(held)])
 
 
-def test_values_that_are_not_packed(tmp_path):
-    """Without any compression a leaf has all 512 values, whatever their state."""
-    values = np.linspace(-4, 4, 512).astype("<f4")
-    leaf = bytes([6]) + values.tobytes()
-    (tmp_path / "a.vdb").write_bytes(one_leaf(leaf, mask(size=512), flags=0))
-    np.testing.assert_array_equal(voxels(tmp_path / "a.vdb")[0][2:-2, 2:-2, 2:-2].ravel(), values)
-
-
 def said_of(path: Path, content: bytes, kind: type[Exception] = FileError) -> str:
     """Return why a file of this content is refused."""
     path.write_bytes(content)
@@ -183,11 +175,6 @@ def test_a_file_that_ends_early_or_is_another_one(tmp_path):
         assert re.match(r".*a\.vdb is (truncated or damaged|no \.vdb file): ", said)
     said = said_of(path, whole[:8] + struct.pack("<I", 220) + whole[12:])
     assert "has version 220 of the format: save it with OpenVDB 3" in said
-
-
-def test_a_grid_is_named_where_there_are_several():
-    said = refusal(FileError, read_grid, DATA / "picogk.vdb:b")
-    assert "has no grid of floating-point values 'b': it holds surf" in said
 
 
 def test_info_lists_the_grids_of_a_file(command):

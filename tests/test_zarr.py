@@ -116,24 +116,6 @@ def test_an_array_without_metadata_may_begin_with_axes_of_length_one(values):
     assert said_of("c.zarr", spacing=1) == said
 
 
-def test_transformations_of_another_type_are_refused(values):
-    image("i.zarr", [(values.T, [{"type": "affine", "affine": [1, 2]}])])
-    assert said_of("i.zarr") == (
-        "i.zarr: one of its coordinateTransformations has the type 'affine' and 2 numbers: give "
-        "scale or translation, with one number for each of its 3 axes"
-    )
-
-
-def test_an_image_among_several(values):
-    """As bioformats2raw writes them: a group of images, each a group."""
-    for name in ("0", "1"):
-        zarr.open_group("b.zarr", mode="a")
-        image(f"b.zarr/{name}", [(values.T, [scale(1, 1, 1), translation(5, 5, 5)])])
-    said = "b.zarr holds several arrays, /0/0, /1/0: give b.zarr:/0/0"
-    assert said_of("b.zarr", FileError).startswith(said)
-    assert read_grid("b.zarr:/1").origin == read_grid("b.zarr:/1/0").origin == (5, 5, 5)
-
-
 def test_batch_finds_stores_in_folders_and_by_patterns(run_batch, values):
     Path("in/deep").mkdir(parents=True)
     store("in/a.zarr", values.T)
@@ -171,17 +153,6 @@ def test_info_of_a_file_prints_its_chunks(command, values):
     assert found["spacing"] == [1, 1, 1] and found["origin"] == [1, 2, 3]
     assert found["chunks"] == [8, 8, 8] and found["zarr format"] == 2
     assert found["notes"] == ["lengths are in the unit of its axes, micrometer"]
-
-
-def test_info_of_numpy_files(command, values):
-    np.save("a.npy", values)
-    np.savez("b.npz", values=values, spacing=0.5, origin=[1, 2, 3])
-    assert "shape: 30, 26, 22\n" in command("info", "a.npy")[1]
-    found = json.loads(command("info", "b.npz", "--json")[1])
-    assert found["spacing"] == [0.5] and found["origin"] == [1, 2, 3] and found["order"] == "C"
-    assert command("info", "no.zarr")[::2] == (1, "Error: no.zarr does not exist\n")
-    want = "Error: a.npy and --check: give only one of them\n"
-    assert command("info", "a.npy", "--check")[2] == want
 
 
 @pytest.mark.parametrize("axes", ["xyz", "zyx"])

@@ -89,16 +89,4 @@ def rounded(rng: np.random.Generator) -> Manifold:
     return Manifold.batch_hull([turned(rng, primitive(rng)).translate(list(p)) for p in spread[:3]])
 
 
-def facets(rng: np.random.Generator) -> Manifold:
-    """Draw a convex polyhedron, whole or as CSG with a few others."""
-    solid = Manifold()
-    for n in range(rng.choice([1, 1, 2, 3, 5])):
-        points = rng.normal(size=(int(rng.integers(5, 40)), 3))
-        points /= np.linalg.norm(points, axis=1, keepdims=True) ** rng.choice([0.5, 1])
-        other = Manifold.hull_points(points * rng.uniform(0.15, 0.5, 3))
-        other = other.translate(list(rng.uniform(-0.35, 0.35, 3)))
-        solid = solid - other if n and rng.random() < 0.5 else solid + other
-    return solid
-
-
-PARTS = (rounded, lathe, facets, prism, primitive)
+PARTS = (rounded, lathe, prism, primitive)

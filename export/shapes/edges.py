@@ -10,14 +10,7 @@ import numpy as np
 from manifold3d import CrossSection, Manifold
 from scipy.spatial import cKDTree
 
-from export.shapes.draws import (
-    bars,
-    draw_outline,
-    joined,
-    log_uniform,
-    polar_polygon,
-    sharp_outline,
-)
+from export.shapes.draws import bars, draw_outline, log_uniform, sharp_outline
 
 QUARTER = np.linspace(0, np.pi / 2, 7)
 ROUND = np.stack([1 - np.cos(QUARTER), np.sin(QUARTER)], axis=1)  # inset and rise, from the wall on
@@ -98,19 +91,6 @@ def pierced(rng: np.random.Generator, outline: CrossSection) -> CrossSection:
     return outline
 
 
-def stepped(rng: np.random.Generator, radius: float, segments: int) -> Manifold:
-    """Draw a turned part of a few steps, whose corners are rounded or, by 4 segments, cut."""
-    half = CrossSection()
-    heights = rng.uniform(0.08, 0.4, int(rng.integers(2, 6)))
-    for z, height in zip(np.cumsum(heights) - heights / 2, heights):
-        step = CrossSection.square([2 * rng.uniform(0.1, 0.5), height + 1e-3], True)
-        half += step.translate([0, z])
-    if rng.random() < 0.4:
-        half -= CrossSection.square([rng.uniform(0.05, 0.15), 9], True)
-    profile = smooth(half, min(radius, 0.06), segments)
-    return (profile ^ CrossSection.square([9, 9]).translate([0, -4])).revolve(64)
-
-
 def studded(rng: np.random.Generator, edge: np.ndarray, size: float) -> Manifold:
     """Draw a plate with bosses and pockets, all their edges treated, the inner ones too."""
     outline, height = smooth(draw_outline(rng), size), log_uniform(rng, 0.06, 0.3)
@@ -136,15 +116,13 @@ def crossed(rng: np.random.Generator, radius: float, segments: int) -> Manifold:
 
 
 def filleted(rng: np.random.Generator) -> Manifold:
-    """Draw a part whose edges are round, outside and inside: slab, turned part, plate, bracket."""
+    """Draw a part whose edges are round, outside and inside: slab, plate, bracket."""
     radius = log_uniform(rng, 0.012, 0.25)
-    match rng.integers(5):
+    match rng.integers(4):
         case 0 | 1:
             outline = smooth(pierced(rng, sharp_outline(rng)), radius)
             return slab(outline, log_uniform(rng, 0.05, 1), ROUND, radius, int(rng.integers(2)))
         case 2:
-            return stepped(rng, radius, 48)
-        case 3:
             return studded(rng, ROUND, min(radius, 0.06))
     return crossed(rng, radius, 48)
 
@@ -162,27 +140,10 @@ def cut_block(rng: np.random.Generator) -> Manifold:
     return solid
 
 
-def hexagonal(rng: np.random.Generator) -> Manifold:
-    """Draw a nut, a knob or a pencil: a polygonal prism whose ends are cut by cones."""
-    count, height, cut = (
-        int(rng.integers(3, 13)),
-        log_uniform(rng, 0.1, 1.5),
-        rng.uniform(0.02, 0.2),
-    )
-    outline = polar_polygon(np.arange(count) * 2 * np.pi / count, np.full(count, 0.5))
-    if rng.random() < 0.6:
-        outline -= CrossSection.circle(rng.uniform(0.1, 0.3), 48)
-    rise = min(cut * rng.choice([0.5, 1]), 0.45 * height)
-    cone = Manifold.cylinder(rise, 0.5, 0.5 - cut, 96).translate([0, 0, height - rise])
-    ends = [cone, cone.mirror([0, 0, 1]).translate([0, 0, height])]
-    middle = Manifold.cylinder(height - 2 * rise, 0.5, 0.5, 96).translate([0, 0, rise])
-    return outline.extrude(height) ^ joined([*ends, middle])
-
-
 def chamfered(rng: np.random.Generator) -> Manifold:
-    """Draw a part whose edges are cut off: slab, block, turned part, plate, bracket or nut."""
+    """Draw a part whose edges are cut off: slab, block, plate or bracket."""
     size = log_uniform(rng, 0.012, 0.2)
-    match rng.integers(6):
+    match rng.integers(4):
         case 0:
             outline, steep = pierced(rng, draw_outline(rng)), rng.choice([0.5, 1, 1, 2])
             height = log_uniform(rng, 0.05, 1)
@@ -190,9 +151,5 @@ def chamfered(rng: np.random.Generator) -> Manifold:
         case 1:
             return cut_block(rng)
         case 2:
-            return stepped(rng, size, 4)
-        case 3:
             return studded(rng, CHAMFER, min(size, 0.06))
-        case 4:
-            return crossed(rng, size, 4)
-    return hexagonal(rng)
+    return crossed(rng, size, 4)

@@ -1,4 +1,4 @@
-"""Families of machine parts: plates, gears, patterns, screws, ribbed castings, and letters."""
+"""Families of machine parts: plates, gears, screws, ribbed castings, and letters."""
 
 from __future__ import annotations
 
@@ -7,17 +7,7 @@ import math
 import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 
-from export.shapes.basic import primitive
-from export.shapes.draws import (
-    draw_outline,
-    joined,
-    log_uniform,
-    polar_polygon,
-    polyline,
-    turned,
-    unit_sized,
-    wound,
-)
+from export.shapes.draws import draw_outline, joined, log_uniform, polar_polygon, polyline, wound
 
 
 def plate(rng: np.random.Generator) -> Manifold:
@@ -55,23 +45,6 @@ def gear(rng: np.random.Generator) -> Manifold:
     return solid - bore.extrude(4 * height).translate([0, 0, -1.5 * height])
 
 
-def repeated(rng: np.random.Generator) -> Manifold:
-    """Draw a ring or a grid of one part, on or cut into a base: fins, combs, studs, castles."""
-    part = unit_sized(turned(rng, primitive(rng)))
-    part = part.scale([log_uniform(rng, 0.1, 0.4), log_uniform(rng, 0.1, 1), rng.uniform(0.1, 0.8)])
-    base = unit_sized(draw_outline(rng).extrude(log_uniform(rng, 0.03, 0.5)))
-    top, most = base.bounding_box()[5], 2 + math.isqrt(4000 // part.num_tri())
-    if rng.random() < 0.4:
-        count, radius = int(rng.integers(3, min(2 * most, 17))), rng.uniform(0.1, 0.35)
-        arm = part.translate([radius, 0, top])
-        copies = [arm.rotate([0, 0, 360 * n / count]) for n in range(count)]
-    else:
-        counts, gap = rng.integers(1, min(most, 8), 2), rng.uniform(0.5, 0.9) / 7
-        places = np.indices(tuple(counts)).reshape(2, -1).T - (counts - 1) / 2
-        copies = [part.scale([0.3] * 3).translate([*(p * gap), top]) for p in places]
-    return base - joined(copies) if rng.random() < 0.35 else base + joined(copies)
-
-
 def tooth(rng: np.random.Generator, pitch: float, depth: float) -> CrossSection:
     """Draw the section of a thread from its root outward: pointed, flat, round, or a blade."""
     root, top = 0.49 * pitch * rng.uniform(0.6, 1), rng.choice([0.05, 0.12, 0.25]) * pitch
@@ -101,29 +74,17 @@ def screw(rng: np.random.Generator, length: float, radius: float) -> Manifold:
     return rod if rng.random() < 0.5 else rod.mirror([1, 0, 0])
 
 
-def head(rng: np.random.Generator, wide: float) -> Manifold:
-    """Draw the head of a screw, below z = 0: round, square or hexagonal, with a slot or socket."""
-    height, sides = wide * rng.uniform(0.3, 0.9), int(rng.choice([4, 6, 6, 48]))
-    body = Manifold.cylinder(height, wide, wide * rng.choice([0.7, 1, 1]), sides)
-    tool = Manifold.cylinder(wide, wide * rng.uniform(0.3, 0.6), -1, int(rng.choice([4, 6, 48])))
-    if rng.random() < 0.4:
-        tool = Manifold.cube([3 * wide, 0.2 * wide, wide], True).translate([0, 0, wide / 2])
-    depth = rng.choice([0, rng.uniform(0.2, 0.8)]) * height
-    return (body - tool.translate([0, 0, height - depth])).mirror([0, 0, 1])
-
-
 def threads(rng: np.random.Generator) -> Manifold:
     """Draw a threaded rod, a bolt or screw with a head, or a nut or block with a threaded bore."""
     radius, length = log_uniform(rng, 0.06, 0.4), log_uniform(rng, 0.2, 1)
     rod = screw(rng, length, radius)
-    match rng.integers(4):
-        case 0:
-            return rod
-        case 1 | 2:
-            shank = Manifold.cylinder(rng.uniform(0, 0.4) * length + 0.01, radius, -1, 36)
-            tip = Manifold.cylinder(length, length + 0.6 * radius, 0.6 * radius, 48)
-            return joined([rod ^ tip, shank, head(rng, radius * rng.uniform(1.3, 2.2))])
     sides, wide = int(rng.choice([4, 6, 6, 48])), radius * rng.uniform(1.5, 2.2)
+    if rng.random() < 0.25:
+        return rod
+    if rng.random() < 0.5:
+        shank = Manifold.cylinder(rng.uniform(0, 0.4) * length + 0.01, radius, -1, 36)
+        head = Manifold.cylinder(rng.uniform(0.3, 0.9) * wide, wide, -1, sides).mirror([0, 0, 1])
+        return joined([rod, shank, head])
     return Manifold.cylinder(0.9 * length, wide, -1, sides).translate([0, 0, 0.05 * length]) - rod
 
 
@@ -147,42 +108,15 @@ def fins(rng: np.random.Generator, wall: float) -> CrossSection:
     return section.rotate(float(rng.choice([0, 0, 45])))
 
 
-def gusset(wall: float, size: tuple[float, float], hollow: float) -> Manifold:
-    """Return a triangular web in the xz plane with its right angle at the origin."""
-    triangle = CrossSection([np.array([[-0.02, -0.02], [size[0], -0.02], [-0.02, size[1]]])])
-    triangle -= triangle.offset(-hollow)
-    return triangle.extrude(wall).rotate([90, 0, 0]).translate([0, wall / 2, 0])
-
-
-def bracket(rng: np.random.Generator, wall: float) -> Manifold:
-    """Draw two plates at a right angle, or a post on a plate, held by gussets."""
-    base, width = log_uniform(rng, 0.015, 0.1), rng.uniform(0.3, 1)
-    length, height = rng.uniform(0.3, 0.8, 2)
-    size, count = (rng.uniform(0.4, 1) * length, rng.uniform(0.4, 1) * height), rng.integers(1, 7)
-    web = gusset(wall, size, rng.choice([9, rng.uniform(0.02, 0.06)]))
-    if rng.random() < 0.5:
-        floor = Manifold.cube([length + base, width, base]).translate([-base, -width / 2, -base])
-        back = Manifold.cube([base, width, height]).translate([-base, -width / 2, 0])
-        places = np.linspace(-0.5, 0.5, count + 2)[1:-1] * width
-        return joined([floor, back, *(web.translate([0, y, 0]) for y in places)])
-    post = Manifold.cylinder(height, rng.uniform(0.06, 0.2), -1, 48)
-    reach = post.bounding_box()[3] - 0.01
-    webs = [web.translate([reach, 0, 0]).rotate([0, 0, 360 * n / count]) for n in range(count)]
-    floor = Manifold.cylinder(base, reach + length, -1, int(rng.choice([4, 48]))).rotate([0, 0, 45])
-    return joined([post, floor.translate([0, 0, -base]), *webs])
-
-
 def ribs(rng: np.random.Generator) -> Manifold:
-    """Draw a plate, tray or shaft stiffened by thin ribs, or plates held by gussets."""
+    """Draw a plate, tray or shaft stiffened by thin ribs."""
     wall, height = log_uniform(rng, 0.008, 0.06), log_uniform(rng, 0.05, 0.5)
-    kind, floor, outline = rng.integers(5), log_uniform(rng, 0.01, 0.1), draw_outline(rng)
-    if kind == 0:
-        return bracket(rng, wall)
-    if kind == 1:  # a shaft, its ribs all round
+    kind, floor, outline = rng.integers(4), log_uniform(rng, 0.01, 0.1), draw_outline(rng)
+    if kind == 0:  # a shaft, its ribs all round
         core = Manifold.cylinder(height * rng.choice([0.8, 1, 1.5]), rng.uniform(0.05, 0.3), -1, 48)
         return core + (fan(int(rng.integers(1, 13)), wall) ^ outline).extrude(height)
     walls = fins(rng, wall) ^ outline
-    if kind == 2:  # a tray with webs inside
+    if kind == 1:  # a tray with webs inside
         walls += outline - outline.offset(-rng.choice([1, 2]) * wall)
     level = rng.choice([0.01, 0.01, height / 2]) - floor  # of the plate: below, or half-way up
     return walls.extrude(height) + outline.extrude(floor).translate([0, 0, level])
@@ -207,21 +141,16 @@ def stroke(rng: np.random.Generator, pen: float, segments: int) -> CrossSection:
     return CrossSection.circle(0.7 * pen, segments).translate(list(GRID[rng.integers(len(GRID))]))
 
 
-def letter(rng: np.random.Generator, pen: float, segments: int) -> CrossSection:
-    """Draw a letter of one stroke to three."""
-    strokes = [stroke(rng, pen, segments) for _ in range(rng.integers(1, 4))]
-    return CrossSection.batch_boolean(strokes, OpType.Add)
-
-
 def writing(rng: np.random.Generator) -> CrossSection:
     """Draw lines of letters, slanted or upright, round the origin and about one unit wide."""
     pen, segments = log_uniform(rng, 0.05, 0.25), int(rng.choice([4, 16]))
     shape, slant = (rng.choice([1, 1, 2, 3]), rng.integers(1, 8)), rng.choice([0, 0, 0.25])
-    letters = [
-        letter(rng, pen, segments).translate([(0.62 + pen) * column, (1.15 + pen) * row])
+    strokes = [
+        stroke(rng, pen, segments).translate([(0.62 + pen) * column, (1.15 + pen) * row])
         for row, column in np.ndindex(shape)
+        for _ in range(rng.integers(1, 4))
     ]
-    page = CrossSection.batch_boolean(letters, OpType.Add).transform([[1, slant, 0], [0, 1, 0]])
+    page = CrossSection.batch_boolean(strokes, OpType.Add).transform([[1, slant, 0], [0, 1, 0]])
     low, high = np.reshape(page.bounds(), (2, 2))
     return page.translate(list(-(low + high) / 2)).scale([0.9 / (high - low).max()] * 2)
 

@@ -1,69 +1,34 @@
 """Families of smooth bodies, most of them level sets: blends, grown limbs, skins, figures.
 
-A figure has a relief, as sculptures, scans and toys have: sheets, reliefs and spikes down to a
+A figure has a relief, as sculptures, scans and toys have: ridges, scales and spikes down to a
 hundredth of its size. Points are (..., 3), fields of distances (n, n, n), both float32.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import cache
-from operator import mul
 
 import numpy as np
 from manifold3d import Manifold, Mesh64
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from export.shapes.basic import rounded
-from export.shapes.draws import log_uniform, unit_sized
+from export.shapes.draws import log_uniform
 
 FLATNESS = 3e-4  # of the unit; how far fewer faces may depart from a level set
 
 
-def wave_sum(terms: Callable[[int, float], Sequence[float]]) -> Callable[..., float]:
-    """Return the field whose value at (x, y, z) is the sum over k of X_k(x) Y_k(y) Z_k(z).
-
-    ``terms(axis, coordinate)`` gives the factors of all k; `level_set` asks for few different
-    coordinates, so remembering them makes its many calls cheap.
-    """
-    factors = cache(terms)
-    return lambda x, y, z: sum(map(mul, map(mul, factors(0, x), factors(1, y)), factors(2, z)))
-
-
 def blobs(rng: np.random.Generator) -> Manifold:
     """Draw blobs, from balls to soft boxes, that blend into one another."""
-    centres = rng.uniform(-0.3, 0.3, (3, int(rng.integers(2, 8))))
+    centres = rng.uniform(-0.3, 0.3, (int(rng.integers(2, 8)), 3))
     widths, power = rng.uniform(0.1, 0.35, centres.shape), int(rng.choice([2, 4, 8]))
-    blend = wave_sum(
-        lambda axis, x: np.exp(-(((x - centres[axis]) / widths[axis]) ** power)).tolist()
-    )
-
-    def field(x: float, y: float, z: float) -> float:
-        # Made to run almost linearly through the surface, which is interpolated linearly.
-        return 1 - math.pow(max(-math.log(blend(x, y, z) + 1e-99), 0), 1 / power)
-
-    return Manifold.level_set(field, [-0.7] * 3 + [0.7] * 3, rng.uniform(0.04, 0.07))
-
-
-def gyroid(rng: np.random.Generator) -> Manifold:
-    """Draw a body filled with a gyroid: one side of it, or a wall along it."""
-    rates, level, walls = rng.uniform(5, 12, 3), rng.uniform(-0.5, 0.5), rng.random() < 0.5
-
-    def terms(axis: int, x: float) -> tuple[float, ...]:
-        sin, cos = math.sin(rates[axis] * x), math.cos(rates[axis] * x)
-        return ((sin, 1.0, cos), (cos, sin, 1.0), (1.0, cos, sin))[axis]
-
-    wave, body = wave_sum(terms), unit_sized(rounded(rng))
-
-    def field(x: float, y: float, z: float) -> float:
-        height = wave(x, y, z) - level
-        return 0.4 - abs(height) if walls else height
-
-    # A level set is ragged where its bounds cut it, so they lie outside the body.
-    bounds = np.array(body.bounding_box()) + np.repeat([-0.05, 0.05], 3)
-    return body ^ Manifold.level_set(field, list(bounds), rng.uniform(0.025, 0.04))
+    step = rng.uniform(0.025, 0.045)
+    points = grid(0.8, step)
+    blend = np.full(points.shape[:-1], 1e-30)
+    for centre, width in zip(centres, widths):
+        blend += np.exp(-(((points - centre) / width) ** power).sum(-1))
+    # made to run almost linearly through the surface, which is interpolated linearly
+    return marched(np.maximum(-np.log(blend), 0) ** (1 / power) - 1, -0.8, step)
 
 
 def marched(values: np.ndarray, low: float, step: float) -> Manifold:
@@ -95,16 +60,6 @@ def roughness(rng: np.random.Generator, points: np.ndarray, finest: float) -> np
         sine = np.sin(points @ wave.astype(points.dtype) + points.dtype.type(phase))
         total += points.dtype.type(height) * (1 - 2 * np.abs(sine) if ridged else sine)
     return total
-
-
-def displaced(rng: np.random.Generator) -> Manifold:
-    """Draw a stone, fruit, star or crumpled ball: a sphere pushed in and out by waves."""
-    depth, finest = log_uniform(rng, 0.06, 0.5), log_uniform(rng, 10, 60)
-
-    def push(points: np.ndarray) -> np.ndarray:
-        return points * np.exp(depth * roughness(rng, points, finest))[:, None]
-
-    return Manifold.sphere(0.5, 180).warp_batch(push).scale(list(rng.uniform(0.3, 1, 3)))
 
 
 def limbs(rng: np.random.Generator) -> np.ndarray:
@@ -216,8 +171,6 @@ def sculpture(rng: np.random.Generator) -> Manifold:
     """Draw a figure with folds, scales, grooves and thorns."""
     points = grid(0.58, STEP)
     values = blended(rng, points, 0.1) if rng.random() < 0.35 else grown(rng, points)
-    for _ in range(rng.integers(0, 3)):
-        values = np.minimum(values, sheet(rng, points))
     skin = np.abs(values) < SKIN
     for _ in range(rng.integers(2, 5)):
         depth = log_uniform(rng, 0.008, 0.04) * rng.choice([-1, 1])
@@ -225,13 +178,6 @@ def sculpture(rng: np.random.Generator) -> Manifold:
     if rng.random() < 0.4:
         put_spikes(rng, points, values)
     return marched(values, points[0, 0, 0, 0], STEP)
-
-
-def sheet(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
-    """Draw a wing, an ear or a fold of cloth: a wavy thin wall that a body cuts out."""
-    middle = draw_distance(rng, points) + 0.05 * roughness(rng, points, COARSE)
-    wall = np.abs(middle) - np.float32(log_uniform(rng, 0.008, 0.025))
-    return np.maximum(wall, draw_distance(rng, points))
 
 
 def relief(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
@@ -276,20 +222,12 @@ def put_spikes(rng: np.random.Generator, points: np.ndarray, values: np.ndarray)
     length, radius = log_uniform(rng, 0.03, 0.25), log_uniform(rng, 0.006, 0.03)
     lean = rng.normal(size=3) * rng.uniform(0, 1)
     for place in surface[rng.integers(len(surface), size=int(log_uniform(rng, 2, 60)))]:
-        way = unit(unit(slope_at(values, place)) + lean) * length * rng.uniform(0.5, 1.2)
+        low, high = np.maximum(place - 2, 0), np.minimum(place + 3, values.shape)
+        around = values[tuple(slice(*ends) for ends in zip(low, high))]
+        slope = np.array([along.mean() for along in np.gradient(around)])
+        way = slope / (np.linalg.norm(slope) + 1e-9) + lean
+        way *= length * rng.uniform(0.5, 1.2) / (np.linalg.norm(way) + 1e-9)
         start, tip = points[tuple(place)], radius * rng.choice([0.15, 0.6])
         rod = np.array([[*start, radius], [*(start + way), tip]], np.float32)
         box = near_rod(points, rod, 0.05)
         values[box] = np.minimum(values[box], rod_distance(points[box], rod))
-
-
-def slope_at(values: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return the mean gradient, per step of the grid, within two steps of a place."""
-    low, high = np.maximum(place - 2, 0), np.minimum(place + 3, values.shape)
-    around = values[tuple(slice(*ends) for ends in zip(low, high))]
-    return np.array([along.mean() for along in np.gradient(around)])
-
-
-def unit(vector: np.ndarray) -> np.ndarray:
-    """Return a vector scaled to length 1; 0 stays 0."""
-    return vector / (np.linalg.norm(vector) + 1e-9)

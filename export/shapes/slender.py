@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from itertools import combinations
 
 import numpy as np
 from manifold3d import CrossSection, Manifold
 from scipy.interpolate import PchipInterpolator
-from scipy.spatial import Delaunay
 
 from export.shapes.basic import PARTS
 from export.shapes.draws import (
@@ -41,24 +39,6 @@ def shell(rng: np.random.Generator) -> Manifold:
     return swayed(rng, sheet, 0.9)
 
 
-def frame(rng: np.random.Generator) -> Manifold:
-    """Draw struts: along the edges of a lattice or of a polyhedron, or from node to node."""
-    radius, sides = log_uniform(rng, 0.012, 0.06), int(rng.choice([4, 8, 12]))
-    if rng.random() < 0.5:
-        counts = rng.integers([2, 2, 1], [4, 4, 3])
-        nodes = np.indices(tuple(counts)).reshape(3, -1).T * rng.uniform(0.3, 0.5, 3)
-        gaps = np.abs(nodes[:, None] - nodes[None])
-        linked = (gaps.max(2) < 0.51) & ((gaps > 0).sum(2) <= rng.choice([1, 1, 2]))
-    else:
-        nodes = rng.uniform(-0.5, 0.5, (int(rng.integers(4, 10)), 3))
-        gaps = np.linalg.norm(nodes[:, None] - nodes[None], axis=2)
-        linked = gaps <= np.sort(gaps, axis=1)[:, 3:4]
-    knot = Manifold.sphere(radius, sides)
-    knots = [knot.translate(list(node)) for node in nodes]
-    pairs = np.argwhere(np.triu(linked | linked.T, 1))
-    return joined([Manifold.batch_hull([knots[a], knots[b]]) for a, b in pairs])
-
-
 def pipe(rng: np.random.Generator) -> Manifold:
     """Draw a coil or a bent pipe, solid or hollow: a bar laid along a helix."""
     turns, coil, rise = log_uniform(rng, 0.15, 4), rng.uniform(0.15, 0.4), rng.uniform(0.15, 0.4)
@@ -82,28 +62,6 @@ def cup(rng: np.random.Generator, wall: float) -> Manifold:
     return half.revolve(64, float(rng.choice([360, 360, rng.uniform(90, 300)])))
 
 
-def blade(rng: np.random.Generator, wall: float) -> Manifold:
-    """Draw a wing or a blade along z: a cambered, tapered and twisted foil."""
-    chord, camber = np.linspace(0, 1, 24), rng.uniform(-0.3, 0.3)
-    thickness = wall * (2.97 * np.sqrt(chord) - 1.26 * chord - 3.5 * chord**2 + 1.9 * chord**3)
-    middle, half = camber * 4 * chord * (1 - chord), thickness / 2 + 0.002
-    upper, lower = np.stack([chord, middle + half], 1), np.stack([chord, middle - half], 1)
-    foil = CrossSection([np.concatenate([lower, upper[::-1]])]).translate([-0.4, 0])
-    foil, taper = foil.scale([rng.uniform(0.15, 0.6)] * 2), rng.uniform(0.4, 1)
-    return foil.extrude(rng.uniform(0.3, 1), 24, rng.uniform(-60, 60), [taper, taper])
-
-
-def propeller(rng: np.random.Generator, wall: float) -> Manifold:
-    """Draw a hub with a ring of blades: a fan, a turbine or a ship's screw."""
-    radius, count = rng.uniform(0.05, 0.2), int(rng.integers(2, 9))
-    leaf = blade(rng, 2 * wall).rotate([0, 0, rng.uniform(10, 80)]).rotate([0, 90, 0])
-    leaves = [
-        leaf.translate([0.8 * radius, 0, 0]).rotate([0, 0, 360 * n / count]) for n in range(count)
-    ]
-    reach = 1.05 * max(abs(leaf.bounding_box()[2]), leaf.bounding_box()[5])
-    return joined([*leaves, Manifold.cylinder(2 * reach, radius, -1, 48, True)])
-
-
 def rolled(rng: np.random.Generator, wall: float) -> Manifold:
     """Draw a sheet rolled to a spiral, folded to a zigzag or waved like corrugated iron."""
     turns, count = rng.uniform(0.5, 3.5), int(rng.integers(2, 9))
@@ -120,10 +78,10 @@ def rolled(rng: np.random.Generator, wall: float) -> Manifold:
 
 
 def thin(rng: np.random.Generator) -> Manifold:
-    """Draw what is thin all over: a sheet, flat, rolled or swayed, a cup, a blade or a fan."""
+    """Draw what is thin all over: a sheet, flat, rolled or swayed, or a cup."""
     wall = log_uniform(rng, 0.006, 0.04)
-    kinds = (cup, cup, blade, propeller, rolled, rolled)
-    kind = rng.integers(len(kinds) + 2)
+    kinds = (cup, rolled)
+    kind = rng.integers(len(kinds) + 1)
     if kind < len(kinds):
         return kinds[kind](rng, wall)
     outline = draw_outline(rng)
@@ -161,12 +119,7 @@ def open_profile(rng: np.random.Generator, wall: float) -> CrossSection:
 
 
 def truss(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Draw nodes (n, 3) and pairs of linked nodes (m, 2): a crystal's cells, or a random truss."""
-    if rng.random() < 0.3:
-        nodes = rng.uniform(-0.5, 0.5, (int(rng.integers(8, 22)), 3)) * rng.uniform(0.3, 1, 3)
-        links = Delaunay(nodes).simplices[:, list(combinations(range(4), 2))].reshape(-1, 2)
-        links = np.unique(np.sort(links, axis=1), axis=0)
-        return nodes, links[rng.random(len(links)) < rng.uniform(0.6, 1)]
+    """Draw nodes (n, 3) and pairs of linked nodes (m, 2): the cells of a crystal."""
     steps = np.indices(tuple(rng.integers([1, 1, 1], [5, 4, 4]) + 1)).reshape(3, -1).T
     inner = steps[(steps < steps.max(0)).all(1)] + 0.5
     match rng.integers(3):

@@ -25,16 +25,13 @@ def length(vectors: np.ndarray) -> np.ndarray:
     return np.linalg.norm(vectors, axis=1)
 
 
-def flat(normal: np.ndarray) -> Field:
-    return lambda points: (points @ normal, np.tile(normal, (len(points), 1)))
-
-
 def tilted(rng: np.random.Generator, degrees: float) -> Field:
     """Return a plane that is tilted against one of the lattice's."""
     normal = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1]][rng.integers(3)], float)
     normal /= np.linalg.norm(normal)
     aside, angle = np.cross(normal, rng.normal(size=3)), np.radians(degrees)
-    return flat(np.cos(angle) * normal + np.sin(angle) * aside / np.linalg.norm(aside))
+    normal = np.cos(angle) * normal + np.sin(angle) * aside / np.linalg.norm(aside)
+    return lambda points: (points @ normal, np.tile(normal, (len(points), 1)))
 
 
 def ellipsoid(axes: np.ndarray) -> Field:

@@ -14,29 +14,29 @@ from manifold3d import Error, Manifold
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from export.shapes.basic import csg, facets, lathe, primitive, prism, rounded
+from export.shapes.basic import csg, lathe, primitive, prism, rounded
 from export.shapes.draws import joined, log_uniform, swayed, turned, twisted, unit_sized
 from export.shapes.edges import chamfered, filleted
-from export.shapes.mechanical import gear, plate, repeated, ribs, text, threads
-from export.shapes.organic import blends, blobs, creature, displaced, gyroid, sculpture
-from export.shapes.slender import frame, lattice, pipe, section, shell, thin
+from export.shapes.mechanical import gear, plate, ribs, text, threads
+from export.shapes.organic import blends, blobs, creature, sculpture
+from export.shapes.slender import lattice, pipe, section, shell, thin
 from super_sdf import Mesh
 
 ATTEMPTS = 20  # about one candidate in a hundred fails, mostly by too many faces
 MAX_FACES = 70_000  # the finest reliefs have some 50,000
-MIN_VOLUME = 1e-4  # of the cubed diagonal; the thinnest shells and frames hold some 1e-3
+MIN_VOLUME = 1e-4  # of the cubed diagonal; the thinnest shells and trusses hold some 1e-3
 TOLERANCE = 1e-5  # of the diagonal; shorter edges only spoil the normals of their triangles
 
 
 Family = Callable[[np.random.Generator], Manifold]
 
 MACHINED: tuple[Family, ...] = (
-    prism, csg, lathe, rounded, facets,
+    prism, csg, lathe, rounded,
     filleted, chamfered,
-    plate, gear, repeated, threads, ribs,
-    shell, frame, pipe, thin, section, lattice, text,
+    plate, gear, threads, ribs,
+    shell, pipe, thin, section, lattice, text,
 )  # fmt: skip
-GROWN: tuple[Family, ...] = (blobs, gyroid, blends, creature, displaced, sculpture)
+GROWN: tuple[Family, ...] = (blobs, blends, creature, sculpture)
 FAMILIES: dict[str, Family] = {family.__name__: family for family in (*MACHINED, *GROWN)}
 
 GROWN_SHARE = 0.4  # few of the meshes at hand have smooth, irregular shapes
@@ -51,22 +51,11 @@ def draw_family(rng: np.random.Generator, names: Sequence[str] = ()) -> Family:
 
 
 def bent(rng: np.random.Generator, solid: Manifold) -> Manifold:
-    """Bend, twist or sway a solid, its faces first cut fine enough to follow."""
+    """Twist or sway a solid, its faces first cut fine enough to follow."""
     fine = unit_sized(solid).refine_to_length(0.04)
     if fine.num_tri() > MAX_FACES:
         return solid
-    kind, rate = rng.integers(3), rng.uniform(0.4, 1.4)
-    if kind == 0:
-        return swayed(rng, fine, 0.6)
-    if kind == 1:
-        return twisted(fine, 2 * rate)
-
-    def bend(points: np.ndarray) -> np.ndarray:
-        # Round an axis parallel to y, 1 / rate away: farther than the solid reaches.
-        arm, angle = 1 / rate - points[:, 0], rate * points[:, 2]
-        return np.stack([1 / rate - arm * np.cos(angle), points[:, 1], arm * np.sin(angle)], axis=1)
-
-    return fine.warp_batch(bend)
+    return swayed(rng, fine, 0.6) if rng.random() < 0.5 else twisted(fine, rng.uniform(0.8, 2.8))
 
 
 def draw_places(rng: np.random.Generator, solid: Manifold, count: int) -> np.ndarray:

@@ -7,12 +7,13 @@ import onnx
 import pytest
 import torch
 
+from export import to_onnx
 from export.augment import draw_samples
 from export.network import SIZES, GatherMatMul, SuperSdfNet, is_noisy
 from export.onnx_graph import THRESHOLD
-from export.quantize import LEVELS, MOST, distance_apart, quantize, whole_layer
+from export.quantize import distance_apart, quantize
 from export.tests.conftest import SMALL
-from export.to_onnx import make_card, noisy_ball, parity, read_network, rewrite, write_model
+from export.to_onnx import make_card, noisy_ball, parity, read_network, write_model
 from super_sdf import load_network
 from super_sdf.errors import ModelError
 from super_sdf.network import contract, device
@@ -118,20 +119,6 @@ def test_the_int8_file_is_near_holds_the_optimised_graph_and_runs_in_whole_numbe
         read_network(target)
 
 
-def test_a_rounded_layer_is_near_and_no_pair_of_products_is_cut_off():
-    assert 2 * LEVELS * MOST < 2**15  # on processors without VNNI
-    torch.manual_seed(0)
-    weight, bias, steps = torch.randn(108, 5), torch.randn(5), np.full(108, 0.015)
-    layer = whole_layer(weight, bias, steps, np.full(5, 0.5), 99)
-    assert layer.weight.dtype == np.int8 and np.abs(layer.weight).max() == MOST
-    read = np.random.default_rng(0).integers(0, LEVELS + 1, (100, 108))
-    got = (read @ layer.weight.astype(int) + layer.bias) * layer.scales * 0.5
-    want = (read - 99) * 0.015 @ weight.numpy() + bias.numpy()
-    assert np.abs(got - want).mean() < 0.02 * np.abs(want).mean()
-    plain = whole_layer(torch.zeros(4, 2), torch.tensor([3.0, 0.0]), np.ones(4), np.ones(2))
-    np.testing.assert_allclose(plain.bias * plain.scales, [3, 0], rtol=1e-6)
-
-
 @pytest.mark.parametrize("name", SIZES)
 def test_a_size_is_that_of_the_shipped_network_whose_int8_file_is_optimised(name):
     files = networks.shipped_models()
@@ -144,6 +131,8 @@ def test_a_size_is_that_of_the_shipped_network_whose_int8_file_is_optimised(name
 
 def test_a_file_is_written_anew_with_the_same_values_and_card(tmp_path):
     shipped = networks.shipped_models()["fast"]
-    rewrite(shipped, tmp_path / "fast.onnx")
+    to_onnx.main(["--from", str(shipped), "--out", str(tmp_path / "fast.onnx")])
     one, other = load_network(shipped, device="cpu"), load_network(tmp_path / "fast.onnx")
     assert one.card == other.card and [path.name for path in tmp_path.iterdir()] == ["fast.onnx"]
+    values = [each(*noisy_ball()) for each in (one, other)]
+    np.testing.assert_allclose(*values, rtol=0, atol=2e-6)

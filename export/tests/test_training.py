@@ -1,14 +1,12 @@
 """From shapes to a file that the runtime loads, in small, by the commands of the README."""
 
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from export import dataset, measure, store, train
+from export import dataset, measure, store, to_onnx, train
 from export.augment import CLEAN, DISTANCES, USUAL, change, masked, turned
 from export.losses import RECIPE, batch_of, encode, errors_of, predict, window_losses
 from export.network import SuperSdfNet, interpolation_weights
@@ -18,11 +16,6 @@ from export.tests.conftest import SMALL
 from super_sdf import load_network
 from super_sdf.network import contract, neighbourhood
 from super_sdf.refine import nodes
-
-
-def script(name, *words):
-    command = [sys.executable, "-m", f"export.{name}", *map(str, words)]
-    return subprocess.run(command, capture_output=True, text=True)
 
 
 def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys, monkeypatch):
@@ -41,8 +34,7 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys, mo
     train.main([*words.split(), "0.1"])
     lines = [line.split(",") for line in (run / "log.csv").read_text().splitlines()]
     assert len(lines) == 2 and int(lines[1][0]) > int(lines[0][0]) and len(lines[1]) == 9
-    made = script("to_onnx", "--run", run, "--out", file)
-    assert made.returncode == 0 and "differs from torch by" in made.stdout, made.stderr
+    to_onnx.main(["--run", str(run), "--out", str(file)])
     card = load_network(file).card
     assert card["inputs"] == contract.MASKS and card["receptive_field"] == 10
     measure.main(["--store", str(folder), str(file), str(run)])
@@ -54,7 +46,6 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys, mo
     ("name", "words", "code", "message"),
     [
         ("dataset", "--out out --meshes none", 1, "--meshes none is not a folder: give one with"),
-        ("dataset", "--out out --count 0", 2, "argument --count: 0: give at least 1"),
         ("train", "--run out --store none", 1, "--store none is not a folder: fill one with"),
         ("train", "--run out --store s --rate 0", 2, "argument --rate: 0: give a number greater"),
     ],
@@ -68,13 +59,6 @@ def test_what_cannot_be_worked_with_is_refused_in_a_line(
     err = capsys.readouterr().err
     assert ended.value.code == code and err.startswith(f"Error: {message}")
     assert err.count("\n") == 1 and not list(tmp_path.iterdir())
-
-
-def test_shards_come_back_the_same(tmp_path, samples):
-    dataset.write_shard(tmp_path / "shard.npz", samples)
-    for before, after in zip(samples, dataset.read_shard(tmp_path / "shard.npz"), strict=True):
-        for name, array in vars(before).items():
-            np.testing.assert_array_equal(array, getattr(after, name))
 
 
 def test_targets_are_the_distance_at_the_query_points(prepared):
@@ -137,7 +121,11 @@ def test_a_batch_has_the_losses_of_its_samples_and_the_truth_has_no_error(net, p
 
 def test_a_run_learns(tmp_path, samples):
     for number in range(3):
-        dataset.write_shard(tmp_path / f"shard-0-{number}.npz", samples[number : number + 1])
+        path = tmp_path / f"shard-0-{number}.npz"
+        dataset.write_shard(path, samples[number : number + 1])
+        np.testing.assert_array_equal(
+            next(dataset.read_shard(path)).targets, samples[number].targets
+        )
     torch.manual_seed(0)
     recipe = replace(RECIPE, batch_voxels=1, shares=CLEAN)
     for gated in (0, 2):
@@ -183,12 +171,3 @@ def test_samples_that_stay_on_a_device_are_changed_once_by_other_processes(tmp_p
     resident = Store(tmp_path, device="meta")
     assert len(resident) == len(one) and resident.samples["shard"][0].patches.is_meta
     resident.pool.shutdown()
-
-
-@pytest.mark.parametrize("found", [{"avx2": True}, {"avx512_bf16": True}, {"amx_bf16": True}])
-def test_a_step_is_computed_in_bfloat16_where_the_processor_has_it(monkeypatch, found):
-    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: found)
-    layer = torch.nn.Linear(4, 4)
-    with train.autocast("cpu"):
-        expected = torch.float32 if "avx2" in found else torch.bfloat16
-        assert layer(torch.ones(2, 4)).dtype == expected

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from math import prod
@@ -18,22 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
-from ..grid.placement import STRAIGHT, check_kind
-from ..grid.planes import SamplePlanes
+from ..grid.placement import check_kind
+from ..grid.planes import Index, SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import AxisOrder, Options, Space, Values, check_path
 from ..threads import held_memory, memory_bound
 from .formats import GridFormat, check_library, choose_axes, find_format, split_member
 from .output import check_free, replacing
 from .regular import check_grid_file
-from .volume import (
-    PLACE,
-    Request,
-    Placement,
-    Volume,
-    find_placement,
-    place_in_world,
-)
+from .volume import Placement, Request, Volume, find_placement, place_in_world
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -56,31 +49,26 @@ def read_grid(
 ) -> SdfGrid:
     """Read a grid from a file of any format in ``formats.FORMATS``: see docs/guides/formats.md.
 
-    An ``.npy`` file is mapped into memory and not loaded, unless its axes are in another order.
-    Others are loaded, but for HDF5 and Zarr if an array takes more than a quarter of what is left
-    of ``max_memory``: then its planes are read when they are needed.
+    An ``.npy`` file is mapped into memory, unless its axes are in another order. Other files are
+    loaded, but for HDF5 and Zarr if an array takes more than a quarter of the memory that is left:
+    then planes are read when they are needed.
 
     Parameters
     ----------
     path : path
         The file; ``FILE:NAME`` names one of several arrays in a file.
-    spacing, origin : number or three, optional
-        Used instead of those in the file; see ``make_grid``.
-    direction : nine numbers or (3, 3), optional
-        How the axes x, y and z of the array lie in the world, used instead of what the file says;
-        see ``make_grid``. Only for files in which it may be missing: ``.npy``, ``.npz``, TIFF, HDF5
-        and Zarr.
+    spacing, origin, direction : numbers, optional
+        Used instead of those in the file; see ``make_grid``. A direction goes with ``.npy``,
+        ``.npz``, TIFF, HDF5, NetCDF, MATLAB and Zarr.
     axes : {"xyz", "zyx"}, optional
-        The axis order of an array whose file does not state one. Default: x, y, z in ``.npy`` and
-        ``.npz``, else z, y, x.
+        The axis order of an array whose file does not state one. Default: x, y, z in ``.npy``,
+        ``.npz`` and MATLAB, else z, y, x.
     space : {"RAS", "LPS"}, optional
         The anatomical space of the grid's world; for files that state theirs. Default: that one.
-    inside : {"auto", "negative", "positive"}
-        Sign of the values inside the solid; see ``make_grid``.
-    field, label, level, scale
-        What the values are; see ``make_grid``.
     max_memory : int, optional
         Bytes that this process may hold in all. Default: a share of the free memory.
+    inside, field, label, level, scale
+        What the values are; see ``make_grid``.
 
     Raises
     ------
@@ -90,10 +78,9 @@ def read_grid(
     OutOfMemoryError
         If there is no room to load it.
     GridError
-        If its values are not a signed distance grid, or its axes are not at right angles.
+        If its values are no usable grid, or its axes are not at right angles.
     OptionError
-        If the suffix, ``axes``, ``inside`` or ``field`` is unknown; if a direction is given, but
-        files of the format state it; if a space is given, but the file states none.
+        If an option is unknown, or the file states what is given (axes, direction), or no space.
     """
     Options(space=space, **values)  # checks them
     given = {"spacing": spacing, "origin": origin, "direction": direction}
@@ -109,7 +96,7 @@ def read_array(
     space: Space | None,
     max_memory: int | None,
 ) -> dict[str, Any]:
-    """Return values, place (``PLACE``, unless ``given``), space and notes: see ``read_grid``."""
+    """Return values, place (unless ``given``), space and notes: see ``read_grid``."""
     path = check_path(path, "path")
     format_ = find_format(path)
     order = choose_axes(format_, axes, given["direction"])
@@ -156,8 +143,9 @@ class StoredPlanes(SamplePlanes):
     def __init__(self, volume: Volume, placement: Placement, request: Request) -> None:
         self.volume, self.placement, self.path = volume, placement, request.path
         self.files = request.files.pop_all()  # closed with this
-        self.shape, self.dtype, self.name = placement.of_world(volume.shape), volume.dtype, str(request.path)
-        chunk = placement.of_world(volume.chunks)[0] if volume.chunks else 1
+        self.shape, self.dtype = placement.of_world(volume.shape), volume.dtype
+        self.name = str(request.path)
+        chunk = placement.of_world(volume.chunks or (1, 1, 1))[0]
         self.layer = chunk * max(LAYER_BYTES // (chunk * prod(self.shape[1:])), 1)
         self.held: tuple[int, NDArray[Any]] = (-1, np.empty(0))
 
@@ -173,7 +161,7 @@ class StoredPlanes(SamplePlanes):
             planes[low - first : high - first] = held[1][low - start : high - start]
         return planes
 
-    def crop(self, low: Sequence[int], high: Sequence[int]) -> NDArray[Any]:
+    def crop(self, low: Index, high: Index) -> NDArray[Any]:
         """Return the samples in a box, which alone is read."""
         box = [slice(None)] * 3
         for world, (start, stop, count) in enumerate(zip(low, high, self.shape)):
@@ -239,29 +227,20 @@ def grid_from_image(
     Parameters
     ----------
     image : vtkImageData
-        Or a subclass, such as ``pyvista.ImageData``. Its spacing, origin, extent and direction
-        place the samples in the world.
+        Or a subclass, such as ``pyvista.ImageData``, with its spacing, origin, extent, direction.
     scalars : str, optional
         The name of an array of numbers at its points or, if no array there has that name, in its
         cells; samples in cells are at their centres. Default: the active scalars of the points,
         else of the cells, else the only array.
-    inside, field, label, level, scale
-        What the values are; see ``make_grid``.
-    max_memory : int, optional
-        Bytes that this process may hold in all. Default: a share of the free memory.
-
-    Returns
-    -------
-    SdfGrid
-        With a copy of the samples.
+    max_memory, inside, field, label, level, scale
+        As in ``read_grid``.
 
     Raises
     ------
     GridError
-        If there is no such array, or several and none is named; if its values are not a signed
-        distance grid.
+        If there is no such array, or several and none is named; if it is no usable grid.
     OptionError
-        If ``inside`` or ``field`` is unknown, or ``image`` is no image data (``OptionTypeError``).
+        If an option is unknown, or ``image`` is no image data (``OptionTypeError``).
     """
     Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image
@@ -291,21 +270,17 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
         "format": format_.name,
         "shape": list(shape),
         "dtype": str(volume.dtype),
-        "bytes": int(np.prod(shape, dtype=object)) * volume.dtype.itemsize,
+        "bytes": prod(shape) * volume.dtype.itemsize,
         "axes in the file": "".join("xyz"[w] for w in placement.world_axes),
-        **{key: _listed(place[key]) for key in PLACE},
+        **{k: at if at is None else np.ravel(at).astype(float).tolist() for k, at in place.items()},
         **({"space": volume.space} if volume.space else {}),
         **({"chunks": list(volume.chunks)} if volume.chunks else {}),
         **volume.about,
         "notes": list(volume.notes),
     }
-    if facts["direction"] in (None, _listed(STRAIGHT)):
+    if facts["direction"] in (None, np.eye(3).ravel().tolist()):
         del facts["direction"]
     return facts
-
-
-def _listed(numbers: Any) -> list[float] | None:
-    return None if numbers is None else [float(number) for number in np.ravel(numbers)]
 
 
 def check_grid_target(path: str | Path, *, force: bool = False) -> Path:

@@ -75,8 +75,7 @@ def check_beside(path: Path, name: str) -> Path:
 
 def reason_of(error: OSError) -> str:
     """Return why the system refuses to read a file, as the words after its name."""
-    reason = REASONS.get(error.errno or 0)
-    return reason or f"cannot be read: {error.strerror or error}"
+    return REASONS.get(error.errno or 0) or f"cannot be read: {error.strerror or error}"
 
 
 def is_store(path: str | Path) -> bool:
@@ -125,22 +124,16 @@ def _names_in(file: Path) -> Iterator[str]:
     kind = file.suffix.lower()
     if kind == ".hdr":
         yield from (f"{file.stem}.img", f"{file.stem}.img.gz")
-    if kind == ".onnx":
+    elif kind == ".onnx":
         content = file.read_bytes()
         for match in WEIGHTS.finditer(content):
             yield os.fsdecode(content[match.end() : match.end() + match[1][0]])
     elif kind in HEADERS:
-        for text in header_lines(file):
-            value = re.split("[=:]", text, maxsplit=1)[-1].strip()
-            yield from (text, value)
+        with file.open("rb") as header:
+            text = header.read(LONGEST_HEADER).partition(b"\0")[0]  # then there is data
+        for line in os.fsdecode(text).splitlines():
+            value = re.split("[=:]", line, maxsplit=1)[-1].strip()
+            yield from (line.strip(), value)
             if NUMBER.search(value):
                 pattern = NUMBER.sub("*", glob.escape(value.split()[0]))
                 yield from glob.glob(pattern, root_dir=file.parent)
-
-
-def header_lines(file: Path) -> list[str]:
-    """Return the lines of text that a file begins with."""
-    with file.open("rb") as header:
-        lines = header.read(LONGEST_HEADER).split(b"\n")
-    binary = next((n for n, line in enumerate(lines) if b"\0" in line), len(lines))
-    return [os.fsdecode(line).strip() for line in lines[:binary]]

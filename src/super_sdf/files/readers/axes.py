@@ -19,8 +19,9 @@ from ..volume import axes_direction, kept_axes, triple
 
 SPACE = "xyz"
 PREFIXES = {"k": 1e3, "": 1.0, "d": 1e-1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12}
-WORDS = {"kilo": "k", "deci": "d", "centi": "c", "milli": "m", "micro": "u", "nano": "n", "pico": "p"}
+WORDS = ("kilo", "", "deci", "centi", "milli", "micro", "nano", "pico")  # in the same order
 METRES = {f"{prefix}m": factor for prefix, factor in PREFIXES.items()} | {
+    **{f"{word}m": factor for word, factor in zip(WORDS, PREFIXES.values())},
     **{"inch": 0.0254, "in": 0.0254, '"': 0.0254, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048},
     **{"angstrom": 1e-10, "å": 1e-10, "mil": 2.54e-5, "thou": 2.54e-5},
 }
@@ -43,7 +44,7 @@ def in_metres(unit: str) -> float | None:
         return METRES[plain]
     word = re.sub(r"(?<=.)(?<!inche)s$|(?<=inch)es$", "", plain.lower())
     word = re.sub("met(er|re)$", "m", {"micron": "um"}.get(word, word))
-    return METRES.get(next((WORDS[w] + "m" for w in WORDS if word == f"{w}m"), word))
+    return METRES.get(word)
 
 
 def in_one_unit(units: Sequence[str]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
@@ -163,7 +164,6 @@ def _stated(attributes: dict[str, Any], name: str, default: Any) -> Any:
 def values_of(
     dtype: np.dtype[Any],
     attributes: dict[str, Any],
-    *,
     missing: Any = None,
     absent: int = 0,
     total: int = 0,
@@ -186,10 +186,8 @@ def values_of(
         raise gaps
     is_packed = "scale_factor" in attributes or "add_offset" in attributes
     is_packed |= dtype.kind == "f" and "_FillValue" in attributes
-    factor, offset = (
-        float(np.ravel(attributes.get(name, i))[0])
-        for name, i in (("scale_factor", 1), ("add_offset", 0))
-    )
+    factor = float(np.ravel(attributes.get("scale_factor", 1))[0])
+    offset = float(np.ravel(attributes.get("add_offset", 0))[0])
     none = np.ravel(attributes.get("_FillValue", missing))
     kind = np.result_type(dtype, np.float32) if is_packed else dtype
 
@@ -202,5 +200,4 @@ def values_of(
         values[np.isin(stored, none)] = np.nan
         return values
 
-    needed = is_packed or (absent and fill == 0)
-    return {"convert": convert, "converted": kind} if needed else {}
+    return {"convert": convert, "converted": kind}

@@ -109,7 +109,7 @@ def _volume_of(request: Request, values: Any, place: dict[str, Any]) -> Volume:
         total = prod(-(-size // chunk) for size, chunk in zip(values.shape, values.chunks))
         absent = total - values.id.get_num_chunks()
     about = dict(values.attrs)
-    said = values_of(values.dtype, about, absent=absent, total=total, fill=values.fillvalue)
+    said = values_of(values.dtype, about, None, absent, total, values.fillvalue)
     for raw, _, _ in values.external or ():
         check_beside(request.path, raw)
     if values.external:  # HDF5 takes their names from the current folder, unless told otherwise

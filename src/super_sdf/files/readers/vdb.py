@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -20,38 +19,105 @@ from numpy.typing import NDArray
 
 from ...arrays import BoolArray
 from ...errors import FileError, GridError
-from ..vdb_writer import (
-    ACTIVE_MASK,
-    ALL,
-    BLOSC,
-    EDGES,
-    LEAF,
-    MAGIC,
-    MASKED,
-    MASKED_ONE,
-    MASKED_TWO,
-    ONE_VALUE,
-    ZIP,
-)
+from .. import vdb_writer as vdb
 from ..volume import Later, Request, Volume, from_affine
 
 Ints = NDArray[np.int64]
 
 OLDEST = 222  # version of the file format, of OpenVDB 3
 MARGIN = 2  # voxels of background around the others, so that the border is outside
-TYPES = {"Tree_float_5_4_3": np.dtype("<f4"), "Tree_double_5_4_3": np.dtype("<f8")}
+FLOAT, DOUBLE = np.dtype("<f4"), np.dtype("<f8")
+TYPES: dict[str, np.dtype[Any]] = {"Tree_float_5_4_3": FLOAT, "Tree_double_5_4_3": DOUBLE}
 HALF = "_HalfFloat"  # ends the type of a grid whose values are stored in 16 bits
 NUMBERS = {"float": "f", "double": "d", "int32": "i", "int64": "q", "bool": "?"}  # of metadata
 # How many vectors a map has, and which are the translation and the scale.
-MAPS = {
-    "TranslationMap": (1, 0, None),
-    "ScaleMap": (5, None, 0),
-    "UniformScaleMap": (5, None, 0),
-    "ScaleTranslateMap": (6, 0, 1),
-    "UniformScaleTranslateMap": (6, 0, 1),
-}
+MAPS = {"TranslationMap": (1, 0, None), "ScaleMap": (5, None, 0), "ScaleTranslateMap": (6, 0, 1)}
 PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in millimetres
-STATED = {ONE_VALUE: 1, MASKED_ONE: 1, MASKED_TWO: 2}  # inactive values that a node states
+STATED = {vdb.ONE_VALUE: 1, vdb.MASKED_ONE: 1, vdb.MASKED_TWO: 2}  # inactive values in a node
+
+
+def read_vdb(request: Request) -> Volume:
+    """Read a grid of floating-point values of a ``.vdb`` file.
+
+    Every voxel has the value that OpenVDB gives it, inactive ones too. A background of 0 is no
+    distance: where values are signed, voxels that have it and are not active are unknown.
+    """
+    start = _Cursor(str(request.path), request.path.read_bytes())
+    entries = _entries(start)
+    usable = [entry for entry in entries if entry[1].removesuffix(HALF) in TYPES]
+    names = [name for name, *_ in usable]
+    if request.describes and request.member is None:
+        names = names[:1]
+    chosen = names.index(request.choose(names, "grid of floating-point values"))
+    name, kind, parent, place = usable[chosen]
+    cursor = start.at(place)
+    flags, metadata, affine = cursor.number("I"), cursor.metadata(), cursor.transform()
+    if parent:  # whose tree it shares
+        cursor = start.at(next(place for name, _, _, place in entries if name == parent))
+        flags, _, _ = cursor.number("I"), cursor.metadata(), cursor.transform()
+    tree = _Tree(cursor, kind, flags)
+    stated = metadata.get("file_voxel_count", tree.active_count)
+    if stated != tree.active_count:
+        has = f"it has {tree.active_count:,} active voxels and states {stated:,}"
+        raise FileError(f"{request.path} is damaged: {has}")
+    if not tree.ends:
+        raise GridError(f"{request.path} has no active voxel: it holds no surface")
+    lows, highs = zip(*tree.ends)
+    unknown = not tree.background and any(np.min(values) < 0 for _, _, values, _ in tree.cubes)
+    margin = 0 if unknown else MARGIN
+    low, high = np.min(lows, 0) - margin, np.max(highs, 0) + margin
+    size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
+    shape, notes = tuple((high - low).tolist()), tuple[str, ...]()
+
+    def load() -> NDArray[Any]:
+        voxels = tree.voxels(low, shape, unknown=unknown)
+        return voxels if size == 1 else voxels * voxels.dtype.type(size)
+
+    matrix = size * np.column_stack([affine[:, :3], affine[:, :3] @ low + affine[:, 3]])
+    if "PicoGK.VoxelSize" in metadata:
+        notes = (f"voxels of {size:.6g} mm, as PicoGK states: the mesh is in millimetres",)
+    volume = Volume(Later(shape, tree.dtype, load), *from_affine(matrix), notes=notes)
+    return _with_grids(volume, start, entries, name) if request.describes else volume
+
+
+def _with_grids(volume: Volume, start: _Cursor, entries: list[Any], read: str) -> Volume:
+    """Return a volume that says which grids its file holds, and which of them it is."""
+    grids = []
+    for name, kind, _, place in entries:
+        metadata = start.at(place + 4).metadata()
+        kind = kind.removeprefix("Tree_").split("_")[0]
+        grids.append({"name": name, "type": kind, "class": metadata.get("class", "unknown")})
+        grids[-1]["active_voxels"] = metadata.get("file_voxel_count")
+    other = f"shape and place are those of {read!r}: give {start.name}:NAME for another grid"
+    notes = volume.notes + (other,) * (len(grids) > 1)
+    return replace(volume, about={"grids": grids}, notes=notes)
+
+
+def _entries(cursor: _Cursor) -> list[tuple[str, str, str, int]]:
+    """Return name, type, name of the grid whose tree it shares, and place of each grid."""
+    if len(cursor.data) < 12 or cursor.number("q") != vdb.MAGIC:
+        raise FileError(f"{cursor.name} is no .vdb file: its first bytes are not OpenVDB's")
+    version = cursor.number("I")
+    if version < OLDEST:
+        raise FileError(
+            f"{cursor.name} has version {version} of the format: save it with OpenVDB 3 or later, "
+            f"whose files have {OLDEST} at least"
+        )
+    cursor.take(8)  # the library's version
+    seekable = cursor.number("?")
+    cursor.take(36)  # the file's own number
+    cursor.metadata()
+    count, entries = cursor.number("I"), []
+    if not seekable and count > 1:
+        said = f"{cursor.name} holds {count} grids one after the other, as a stream"
+        raise FileError(f"{said}: save it with openvdb.write")
+    for _ in range(count):
+        name, kind, parent = (cursor.text().replace("\x1e", "#") for _ in range(3))
+        _, _, end = cursor.unpack("qqq")
+        entries.append((name, kind, parent, cursor.place))
+        if count > 1:
+            cursor.place = end
+    return entries
 
 
 class _Cursor:
@@ -102,22 +168,20 @@ class _Cursor:
         kind = self.text()
         if kind in ("AffineMap", "UnitaryMap"):
             return self.array("<f8", 16).reshape(4, 4).T[:3]  # OpenVDB multiplies rows by it
-        if kind not in MAPS:
-            raise GridError(
-                f"{self.name} has a transform that is not affine, {kind}: resample the grid to a "
-                "linear transform"
-            )
-        count, translation, scale = MAPS[kind]
+        if kind.removeprefix("Uniform") not in MAPS:
+            said = f"{self.name} has a transform that is not affine, {kind}"
+            raise GridError(f"{said}: resample the grid to a linear transform")
+        count, translation, scale = MAPS[kind.removeprefix("Uniform")]
         vectors = self.array("<f8", 3 * count).reshape(count, 3)
         moved = np.zeros(3) if translation is None else vectors[translation]
         return np.column_stack([np.diag(np.ones(3) if scale is None else vectors[scale]), moved])
 
 
 class _Tree:
-    """Cubes of voxels: corners, and values of each, which are one number for a tile.
+    """The cubes of voxels of a grid: corner, edge, values, and which are active.
 
-    Tiles of inactive background are left out. ``bounds`` are the first voxel and the one after the
-    last that is no inactive background, None if all are.
+    A tile has one number for all of them; tiles of inactive background are left out. ``ends`` are
+    the first voxel, and the one after the last, of each cube that is no inactive background.
     """
 
     def __init__(self, cursor: _Cursor, kind: str, flags: int) -> None:
@@ -127,72 +191,74 @@ class _Tree:
         if (buffers := cursor.number("I")) != 1:
             raise FileError(f"{cursor.name} is damaged: its tree has {buffers} buffers, not one")
         self.background = float(cursor.array(self.dtype, 1)[0])
-        self.cubes: list[tuple[Ints, int, Any, Any]] = []  # corner, edge, values, active
+        self.cubes: list[tuple[Ints, int, Any, Any]] = []
         leaves: list[Ints] = []
         tiles, children = cursor.unpack("II")
         for _ in range(tiles):
             corner = cursor.array("<i4", 3).astype(np.int64)
             value, active = cursor.array(self.dtype, 1)[0], cursor.number("B") & 1
-            self._add_tile(corner, EDGES[0], value, active)
+            if active or value != self.background:
+                self.cubes.append((corner, vdb.EDGES[0], value, active))
         for _ in range(children):
-            self._add_node(cursor.array("<i4", 3).astype(np.int64), EDGES, leaves)
-        ends = [(corner, corner + edge) for corner, edge, *_ in self.cubes]
+            self._add_node(cursor.array("<i4", 3).astype(np.int64), vdb.EDGES, leaves)
+        self.ends = [(corner, corner + edge) for corner, edge, *_ in self.cubes]
         self.active_count = sum(edge**3 for _, edge, _, active in self.cubes if active)
+        cube = (vdb.LEAF,) * 3
         for corner in leaves:  # after the topology, each after its mask
-            active = cursor.bits(LEAF**3)
+            active = cursor.bits(vdb.LEAF**3)
             values, state = self._values(active)
             self.active_count += int(active.sum())
-            self.cubes.append((corner, LEAF, values.reshape((LEAF,) * 3), active))
-            shown = np.argwhere((active if state == 0 else active | True).reshape((LEAF,) * 3))
+            self.cubes.append((corner, vdb.LEAF, values.reshape(cube), active.reshape(cube)))
+            shown = np.argwhere((active if state == 0 else active | True).reshape(cube))
             if len(shown):
-                ends.append((corner + shown.min(0), corner + shown.max(0) + 1))
-        lows, highs = zip(*ends) if ends else ((), ())
-        self.bounds = (np.min(lows, 0), np.max(highs, 0)) if ends else None
-
-    def _add_tile(self, corner: Ints, edge: int, value: Any, active: Any) -> None:
-        if active or value != self.background:
-            self.cubes.append((corner, edge, value, active))
+                self.ends.append((corner + shown.min(0), corner + shown.max(0) + 1))
 
     def _add_node(self, corner: Ints, edges: tuple[int, ...], leaves: list[Ints]) -> None:
         """Take a node whose children have the second edge, or are leaves."""
-        edge = edges[1] if len(edges) > 1 else LEAF
+        edge = edges[1] if len(edges) > 1 else vdb.LEAF
         count = edges[0] // edge
         child, active = self.cursor.bits(count**3), self.cursor.bits(count**3)
         values, _ = self._values(active)
         corners = corner + edge * np.argwhere(np.ones((count,) * 3, bool))
         for n in np.flatnonzero(~child & (active | (values != self.background))):
-            self._add_tile(corners[n], edge, values[n], active[n])
+            self.cubes.append((corners[n], edge, values[n], active[n]))
         for place in corners[child]:
-            if edge > LEAF:
+            if edge > vdb.LEAF:
                 self._add_node(place, edges[1:], leaves)
             else:
-                self.cursor.take(LEAF**3 // 8)  # its mask, which is there again before its values
+                self.cursor.take(vdb.MASK_BYTES)  # there again before the leaf's values
                 leaves.append(place)
 
     def _values(self, active: BoolArray) -> tuple[NDArray[Any], int]:
         """Return the next values, and how those of inactive voxels are stored."""
         cursor, count = self.cursor, len(active)
         state = cursor.number("B")
-        if state > ALL:
+        if state > vdb.ALL:
             raise FileError(f"{cursor.name} is damaged: a node's values are of kind {state}")
         values = [-self.background if state else self.background, self.background]
         stated = STATED.get(state, 0)
         values[:stated] = cursor.array(self.dtype, stated).tolist()
-        masked = state in (MASKED, MASKED_ONE, MASKED_TWO)
+        masked = state in (vdb.MASKED, vdb.MASKED_ONE, vdb.MASKED_TWO)
         selection = cursor.bits(count) if masked else np.zeros(count, bool)
-        if state == ALL or not self.flags & ACTIVE_MASK:
+        if state == vdb.ALL or not self.flags & vdb.ACTIVE_MASK:
             return self._numbers(count), state
         filled = np.where(selection, *np.array(values[::-1], self.dtype))
         filled[active] = self._numbers(int(active.sum()))
         return filled, state
 
     def _numbers(self, count: int) -> NDArray[Any]:
-        size = count * self.stored.itemsize
-        packed = self.flags & (ZIP | BLOSC) and (count or self.stored == self.dtype)
+        """Return the next numbers, which are a zlib stream, a Blosc buffer, or as they are."""
+        size, is_blosc = count * self.stored.itemsize, self.flags & vdb.BLOSC
+        packed = (self.flags & vdb.ZIP or is_blosc) and (count or self.stored == self.dtype)
         length = self.cursor.number("q") if packed else -size
         data = self.cursor.take(abs(length))
-        if length > 0:
-            data = _unpacked(data, size, self.flags & BLOSC)
+        if length > 0 and not is_blosc:
+            data = zlib.decompressobj().decompress(data, size + 1)
+        # the header of Blosc: four bytes, then the sizes unpacked, of a block, and packed
+        elif length >= 16 and struct.unpack_from("<I4xI", data, 4) == (size, length):
+            from numcodecs import blosc
+
+            data = bytes(blosc.decompress(data)) if size else b""
         if len(data) != size:
             raise FileError(f"{self.cursor.name} is damaged: a node's values cannot be unpacked")
         return np.frombuffer(data, self.stored).astype(self.dtype)
@@ -202,117 +268,9 @@ class _Tree:
         box = np.full(shape, np.nan if unknown else self.background, self.dtype)
         for corner, edge, values, active in self.cubes:
             low, high = np.maximum(corner - first, 0), np.minimum(corner - first + edge, shape)
-            if np.ndim(values) and unknown:
-                is_lost = ~active.reshape(values.shape) & (values == self.background)
-                values = np.where(is_lost, np.nan, values)
             if np.ndim(values):
+                known = active | (values != self.background) | (not unknown)
+                values = np.where(known, values, np.nan)
                 values = values[tuple(map(slice, low - corner + first, high - corner + first))]
             box[tuple(map(slice, low, high))] = values
         return box
-
-
-def _unpacked(data: bytes, size: int, is_blosc: int) -> bytes:
-    """Return the bytes of a zlib stream or Blosc buffer; none if they are damaged."""
-    with suppress(zlib.error, RuntimeError, ValueError):
-        if not is_blosc:
-            return zlib.decompressobj().decompress(data, size + 1)
-        from numcodecs import blosc
-
-        # the header: four bytes, then the sizes unpacked, of a block, and packed
-        if len(data) >= 16 and struct.unpack_from("<I4xI", data, 4) == (size, len(data)):
-            return bytes(blosc.decompress(data))
-    return b""
-
-
-def read_vdb(request: Request) -> Volume:
-    """Read a grid of floating-point values of a ``.vdb`` file.
-
-    Every voxel has the value that OpenVDB gives it, inactive ones too. A background of 0 is no
-    distance: where values are signed, voxels that have it and are not active are unknown.
-    """
-    start = _Cursor(str(request.path), request.path.read_bytes())
-    entries = _entries(start)
-    usable = [entry for entry in entries if entry[1].removesuffix(HALF) in TYPES]
-    names = [name for name, *_ in usable]
-    if request.describes and request.member is None:
-        names = names[:1]
-    chosen = names.index(request.choose(names, "grid of floating-point values"))
-    name, kind, parent, place = usable[chosen]
-    cursor = start.at(place)
-    flags, metadata, affine = cursor.number("I"), cursor.metadata(), cursor.transform()
-    if parent:  # whose tree it shares
-        places = [place for name, _, _, place in entries if name == parent]
-        if not places:
-            raise FileError(f"{request.path} is damaged: it lacks the grid {parent!r}")
-        cursor = start.at(places[0])
-        flags, _, _ = cursor.number("I"), cursor.metadata(), cursor.transform()
-    tree = _Tree(cursor, kind, flags)
-    stated = metadata.get("file_voxel_count", tree.active_count)
-    if stated != tree.active_count:
-        raise FileError(
-            f"{request.path} is damaged: it has {tree.active_count:,} active voxels and states "
-            f"{stated:,}"
-        )
-    if tree.bounds is None:
-        raise GridError(f"{request.path} has no active voxel: it holds no surface")
-    unknown = not tree.background and any(np.min(values) < 0 for _, _, values, _ in tree.cubes)
-    margin = 0 if unknown else MARGIN
-    low, high = tree.bounds[0] - margin, tree.bounds[1] + margin
-    size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
-    shape = tuple((high - low).tolist())
-
-    def load() -> NDArray[Any]:
-        voxels = tree.voxels(low, shape, unknown=unknown)
-        return voxels if size == 1 else voxels * voxels.dtype.type(size)
-
-    turn = affine[:, :3]
-    matrix = size * np.column_stack([turn, turn @ low + affine[:, 3]])
-    notes: tuple[str, ...] = ()
-    if "PicoGK.VoxelSize" in metadata:
-        notes = (f"voxels of {size:.6g} mm, as PicoGK states: the mesh is in millimetres",)
-    volume = Volume(Later(shape, tree.dtype, load), *from_affine(matrix), notes=notes)
-    return _with_grids(volume, start, entries, name) if request.describes else volume
-
-
-def _entries(cursor: _Cursor) -> list[tuple[str, str, str, int]]:
-    """Return name, type, name of the grid whose tree it shares, and place of each grid."""
-    if len(cursor.data) < 12 or cursor.number("q") != MAGIC:
-        raise FileError(f"{cursor.name} is no .vdb file: its first bytes are not OpenVDB's")
-    version = cursor.number("I")
-    if version < OLDEST:
-        raise FileError(
-            f"{cursor.name} has version {version} of the format: save it with OpenVDB 3 or later, "
-            f"whose files have {OLDEST} at least"
-        )
-    cursor.take(8)  # the library's version
-    seekable = cursor.number("?")
-    cursor.take(36)  # the file's own number
-    cursor.metadata()
-    count = cursor.number("I")
-    if not seekable and count > 1:
-        raise FileError(
-            f"{cursor.name} holds {count} grids one after the other, as a stream: save it with "
-            "openvdb.write"
-        )
-    entries = []
-    for _ in range(count):
-        name, kind, parent = (cursor.text().replace("\x1e", "#") for _ in range(3))
-        _, _, end = cursor.unpack("qqq")
-        entries.append((name, kind, parent, cursor.place))
-        if count > 1:
-            cursor.place = end
-            cursor.take(0)
-    return entries
-
-
-def _with_grids(volume: Volume, start: _Cursor, entries: list[Any], read: str) -> Volume:
-    """Return a volume that says which grids its file holds, and which of them it is."""
-    grids = []
-    for name, kind, _, place in entries:
-        metadata = start.at(place + 4).metadata()
-        kind = kind.removeprefix("Tree_").split("_")[0]
-        grids.append({"name": name, "type": kind, "class": metadata.get("class", "unknown")})
-        grids[-1]["active_voxels"] = metadata.get("file_voxel_count")
-    other = f"shape and place are those of {read!r}: give {start.name}:NAME for another grid"
-    notes = volume.notes + (other,) * (len(grids) > 1)
-    return replace(volume, about={"grids": grids}, notes=notes)

@@ -1,4 +1,4 @@
-"""Image data of VTK, from its files or in memory; and rectilinear grids, if their steps are even."""
+"""Image data of VTK, in files or in memory; and rectilinear grids, if their steps are even."""
 
 from __future__ import annotations
 
@@ -14,13 +14,6 @@ from ..volume import XYZ, Request, Volume, triple
 
 NAME = "the image"  # in memory, in error messages
 MARKS = ("vtkGhostType", "vtkValidPointMask")
-RESAMPLE = (
-    'make .npz with python -c "import numpy as n, pyvista as v; from scipy.interpolate import '
-    "interpn as f; m = v.read('{0}'); a = m.x, m.y, m.z; e = [n.linspace(c[0], c[-1], len(c)) for "
-    "c in a]; w = m['{2}'].reshape(m.dimensions, order='F'); n.savez('{1}.npz', values=f(a, w, "
-    "tuple(n.meshgrid(*e, indexing='ij'))), spacing=[c[1] - c[0] for c in e], origin=[c[0] for c "
-    'in e])"'
-)
 # Lines of text between the values of arrays: keywords, or name, counts and type of an array.
 BETWEEN = re.compile(rb"^(?:[A-Z_]{4,}.*|\S+ \d+ \d+ [a-zA-Z_]+\s*)$", re.M)
 EVEN = 1e-4  # share of a step by which steps may differ
@@ -149,8 +142,10 @@ def _volume_of(image: Any, array: Any, of_points: bool, what: str, path: Any) ->
         for axis, each, start, step in zip("xyz", places, origin, spacing):
             even = start + step * np.arange(len(each))
             if not np.allclose(each, even, rtol=0, atol=EVEN * abs(step)):
-                resample = RESAMPLE.format(path, path.stem, array.GetName())
-                raise GridError(f"{path}: its coordinates along {axis} are uneven: {resample}")
+                raise GridError(
+                    f"{path}: its coordinates along {axis} are uneven: resample it, as with "
+                    "pyvista.create_grid(mesh, dimensions=mesh.dimensions).sample(mesh)"
+                )
     else:
         raise GridError(
             f"it holds {image.GetClassName()}, no image data: sample its distances on a lattice, "

@@ -40,35 +40,27 @@ Document = dict[str, Any]
 def read_zarr(request: Request) -> Volume:
     """Read ``FOLDER.zarr``, or ``FOLDER.zarr:/ARRAY`` of a group; of OME-Zarr the finest level."""
     store = _Store(request)
-    name = ""
-    if "" not in store.arrays:
-        name = _choose(store, request)
-    elif request.member is not None:
+    if "" in store.arrays and request.member is not None:
         raise FileError(f"{request.path} is one array: give no name of another in it")
+    name = "" if "" in store.arrays else _choose(store, request)
     array, axes = store.open(name), _image_axes(store, name)
-    stated = dict(array.attrs)
-    if axes and ({*"xyz"} - {axis.name for axis in axes} or len(axes) != array.ndim):
+    stated, version = dict(array.attrs), 2 if store.document(name, ARRAY_2) else 3
+    if axes and (not {*"xyz"} <= {axis.name for axis in axes} or len(axes) != array.ndim):
         listed = ", ".join(axis.name for axis in axes)
-        raise GridError(
-            f"an array of {array.ndim} axes has the axes {listed}: give an image of z, y, x"
-        )
-    place = placed(
-        axes or _named_axes(store, name, array), {} if axes else stated, array.shape, request.axes
-    )
-    version = getattr(getattr(array, "metadata", None), "zarr_format", 2)
+        said = f"an array of {array.ndim} axes has the axes {listed}"
+        raise GridError(f"{said}: give an image of z, y, x")
+    if axes:
+        place = placed(axes, {}, array.shape, request.axes)
+    else:
+        place = placed(_named_axes(store, name, array), stated, array.shape, request.axes)
     total = prod(-(-size // chunk) for size, chunk in zip(array.shape, array.chunks))
-    said = values_of(
-        array.dtype,
-        stated,
-        missing=array.fill_value if version == 2 else None,  # as xarray takes it
-        absent=max(total - array.nchunks_initialized, 0),
-        total=total,
-        fill=array.fill_value,
-    )
-    shards = getattr(array, "shards", None)
+    absent = max(total - array.nchunks_initialized, 0)
+    none = array.fill_value if version == 2 else None  # as xarray takes it
+    kind = values_of(array.dtype, stated, none, absent, total, array.fill_value)
     about = {"chunks": list(array.chunks), "zarr format": version}
-    about |= {"shards": list(shards)} if shards else {}
-    return Volume(array, **place, **said, about=about)
+    if shards := getattr(array, "shards", None):
+        about["shards"] = list(shards)
+    return Volume(array, **place, **kind, about=about)
 
 
 class _Store:
@@ -80,11 +72,9 @@ class _Store:
     def __init__(self, request: Request) -> None:
         self.path, self.files = request.path, request.files
         self.zip: zipfile.ZipFile | None = None
-        if self.path.is_dir():
-            self.keys = set(self._listed(self.path))
-        else:
+        if not self.path.is_dir():
             self.zip = request.files.enter_context(zipfile.ZipFile(self.path))
-            self.keys = set(self.zip.namelist())
+        self.keys = set(self.zip.namelist() if self.zip else self._listed())
         self.arrays: dict[str, int] = {}  # the number of axes of each
         for key in self.keys:
             path, _, name = key.rpartition("/")
@@ -93,14 +83,14 @@ class _Store:
                 if name == ARRAY_2 or about.get("node_type") == "array":
                     self.arrays[path] = len(about.get("shape", ()))
 
-    def _listed(self, folder: Path) -> Iterator[str]:
-        for at, folders, names in os.walk(folder):
+    def _listed(self) -> Iterator[str]:
+        for at, folders, names in os.walk(self.path):
             for name in (*folders, *names):
                 path = Path(at, name)
-                key = path.relative_to(folder).as_posix()
+                key = path.relative_to(self.path).as_posix()
                 if path.is_symlink():
-                    check_beside(folder, key)
-                elif name in names and not path.is_file():
+                    check_beside(self.path, key)
+                elif not path.is_dir() and not path.is_file():
                     check_regular_file(path)
                 yield key
 
@@ -113,6 +103,17 @@ class _Store:
         if not isinstance(content, dict):
             raise FileError(f"{self.path} is damaged: {key} is no JSON object")
         return content
+
+    def images(self, path: str) -> list[Document]:
+        """Return the images that the metadata of a group describes, as OME-NGFF has it."""
+        attributes = self.attributes(path)
+        about = attributes.get("ome", attributes)
+        images = about.get("multiscales") if isinstance(about, dict) else None
+        for image in images or []:
+            levels = image.get("datasets") if isinstance(image, dict) else None
+            if not levels or not all(isinstance(each, dict) and "path" in each for each in levels):
+                raise FileError("its OME metadata is damaged: multiscales names no arrays")
+        return images or []
 
     def attributes(self, path: str) -> Document:
         stated = self.document(path, NODE_3).get("attributes") or {}
@@ -139,10 +140,10 @@ class _Store:
         return array
 
 
-def _codecs_of(about: Any) -> Iterator[str]:
+def _codecs_of(about: Document) -> Iterator[str]:
     for key in ("compressor", "filters", "codecs", "index_codecs"):
         listed: Any = about.get(key) or ()
-        for codec in listed if isinstance(listed, list) else (listed,) if listed else ():
+        for codec in listed if isinstance(listed, (list, tuple)) else (listed,):
             stated = codec if isinstance(codec, dict) else {"name": codec}
             yield str(stated.get("id", stated.get("name"))).removeprefix("numcodecs.")
             if isinstance(stated.get("configuration"), dict):
@@ -151,18 +152,14 @@ def _codecs_of(about: Any) -> Iterator[str]:
 
 def _choose(store: _Store, request: Request) -> str:
     """Return the array to read: of an image the finest level, unless another is named."""
-    before, named = "", (request.member or "").strip("/")
-    is_group = bool(named) and any(name.startswith(f"{named}/") for name in store.arrays)
-    if is_group:
-        before = f"{named}/"
-    images = _multiscales(store.attributes(before.strip("/")))
+    named = (request.member or "").strip("/")
+    is_group = any(name.startswith(f"{named}/") for name in store.arrays) and bool(named)
+    before = f"{named}/" if is_group else ""
+    images = store.images(before.strip("/"))
     if images and (is_group or request.member is None):
-        return before + _levels(images[0])[0]
-    names = [
-        f"/{name}"
-        for name, axes in sorted(store.arrays.items())
-        if name.startswith(before) and 3 <= axes <= MOST_AXES
-    ]
+        return before + str(images[0]["datasets"][0]["path"]).strip("/")
+    counts = sorted(item for item in store.arrays.items() if item[0].startswith(before))
+    names = [f"/{name}" for name, axes in counts if 3 <= axes <= MOST_AXES]
     asked = replace(request, member=None) if is_group else request
     return asked.choose(names, "3D array").strip("/")
 
@@ -176,58 +173,47 @@ def _named_axes(store: _Store, name: str, array: Any) -> list[Axis]:
     for axis, count in zip(names, array.shape):
         path = f"{group}/{axis}".lstrip("/")
         is_there = bool(name and axis) and store.arrays.get(path) == 1
-        places = store.open(path) if is_there else None
-        whole = np.asarray(places[:]) if places is not None and places.shape == (count,) else None
-        axes.append(measured(axis, whole, store.attributes(path) if is_there else {}))
+        places = store.open(path)[:] if is_there else ()
+        about = store.attributes(path) if is_there else {}
+        axes.append(measured(axis, places if len(places) == count else None, about))
     return axes
 
 
 def _image_axes(store: _Store, name: str) -> list[Axis] | None:
-    """Return the axes of an array that is a level of an image of OME, None if it is of none."""
+    """Return the axes of an array that is a level of an image of OME, None if it is of none.
+
+    The transformations of a level come first, then those of the whole image.
+    """
     parts = name.split("/") if name else []
-    for depth in range(len(parts)):
-        below = "/".join(parts[depth:])
-        for image in _multiscales(store.attributes("/".join(parts[:depth]))):
-            if below in _levels(image):
-                return _axes_of(image, _levels(image).index(below))
-    return None
-
-
-def _multiscales(attributes: Document) -> list[Document]:
-    about = attributes.get("ome", attributes)
-    images = about.get("multiscales") if isinstance(about, dict) else None
-    for entry in images or []:
-        levels = entry.get("datasets") if isinstance(entry, dict) else None
-        if not levels or not all(isinstance(level, dict) and "path" in level for level in levels):
-            raise FileError("its OME metadata is damaged: multiscales names no arrays")
-    return images or []
-
-
-def _levels(image: Document) -> list[str]:
-    return [str(level["path"]).strip("/") for level in image["datasets"]]
-
-
-def _axes_of(image: Document, level: int) -> list[Axis]:
-    """Return the axes of a level: its transformations first, then those of the whole image."""
-    stated = image.get("axes", ["z", "y", "x"])
+    levels = (
+        (image, level)
+        for depth in range(len(parts))
+        for image in store.images("/".join(parts[:depth]))
+        for level in image["datasets"]
+        if str(level["path"]).strip("/") == "/".join(parts[depth:])
+    )
+    image, level = next(levels, (None, None))
+    if image is None or level is None:
+        return None
+    stated = image.get("axes", "zyx")
     named = [axis if isinstance(axis, dict) else {"name": axis} for axis in stated]
-    names = [str(axis.get("name", "")).lower() for axis in named]
-    units = [str(axis.get("unit") or "") for axis in named]
-    key = "coordinateTransformations"
-    steps = [*image["datasets"][level].get(key, ()), *image.get(key, ())]
-    scale, shift = np.ones(len(names)), np.zeros(len(names))
+    count, key = len(named), "coordinateTransformations"
+    steps = [*level.get(key, ()), *image.get(key, ())]
+    scale, shift = np.ones(count), np.zeros(count)
     for step in steps:
         kind = step.get("type")
         numbers = np.asarray(step.get(str(kind), ()), np.float64)
         if kind == "identity":
             continue
-        if kind not in ("scale", "translation") or numbers.shape != (len(names),):
+        if kind not in ("scale", "translation") or numbers.shape != (count,):
+            said = f"one of its {key} has the type {kind!r} and {numbers.size} numbers"
             raise GridError(
-                f"one of its coordinateTransformations has the type {kind!r} and {numbers.size} "
-                "numbers: give scale or translation, with one number for each of its "
-                f"{len(names)} axes"
+                f"{said}: give scale or translation, with one number for each of its {count} axes"
             )
-        scale, shift = (scale * numbers, shift * numbers) if kind == "scale" else (scale, shift + numbers)
-    if not steps:
-        return [Axis(*each) for each in zip(names, units)]
-    return [Axis(*each) for each in zip(names, units, scale.tolist(), shift.tolist())]
+        factor, moved = (numbers, 0) if kind == "scale" else (1, numbers)
+        scale, shift = scale * factor, shift * factor + moved
+    places = zip(scale.tolist(), shift.tolist()) if steps else [(None, None)] * count
+    return [
+        Axis(str(axis.get("name", "")).lower(), str(axis.get("unit") or ""), *place)
+        for axis, place in zip(named, places)
+    ]
