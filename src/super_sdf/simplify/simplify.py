@@ -118,7 +118,14 @@ def simplify_mesh(
     check_mesh(mesh)
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
-    check_room(len(mesh.faces), check_max_memory(max_memory))
+    give_back()  # otherwise freed memory counts as held
+    bound, count = memory_bound(check_max_memory(max_memory)), len(mesh.faces)
+    need = count * BYTES_PER_TRIANGLE + (held_memory() or 0)
+    if bound is not None and need > bound:
+        raise OutOfMemoryError(
+            f"simplifying {count:,} triangles needs {in_words(need)} of memory; {in_words(bound)} "
+            "may be used; use a smaller factor, allow more (--max-memory), or do not simplify"
+        )
     from .collapsing import down_to, within
     from .measuring import Original
 
@@ -140,18 +147,3 @@ def simplify_mesh(
     if progress:
         progress(1.0)
     return Simplified(result, len(mesh.faces), deviation, warnings)
-
-
-def check_room(triangles: int, max_memory: int | None, *, estimated: bool = False) -> None:
-    """Raise OutOfMemoryError if simplifying a mesh would exceed the memory bound.
-
-    With ``estimated``, the number of its triangles is a low estimate.
-    """
-    give_back()  # otherwise freed memory counts as held
-    bound, need = memory_bound(max_memory), triangles * BYTES_PER_TRIANGLE + (held_memory() or 0)
-    if bound is not None and need > bound:
-        raise OutOfMemoryError(
-            f"simplifying {'at least ' * estimated}{triangles:,} triangles needs {in_words(need)} "
-            f"of memory, since the whole mesh must be held; {in_words(bound)} may be used; use a "
-            "smaller factor, allow more (--max-memory), or do not simplify"
-        )
