@@ -26,7 +26,7 @@ from .grid.cubic import cubic_grid
 from .grid.sdf_grid import SdfGrid, check_grid, crop
 from .network.decoder import Decoder, adapt, decode
 from .network.network import given_or_loaded, network_for
-from .options import Options
+from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
@@ -310,7 +310,7 @@ class Task:
     shape: tuple[int, int, int]  # samples of the whole grid
     whole: BandSummary | None  # None of a tile that is the whole grid
     options: Options
-    mesher: options.MesherName
+    mesher: MesherName
     threads: int
 
 

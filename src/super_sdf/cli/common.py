@@ -52,7 +52,9 @@ class Command(click.Command):
             raise click.ClickException(f"{named}{error.strerror or error}") from error
 
 
-def make_command(short: str, examples: str, *takes: Decorator, text: str | None = None) -> Decorator:
+def make_command(
+    short: str, examples: str, *takes: Decorator, text: str | None = None
+) -> Decorator:
     """Return what makes a command of a function, with its arguments and options in this order."""
 
     def make(function: Callable[..., Any]) -> Command:
