@@ -317,7 +317,7 @@ def test_a_length_with_a_unit_is_refused_with_the_option_or_unit_to_give(
     option, way_out, here, command
 ):
     code, _, err = command("upsample", "ball.npz", "a.ply", option, "0.01mm")
-    line = f"Error: Invalid value for '{option}': '0.01mm': {way_out}"
+    line = f"Error: {option} is '0.01mm': {way_out}"
     assert code == 2 and err.splitlines()[-1] == line
     assert command("upsample", "ball.npz", "a.ply", "--tolerance", "0.01", *QUICK)[0] == 0
 
@@ -362,7 +362,7 @@ def test_an_open_mesh_is_simplified_too_and_a_count_that_cannot_be_reached_is_a_
 STARTS = (("upsample", "ball.npz", "a.ply"), ("batch", "ball.npz", "--out", "new"))
 REFUSED = {
     "--simplify 0.1 --triangles 5": "--simplify 0.1 and --triangles 5: give only one of them",
-    "--simplify 0.1 --tolerance 5": "--simplify 0.1 and --tolerance 5: give only one of them",
+    "--simplify 0.1 --tolerance 5": "--simplify 0.1 and --tolerance 5.0: give only one of them",
     "--tolerance 0": "--tolerance is 0: give a number greater than 0",
     "--simplify -1": "--simplify is -1: give a number greater than 0",
     "--triangles 2": "--triangles is 2: give 4 or more, as a closed mesh has",
@@ -396,9 +396,7 @@ def test_a_batch_records_it_and_makes_again_what_has_other_options(here, run_bat
     code, _, err = run_batch("in", "--simplify", 0.02)
     found = rows()[-1]["simplified"]
     assert code == 0 and rows()[-1]["triangles"] == found["triangles"] < found["triangles_before"]
-    assert f"Simplified: from {found['triangles_before']:,} to {found['triangles']:,} tri" in err
     assert "1 done, 0 failed" in err
-    assert "largest distance 0.0" in err and "of a.ply; see the report" in err
     assert "nothing to do: 1 done before" in run_batch("in", "--simplify", 0.02)[2]
     assert "1 done, 0 failed" in run_batch("in", "--triangles", 8)[2]
     assert rows()[-1]["triangles"] == 8
@@ -406,5 +404,5 @@ def test_a_batch_records_it_and_makes_again_what_has_other_options(here, run_bat
     Path("list.jsonl").write_text('{"in": "two.npz", "triangles": 6}')
     code, _, err = run_batch("list.jsonl", "--simplify", 0.02, out="new")
     assert code == 0 and rows("new")[-1]["simplified"]["triangles"] > 6
-    assert "Warning: 1 were not simplified as asked: see new/report.jsonl" in err
+    assert "Warning: 1 have warnings: see new/report.jsonl" in err
     assert "contradictory" not in err
