@@ -4,31 +4,16 @@ from __future__ import annotations
 
 import sys
 from importlib import import_module
-from pathlib import Path
-from types import ModuleType
 
 COMMANDS = {
     "evaluate": "measure the quality on your own meshes",
-    "render": "draw meshes, or a cross-section of a grid",
     "figures": "measure what README, the documents and the model cards quote",
     "documents": "write the measured figures into them",
-    "meshes": "does a change of the code change a mesh",
-    "bounds": "does a conversion stay within --max-memory",
     "faults": "conversions and batches ended at random moments, also on a cluster, and full disks",
     "zoo": "grids as people have them, and the ways out that refusals name",
-    "corpus": "thousands of bad and odd inputs, and random fields",
-    "cuda": "CUDA against the CPU",
-    "versions": "releases of Python and of the dependencies",
-    "picture": "the pictures in README and of sharp edges",
+    "picture": "draw meshes; the pictures in README and of sharp edges",
+    "fields": "random fields: are their meshes closed manifolds",
 }
-
-
-def module_of(command: str) -> ModuleType:
-    """Return the module of a command; the corpus is beside the tests that run a part of it."""
-    if command == "corpus":
-        sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-        return import_module("corpus.command")
-    return import_module(f"lab.{command}")
 
 
 def main() -> int:
@@ -42,7 +27,7 @@ def main() -> int:
 
     sys.argv = [f"python -m lab {command}", *words]
     try:
-        return module_of(command).main() or 0
+        return import_module(f"lab.{command}").main() or 0
     except OptionError as error:
         print(f"Error: {error}", file=sys.stderr)
         return 2

@@ -1,4 +1,4 @@
-"""Quality against reference meshes, the baselines and the upper bound: tables, plots, pictures.
+"""Quality against reference meshes, the baselines and the upper bound.
 
     python -m lab evaluate meshes/ --out report/
     python -m lab evaluate a.ply b.ply --sizes 32 --methods mc ours --model new.onnx --out report/
@@ -9,9 +9,7 @@ earlier evaluation, which is resumed; there another model is compared without me
 again:
 
     OUT/report.md      the tables
-    OUT/shapes.md      every figure of every shape
     OUT/results.jsonl  the rows they are made from, a line for each shape, size and method
-    OUT/plots, OUT/pictures
 """
 
 from __future__ import annotations
@@ -19,50 +17,23 @@ from __future__ import annotations
 import sys
 import time
 from argparse import ArgumentParser
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from super_sdf.errors import FileError, OptionError, SuperSdfError, seen
-from super_sdf.files.output import replacing
-from super_sdf.threads import count_cores
+from super_sdf.errors import FileError, OptionError, seen
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY, PRECISIONS
+from super_sdf.threads import count_cores
 
 from . import parser_of
 from .measuring import NO_SETTING, Task, network_of
-from .methods import BY_NAME, FLOOR, METHODS, OURS, make_surface
+from .methods import BY_NAME, FLOOR, METHODS, OURS
 from .ndc import add_ndc
-from .plots import draw_plots
-from .processes import describe_machine
-from .rows import Row, Rows
-from .runner import LeftOut, OnTask, complete
-from .shapes import HALVES, Case, Setting, Shape, draw_halves, find_meshes, spread
-from .tables import (
-    BY_KEY,
-    COST,
-    EDGES,
-    GAPS,
-    gap_closed,
-    label_of,
-    listed,
-    markdown,
-    mean_of,
-    percent,
-    summary,
-    surface_table,
-    win_line,
-)
-
-Halves = Mapping[str, Sequence[str]]
-"""Names of shapes: all, and each half."""
-ByMethod = Mapping[str, Sequence[Row]]
+from .rows import LeftOut, OnTask, Row, Rows, complete
+from .shapes import Setting, find_meshes, spread
+from .tables import EDGES, GAPS, gap_closed, listed, percent, summary, surface_table
 
 ROWS = "results.jsonl"
-EXTREMES = 5  # number of best shapes shown, and of worst
-ERROR_TOP = 0.25  # upper end of the colour bar in the pictures, in voxels
-COST_LINES = """\
-From the samples in memory to the mesh in memory, several at a time on one machine: to compare
-methods, not to quote. The peak is what the process held beyond what it held before."""
 PROTOCOL_LINES = """\
 Lengths are in units of the reference's box diagonal. 100,000 points are sampled on each surface; CD
 is the sum of the mean squared distances both ways, F1 at 0.003, NC the normal consistency. p2s is
@@ -145,145 +116,22 @@ def results_of(
     return results
 
 
-def check_folder(out: Path) -> None:
-    """Raise FileError unless a folder is new, empty or made by an evaluation."""
-    if out.exists() and not out.is_dir():
-        raise FileError(f"{out} is no folder: give a new one")
-    names = sorted(path.name for path in out.iterdir()) if out.exists() else []
-    if names and ROWS not in names:
-        raise FileError(
-            f"{out} holds {names[0]!r} and no {ROWS}, so no evaluation made it: give a new or an "
-            "empty folder"
-        )
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{out} cannot be made: {error.strerror}") from error
-
-
-def write_report(results: Results, like: Task, halves: Halves, out: Path, up: str | None) -> Path:
-    """Write report.md, shapes.md, plots and pictures; return the path of report.md.
-
-    ``up`` is the axis that points up in the pictures; None: none are drawn.
-    """
-    settings = dict.fromkeys(t.setting for t in results.tasks if t.setting != NO_SETTING)
-    by_setting = {s: results.by_method(s, (*like.methods, FLOOR)) for s in settings}
-    means = {setting: [{"method": method, **summary(rows)} for method, rows in found.items()]
-             for setting, found in by_setting.items()}  # fmt: skip
+def report(results: Results, like: Task) -> str:
+    """Return the tables of all settings as Markdown, with what was left out."""
     parts = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
     if like.turned is not None:
         parts.append(f"The shapes are turned at random, by seed {like.turned}.")
     parts += [f"Left out, {entry.shape}: {entry.reason}." for entry in results.left_out]
-    for setting, found in by_setting.items():
-        parts += [f"## {setting}", surface_table(means[setting], setting.size)]
-        parts += [*comparisons(found, halves), *odd_meshes(found)]
-    for title, text, columns in (
-        ("Edges and triangles", EDGE_LINES, EDGES),
-        ("Time and memory", f"{describe_machine()}\n\n{COST_LINES}", COST),
-    ):
-        parts += [f"## {title}", text]
-        parts += [f"**{setting}**\n\n{listed(rows, columns)}" for setting, rows in means.items()]
-    plots = draw_plots({s.size: found for s, found in by_setting.items()}, out / "plots")
-    parts += ["## Plots", *(f"![{text}](plots/{name})" for name, text in plots.items())]
-    if up and OURS in like.methods:
-        parts += picture_lines(results, like, next(iter(settings)), out, up)
-    notes = {name: "; ".join(row["notes"]) for name, row in results.floors.items()}
-    lines = [f"- {name}: {said}." for name, said in notes.items() if said]
-    parts += ["## Notes on the shapes", "\n".join(lines)] if lines else []
-    shapes = [f"## {setting}\n\n{shape_table(found)}" for setting, found in by_setting.items()]
-    write_page(out / "shapes.md", shapes)
-    return write_page(out / "report.md", parts)
-
-
-def comparisons(by_method: ByMethod, halves: Halves) -> list[str]:
-    """Return on how many shapes ours beats B-spline, and the gap to the bound that it closes."""
-    if not {OURS, "bspline"} <= set(by_method):
-        return []
-    lines = [win_line(by_method[OURS], by_method["bspline"])]
-    if "bound" in by_method:
-        body = []
-        for half, names in halves.items():
-            three = [[row for row in by_method[method] if row["shape"] in names]
-                     for method in (OURS, "bspline", "bound")]  # fmt: skip
-            if three[0]:
-                cells = (f"{mean_of(three[0], key):.4g}, {percent(gap_closed(*three, key), 1)}"
-                         for key in GAPS)  # fmt: skip
-                body.append([f"{half} ({len(three[0])})", *cells])
-        title = "super-sdf, and what it closes of the gap between B-spline and the bound"
-        lines.append(markdown([title, *GAPS.values()], body))
-    return lines
-
-
-def odd_meshes(by_method: ByMethod) -> list[str]:
-    """Return a line for each method that found no surface on some shapes, or one inside out."""
-    lines = []
-    for method, rows in by_method.items():
-        empty = [row["shape"] for row in rows if not row["faces"]]
-        turned = [row["shape"] for row in rows if row["faces"] and not row["outward"]]
-        odd = {"No surface (a dot stands in)": empty, "Inside out": turned}
-        named = {what: names for what, names in odd.items() if names}
-        lines += [f"{what}, {label_of(method)}: {', '.join(n)}." for what, n in named.items()]
-    return lines
-
-
-def shape_table(by_method: ByMethod) -> str:
-    """Return the table of all shapes, with a row for each shape and method."""
-    rows = [
-        {**row, "method": name}
-        for measured in zip(*by_method.values())
-        for name, row in zip(by_method, measured)
-    ]
-
-    def words(row: Row) -> list[str]:
-        return [f"{row['shape']}, {label_of(row['method'])}"]
-
-    return listed(rows, list(BY_KEY.values()), words, ["shape, method"])
-
-
-def write_page(path: Path, parts: Sequence[str]) -> Path:
-    """Write a page of Markdown, whole or not at all; return its path."""
-    with replacing(path) as part:
-        part.write_text("\n\n".join(parts) + "\n", encoding="utf-8", errors="backslashreplace")
-    return path
-
-
-def picture_lines(results: Results, like: Task, setting: Setting, out: Path, up: str) -> list[str]:
-    """Draw the shapes on which ours is best and worst; return the lines that show them.
-
-    They are ranked by F1 over the floor's F1, which is low on large surfaces: there 100,000 points
-    are far apart.
-    """
-    floors, ranked = results.floors, results.of(setting, OURS)
-    ranked.sort(key=lambda row: row["f1"] / floors[row["shape"]]["f1"], reverse=True)
-    shown = ranked if len(ranked) < 2 * EXTREMES else [*ranked[:EXTREMES], *ranked[-EXTREMES:]]
-    paths, folder = {task.path.stem: task.path for task in results.tasks}, out / "pictures"
-    folder.mkdir(exist_ok=True)
-    lines = [f"## {len(shown)} of {len(ranked)} shapes at {setting.size}^3, best and worst F1 over "
-             "the floor's"]  # fmt: skip
-    for row in shown:
-        name, floor = row["shape"], floors[row["shape"]]["f1"]
-        lines.append(f"**{name}**, F1 {row['f1']:.3f} (floor {floor:.3f}), NC {row['nc']:.3f}")
-        try:
-            draw_shape(replace(like, path=paths[name], setting=setting), folder, up)
-            lines.append(f"![{name}](pictures/{name}.png)")
-        except SuperSdfError as problem:  # the tables matter more than a picture
-            lines.append(f"Not drawn: {problem}.")
-    return lines
-
-
-def draw_shape(task: Task, folder: Path, up: str) -> None:
-    """Draw a picture of coarse marching cubes, ours, the reference, and the error of ours."""
-    from .drawing import Panel, render_panels, vertex_errors
-
-    shape = Shape.read(task.path, task.turned)
-    case, network = Case(shape, task.setting), network_of(*task.network(OURS), task.threads)
-    coarse, ours = (make_surface(name, case, network).mesh for name in ("mc", OURS))
-    titles = {f"marching cubes of {task.setting.size}^3": coarse, "super-sdf": ours}
-    panels = [Panel(m, f"{t}: no surface" * (not len(m.faces)) or t) for t, m in titles.items()]
-    panels += [Panel(shape.mesh, "reference")]
-    panels += [Panel(ours, "error of super-sdf", vertex_errors(ours, shape.solid))]
-    target, top = folder / f"{shape.name}.png", ERROR_TOP * case.spacing
-    render_panels(panels, target, colour="error", up=up, top=top, unit="box diagonal 1")
+    for setting in dict.fromkeys(t.setting for t in results.tasks if t.setting != NO_SETTING):
+        found = {method: results.of(setting, method) for method in (*like.methods, FLOOR)}
+        means = [{"method": method, **summary(rows)} for method, rows in found.items()]
+        parts += [f"## {setting}", surface_table(means, setting.size)]
+        if {OURS, "bspline", "bound"} <= found.keys():
+            three = found[OURS], found["bspline"], found["bound"]
+            gaps = (f"{title} {percent(gap_closed(*three, key))}" for key, title in GAPS.items())
+            parts.append(f"Of the gap from B-spline to the bound closed: {', '.join(gaps)}.")
+        parts += [f"### Edges and triangles\n\n{EDGE_LINES}", listed(means, EDGES)]
+    return "\n\n".join(parts) + "\n"
 
 
 def progress_lines() -> OnTask:
@@ -314,13 +162,9 @@ def main() -> int:
     parser.add_argument("--factor", type=int, default=4)
     parser.add_argument("--methods", nargs="+", choices=BY_NAME, default=list(METHODS))
     parser.add_argument("--limit", type=int, help="use only this many meshes, spread over the list")
-    parser.add_argument("--half", choices=("all", *HALVES), default="all",
-                        help="networks are chosen on one half of the meshes")  # fmt: skip
     parser.add_argument("--turned", type=int, metavar="SEED", help="turn meshes at random first")
     parser.add_argument("--model", default=DEFAULT_QUALITY, help="shipped network or ONNX file")
     parser.add_argument("--precision", choices=PRECISIONS, default=AUTO_PRECISION)
-    parser.add_argument("--up", choices=("x", "y", "z"), default="z", help="upward in pictures")
-    parser.add_argument("--no-pictures", action="store_true")
     parser.add_argument("--quiet", action="store_true", help="print errors only")
     add_jobs(parser)
     add_ndc(parser)
@@ -328,9 +172,6 @@ def main() -> int:
     if words.turned is not None and words.turned < 0:
         raise OptionError(f"turned is {seen(words.turned)}: give a seed of 0 or more")
     paths = find_meshes(words.meshes)
-    names = [path.stem for path in paths]
-    halves = {"all": names, **draw_halves(names)}
-    paths = [path for path in paths if path.stem in halves[words.half]]
     paths = spread(paths, words.limit or len(paths))
     settings = [Setting(size, words.factor) for size in dict.fromkeys(words.sizes)]
     for setting in settings:
@@ -339,13 +180,13 @@ def main() -> int:
     methods = tuple(name for name in BY_NAME if name in words.methods)
     threads = max(1, count_cores() // max(words.jobs, 1))
     like = Task(paths[0], settings[0], methods, words.model, words.precision, threads, words.turned)
-    check_folder(words.out)
-    tasks, rows = tasks_of(paths, settings, like), Rows(words.out / ROWS)
-    results = results_of(tasks, rows, words.jobs, None if words.quiet else progress_lines())
+    rows = Rows(words.out / ROWS)
+    on_task = None if words.quiet else progress_lines()
+    results = results_of(tasks_of(paths, settings, like), rows, words.jobs, on_task)
     if not results.floors:
         raise FileError("no shape could be measured")
-    up = None if words.no_pictures else words.up
-    path = write_report(results, like, halves, words.out, up)
+    text = report(results, like)
+    (words.out / "report.md").write_text(text, encoding="utf-8", errors="backslashreplace")
     if not words.quiet:
-        print(path.read_text(encoding="utf-8"))
+        print(text)
     return int(bool(results.left_out))

@@ -27,20 +27,20 @@ import numpy as np
 
 from super_sdf.errors import FileError, OptionError
 from super_sdf.files.output import replacing
-from super_sdf.threads import count_cores
 from super_sdf.network.network import find_model
 from super_sdf.options import DEFAULT_QUALITY, QUALITIES
+from super_sdf.threads import count_cores
 
-from . import costs, others, parser_of, quoted
+from . import costs, parser_of, quoted
+from .costs import machine
 from .evaluate import Results, add_jobs, progress_lines, results_of, tasks_of
 from .kinds import KINDS
 from .measuring import Task, digest_of_ours
 from .methods import FLOOR, ON
 from .ndc import add_ndc
-from .processes import describe_machine, machine
 from .rows import Row, Rows
-from .shapes import Setting, draw_halves, find_meshes, spread
-from .tables import GAPS, gap_closed, mean_of, summary, win_line
+from .shapes import Setting, find_meshes, spread
+from .tables import GAPS, gap_closed, mean_of, summary
 
 FOLDER = Path(__file__).parent / "figures"
 ROWS = "rows.jsonl"
@@ -105,7 +105,7 @@ class Bench:
 
     def timed(self, key: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> Row:
         """Return a row as ``kept`` does; it counts for this machine and its versions only."""
-        return self.kept({**key, "machine": describe_machine()}, measure)
+        return self.kept({**key, "machine": str(machine())}, measure)
 
 
 def name_of(method: str) -> str:
@@ -125,17 +125,13 @@ def quality(bench: Bench) -> list[Row]:
     if bench.network != DEFAULT_QUALITY:  # the others do not change with it
         methods = [*BASELINES, "ours", "ours-marching", "bound"]
     results = bench.measured("validation", [Setting(n) for n in bench.sizes], methods)
-    names = [path.stem for path in bench.shapes]
     rows = []
     for size in bench.sizes:
-        for half, some in {"": names, **draw_halves(names)}.items():
-            found = {m: results.of(Setting(size), m, some) for m in (*methods, FLOOR)}
-            three = found["bspline"], found["bound"]
-            for method, measured in found.items():
-                gaps = {f"gap_{key}": gap_closed(measured, *three, key) for key in GAPS}
-                words = {"size": size, "method": name_of(method), "half": half}
-                rows.append({**words, **summary(measured), **gaps})
-            rows[-1]["wins"] = win_line(found["ours"], found["bspline"])
+        found = {m: results.of(Setting(size), m) for m in (*methods, FLOOR)}
+        three = found["bspline"], found["bound"]
+        for method, measured in found.items():
+            gaps = {f"gap_{key}": gap_closed(measured, *three, key) for key in GAPS}
+            rows.append({"size": size, "method": name_of(method), **summary(measured), **gaps})
     return rows
 
 
@@ -185,7 +181,7 @@ def kinds(bench: Bench) -> list[Row]:
         results = bench.measured(paths, [setting], methods)
         for title in dict.fromkeys(kind.title for kind in some.values()):
             rows += kind_rows(results, setting, name, title)
-    return rows + others.form_rows(bench) + others.slice_rows(bench)
+    return rows
 
 
 def kind_rows(results: Results, setting: Setting, name: str, title: str) -> list[Row]:
@@ -272,9 +268,7 @@ FIGURES: dict[str, tuple[Callable[[Bench], list[Row]], tuple[str, ...]]] = {
     "scale": (scale, ("base",)),
     "factors": (factors, ("base",)),
     "simplify": (simplify, ("base",)),
-    "check": (others.check_rows, ("base",)),
     "speed": (costs.speed_rows, ("fast", "base", "best", "mask", "noisy")),
-    "memory": (costs.memory_rows, ("base",)),
     "peers": (peers, ("base",)),
 }
 RARE = ("peers",)  # takes long for what few ask for

@@ -1,4 +1,4 @@
-"""Solids in closed form, as functions of x, y and z, negative inside; and the true surface of each.
+"""Solids in closed form, as functions of x, y and z, negative inside.
 
 The formulas are the usual ones (https://iquilezles.org/articles/distfunctions): exact distances,
 bounds of them, and smooth combinations. By default they lie in the unit cube around the origin.
@@ -6,16 +6,7 @@ bounds of them, and smooth combinations. By default they lie in the unit cube ar
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-
-from super_sdf import Mesh
-
-from .surfaces import isosurface
-
-Form = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-FINE = 256  # samples a side of the grid on which the true surface is meshed
 
 
 def ball(x, y, z, at: float, radius: float) -> np.ndarray:
@@ -65,36 +56,3 @@ def blobs(x, y, z) -> np.ndarray:
     return 0.6 - sum(
         np.exp(-((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2) / 0.02) for a, b, c in places
     )
-
-
-FORMS: dict[str, Form] = {
-    "torus in thirds": lambda x, y, z: 3 * torus(x, y, z),
-    "box in fifths": lambda x, y, z: 5 * box(x, y, z, 0.3, 0.2, 0.15),
-    "ellipsoid": lambda x, y, z: ellipsoid(x, y, z, 0.4, 0.25, 0.15),
-    "quadric": quadric,
-    "cut quadric": lambda x, y, z: np.maximum(quadric(x, y, z), x + 0.4 * y - 0.1),
-    "smooth difference": lambda x, y, z: (
-        -smooth_union(-ball(x, y, z, -0.08, 0.3), ball(x, y, z, 0.2, 0.2), 0.1)
-    ),
-    "smooth union": lambda x, y, z: smooth_union(
-        ball(x, y, z, -0.15, 0.2), ball(x, y, z, 0.15, 0.2), 0.1
-    ),
-    "smooth union of boxes": lambda x, y, z: smooth_union(
-        box(x, y, z, 0.35, 0.12, 0.1), box(x, y, z, 0.1, 0.1, 0.35), 0.08
-    ),
-    "gyroid": gyroid,
-    "blobs": blobs,
-}
-
-
-def sample(form: Form, size: int) -> tuple[np.ndarray, float, float]:
-    """Return the samples of a form in the unit cube, their spacing, and the first's coordinate."""
-    line = (np.arange(size) + 0.5) / size - 0.5
-    values = form(*np.meshgrid(line, line, line, indexing="ij"))
-    return values.astype(np.float32), 1 / size, 0.5 / size - 0.5
-
-
-def true_surface(form: Form) -> Mesh:
-    """Return the surface of a form: marching cubes of a fine grid."""
-    values, spacing, low = sample(form, FINE)
-    return isosurface(values, spacing, low)

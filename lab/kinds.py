@@ -17,7 +17,7 @@ from scipy import ndimage
 
 from super_sdf.arrays import FloatArray
 from super_sdf.errors import GridError
-from super_sdf.grid.sdf_grid import SdfGrid, make_grid
+from super_sdf.grid.sdf_grid import make_grid
 from super_sdf.network.decoder import Decoder
 from super_sdf.options import AUTO, SCALED
 from super_sdf.pipeline import reconstruct
@@ -31,21 +31,16 @@ Array = NDArray[Any]
 CUTS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # voxels
 INTEGERS = 30_000.0  # of the diagonal, in steps of whole numbers of 16 bits
 RATIOS = (1.5, 5.0)  # of the coarse spacing to the others
-MOST_BY_HAND = 2.0  # ratio up to which grids are resampled by hand to the finest spacing
 CHUNK = 1 << 18  # samples at a time
 
 WIDTHS = (0.5, 0.8, 1.2)  # voxels, of the Gaussians by which masks are smoothed
 DISTANCES = ("mc", "bspline", "ours")
 MASKS = ("mc", "mc-distances", *(f"mc-gaussian-{width:g}" for width in WIDTHS), "ours")
-TO_FINEST, TO_COARSEST = ("linear-finest", "spline-finest"), "spline-coarsest"
 KIND_LABELS = {
     "mc": "MC",
     "mc-distances": "MC of SciPy's distance transform",
     **{f"mc-gaussian-{width:g}": f"MC, Gaussian of {width:g} voxels" for width in WIDTHS},
     "bspline": "B-spline + MC",
-    "linear-finest": "by hand to the finest spacing, linear, super-sdf",
-    "spline-finest": "by hand to the finest spacing, cubic spline, super-sdf",
-    "spline-coarsest": "by hand to the coarsest spacing, cubic spline, super-sdf",
     "ours": "super-sdf",
 }
 AXES = "xyz"
@@ -151,9 +146,8 @@ def truncated_kind(title: str, inside: float, outside: float) -> Kind:
 
 def unequal_kind(ratio: float, axis: str) -> Kind:
     """Return the kind of grid that is coarser along an axis."""
-    by_hand = (*TO_FINEST, TO_COARSEST) if ratio <= MOST_BY_HAND else (TO_COARSEST,)
-    make, methods = partial(unequal, ratio=ratio, axis=axis), ("mc", *by_hand, "ours")
-    return Kind("unequal", f"spacing 1:1:{ratio:g}", make, methods, ratio=ratio, axis=axis)
+    make = partial(unequal, ratio=ratio, axis=axis)
+    return Kind("unequal", f"spacing 1:1:{ratio:g}", make, ("mc", "ours"), ratio=ratio, axis=axis)
 
 
 HALF: dict[str, Any] = {"level": 0.5, "options": {"level": 0.5}}
@@ -234,24 +228,6 @@ def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
     return Surface(EMPTY, facts={"refused": refusals[0]})
 
 
-def resampled_by_hand(
-    kind: Kind, case: Case, network: Decoder, *, order: int, finest: bool
-) -> Surface:
-    """Mesh with super-sdf what SciPy resampled to one spacing; ``order`` is that of the spline."""
-    values, spacing, origin = samples_of(kind, case)
-    h = spacing.min() if finest else spacing.max()
-    step = h / spacing
-    shape = np.rint((np.array(values.shape) - 1) / step).astype(int) + 1
-    values = ndimage.affine_transform(
-        values, step, output_shape=tuple(shape), order=order, mode="nearest"
-    )
-    grid = SdfGrid.trusted(values, h, origin)
-    try:
-        return Surface(reconstruct(grid, network, factor=case.factor))
-    except GridError as problem:
-        return Surface(EMPTY, facts={"refused": str(problem)})
-
-
 BY_METHOD: dict[str, Callable[[Kind, Case, Decoder], Surface]] = {
     "mc": coarse_surface,
     "mc-distances": partial(coarse_surface, change=transformed),
@@ -260,8 +236,5 @@ BY_METHOD: dict[str, Callable[[Kind, Case, Decoder], Surface]] = {
         for width in WIDTHS
     },
     "bspline": spline_of_kind,
-    "linear-finest": partial(resampled_by_hand, order=1, finest=True),
-    "spline-finest": partial(resampled_by_hand, order=3, finest=True),
-    "spline-coarsest": partial(resampled_by_hand, order=3, finest=False),
     "ours": our_surface_of_kind,
 }

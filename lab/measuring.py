@@ -15,12 +15,16 @@ import numpy as np
 
 import super_sdf
 from super_sdf.errors import SuperSdfError
-from super_sdf.files.regular import check_regular_file
-from super_sdf.threads import forget_peak, held_memory
-from super_sdf.surface.mesh import Mesh
 from super_sdf.network.decoder import Decoder
-from super_sdf.network.network import (KIND_MODELS, find_model, float32_name, load_network, shipped_models)
+from super_sdf.network.network import (
+    KIND_MODELS,
+    find_model,
+    float32_name,
+    load_network,
+    shipped_models,
+)
 from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY
+from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.solid import Solid
 
 from . import edges, metrics
@@ -107,15 +111,13 @@ def measure_method(shape: Shape, case: Case | None, method: str, task: Task) -> 
     """Return a method's figures, or the reason in "error" if it raised an exception.
 
     A failure is not a score: its cause is the machine or a bug, not the method. ``seconds`` is the
-    time from the grid in memory to the mesh in memory, ``peak_mb`` the peak of memory meanwhile,
-    less what the process held before.
+    time from the grid in memory to the mesh in memory.
     """
     try:
         network = network_of(*task.network(method), task.threads)
-        forget_peak()
-        held, clock = held_memory(), time.perf_counter()
+        clock = time.perf_counter()
         surface = make_surface(method, case, network) if case else Surface(shape.mesh)
-        seconds, peak = time.perf_counter() - clock, held_memory(peak=True)
+        seconds = time.perf_counter() - clock
         if ON in method:
             figures = measure_on_kind(shape, surface.mesh)
         else:
@@ -123,9 +125,7 @@ def measure_method(shape: Shape, case: Case | None, method: str, task: Task) -> 
         figures |= measure_field(case, surface)
     except Exception as problem:  # named in the report; the other shapes still count
         return {"error": reason_of(problem)}
-    more = None if held is None or peak is None else round(max(peak - held, 0) / 1e6, 1)
-    facts = {"seconds": seconds, "peak_mb": more, "error": None}
-    return {**figures, **(surface.facts or {}), **facts}
+    return {**figures, **(surface.facts or {}), "seconds": seconds, "error": None}
 
 
 def reason_of(problem: Exception) -> str:
@@ -196,7 +196,7 @@ def measure_field(case: Case | None, surface: Surface) -> Measurement:
 @cache
 def digest_of_file(path: Path) -> str:
     """Return a hash of a file's content."""
-    return hashlib.sha256(check_regular_file(path).read_bytes()).hexdigest()[:16]
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 @cache

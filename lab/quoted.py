@@ -15,7 +15,6 @@ from typing import Any
 from super_sdf.errors import FileError
 
 from . import published
-from .forms import FORMS
 from .kinds import KIND_LABELS
 from .rows import Row
 from .tables import (
@@ -25,7 +24,6 @@ from .tables import (
     EDGES,
     EF1,
     F1,
-    GAPS,
     NC,
     P2S,
     THERE,
@@ -47,13 +45,8 @@ EDGE_COLUMNS = (F1, NC, THERE, BACK, *EDGES[:-1])
 PEER_COLUMNS = (*EDGE_COLUMNS, Column("mean s", "seconds", 1, 1))
 DENSE = (SECONDS, PEAK, Column("time over ours", "over_seconds", 1, 1),
          Column("memory over ours", "over_peak_mb", 1, 1))  # fmt: skip
-LARGE = (Column("slabs", "slabs", 1, 0), Column("band voxels", "band_voxels", 1, 0),
-         Column("triangles", "triangles", 1, 0), SECONDS, PEAK,
-         Column("planned MB", "planned_mb", 1, 0))  # fmt: skip
-MEMORY = (Column("bytes per seen voxel", "seen", 1, 0),
-          Column("per decoded voxel", "decoded", 1, 0), Column("fixed MB", "fixed_mb", 1, 0),
-          Column("fit off by, %", "off", 100, 0),
-          Column("peak over plan", "of_plan", 1, 2))  # fmt: skip
+LARGE = (Column("tiles", "tiles", 1, 0), Column("band voxels", "band_voxels", 1, 0),
+         Column("triangles", "triangles", 1, 0), SECONDS, PEAK)  # fmt: skip
 COLUMNS = {**BY_KEY, "seconds": SECONDS, "peak_mb": PEAK}  # of numbers in sentences
 SUMMARY_LABELS = {
     "mc": "marching cubes",
@@ -89,11 +82,7 @@ OPTION_LABELS = {
     "best": "`--quality best`",
     "float32": "`--precision float32`",
     "marching": "`--mesher marching`",
-}
-CHECK_LABELS = {
-    "shapes": "mean residual and mean error, both ways",
-    "largest": "largest residual and largest error",
-    "vertices": "vertices of a shape: median",
+    "simplify": "`--simplify 0.02`",
 }
 
 
@@ -123,9 +112,9 @@ def wide(
 
 def summary_table(rows: Sequence[Row]) -> str:
     """Return F1 and NC of the methods that a new user compares."""
-    sizes, whole, body = values(rows, "size"), pick(rows, half=""), []
+    sizes, body = values(rows, "size"), []
     for name, label in SUMMARY_LABELS.items():
-        found = [pick(whole, size=n, method=name) for n in sizes]
+        found = [pick(rows, size=n, method=name) for n in sizes]
         if any(found):
             figures = [cells(row[0] if row else {}, (F1, NC)) for row in found]
             body.append([label, *(cell for pair in figures for cell in pair)])
@@ -139,34 +128,14 @@ def size_table(rows: Sequence[Row], size: int) -> str:
     def words(row: Row) -> list[str]:
         return [NETWORK_LABELS.get(row["method"]) or label_of(row["method"])]
 
-    return surface_table(pick(rows, size=size, half=""), size, words)
+    return surface_table(pick(rows, size=size), size, words)
 
 
 def network_table(rows: Sequence[Row]) -> str:
     """Return the networks at each size, meshed by marching cubes."""
-    chosen = (row for row in pick(rows, half="") if row["method"] in MODEL_LABELS)
+    chosen = (row for row in rows if row["method"] in MODEL_LABELS)
     heads, labels = ["grid", "network"], MODEL_LABELS
     return listed(chosen, SHORT, lambda row: [f"{row['size']}^3", labels[row["method"]]], heads)
-
-
-def gap_table(rows: Sequence[Row]) -> str:
-    """Return the gap closed by the networks, on all shapes and on each half."""
-    halves = {"": "all", "choose": "those that networks were chosen on", "final": "the others"}
-    body = [
-        [f"{size}^3", f"{halves[row['half']]} ({row['shapes']})", NETWORK_LABELS[row["method"]],
-         *(percent(row[f"gap_{key}"]) for key in GAPS)]
-        for size in values(rows, "size")
-        for half in halves
-        for row in pick(rows, size=size, half=half)
-        if row["method"] in ("default", "fast", "base", "best")
-    ]  # fmt: skip
-    return markdown(["grid", "shapes", "network", *GAPS.values()], body)
-
-
-def worse_line(rows: Sequence[Row]) -> str:
-    """Return on how many shapes ours is better than B-spline, at each size."""
-    whole = pick(rows, half="")
-    return " ".join(f"At {row['size']}^3 {row['wins']}" for row in whole if row.get("wins"))
 
 
 def edge_table(rows: Sequence[Row], name: str, size: int | None = None) -> str:
@@ -199,27 +168,6 @@ def kind_table(rows: Sequence[Row], wanted: Callable[[str], bool]) -> str:
     return markdown(titles, body)
 
 
-def form_table(rows: Sequence[Row]) -> str:
-    """Return closed forms that are no distances, at their sizes."""
-    chosen, body = pick(rows, set="forms"), []
-    for name in FORMS:
-        found, line = pick(chosen, kind=name), [name]
-        for method in ("mc", "bspline", "ours"):
-            line.append(", ".join(VOXELS.cell(r["voxels"]) for r in pick(found, method=method)))
-        taken = values(found, "taken_as")
-        by_size = (f"{row['size']}^3: {row['taken_as']}" for row in pick(found, method="ours"))
-        body.append([*line, taken[0] if len(taken) == 1 else "; ".join(by_size)])
-    head = ", ".join(f"{n}^3" for n in values(chosen, "size"))
-    return markdown([head, "marching cubes", "B-spline", "super-sdf", "taken as"], body)
-
-
-def slice_table(rows: Sequence[Row]) -> str:
-    """Return masks and truncated distances with thick slices."""
-    chosen = [{**row, "kind": f"1:1:{row['kind']}"} for row in pick(rows, set="slices")]
-    labels = {name: name.replace("ours", "super-sdf") for name in values(chosen, "method")}
-    return wide(chosen, labels, "method", VOXELS, among="kind")
-
-
 def dense_table(rows: Sequence[Row]) -> str:
     """Return dense upsampling and marching cubes on one shape, beside ours."""
     names = {"scipy": "cubic", "trilinear": "trilinear"}
@@ -230,30 +178,9 @@ def dense_table(rows: Sequence[Row]) -> str:
 
 def large_table(rows: Sequence[Row]) -> str:
     """Return a large torus within several limits."""
-    chosen = ({"slabs": "refused", **row} for row in rows if "limit" in row)
+    chosen = ({"tiles": "refused", **row} for row in rows if "limit" in row)
     heads = ["grid", "`--max-memory`"]
     return listed(chosen, LARGE, lambda row: [f"{row['size']}^3", row["limit"]], heads)
-
-
-def stage_table(rows: Sequence[Row]) -> str:
-    """Return the seconds of each stage, and its share, at each size."""
-    found = pick(rows, option="network base int8")
-    totals = [sum(row["stages"].values()) for row in found]
-    body = []
-    for stage in found[0]["stages"] if found else ():
-        seconds = [row["stages"][stage] for row in found]
-        body.append([stage, *(f"{s:.3f} ({s / total:.0%})" for s, total in zip(seconds, totals))])
-    return markdown(["seconds", *(f"{row['size']}^3" for row in found)], body)
-
-
-def rate_table(rows: Sequence[Row]) -> str:
-    """Return the microseconds per voxel of the networks, at the largest size."""
-    found = [row for row in rows if row["option"].startswith("network")]
-    body: dict[str, list[str]] = {}
-    for row in pick(found, size=max(values(found, "size"), default=0)):
-        body.setdefault(row["option"].split()[1], []).append(f"{row['us_per_voxel']:.1f}")
-    lines = [[f"`{name}`", *both] for name, both in body.items()]
-    return markdown(["microseconds per voxel of the band", "int8", "float32"], lines)
 
 
 def noise_table(rows: Sequence[Row]) -> str:
@@ -296,15 +223,6 @@ def simplify_table(rows: Sequence[Row]) -> str:
     return markdown(heads, [line])
 
 
-def check_table(rows: Sequence[Row]) -> str:
-    """Return how well residuals predict the true error, as rank correlations."""
-    body = [
-        [label, *(Column("", key, 1, 2).cell(row[key]) for row in rows)]
-        for key, label in CHECK_LABELS.items()
-    ]
-    return markdown(["", *(f"{row['size']}^3, {row['grids']} shapes" for row in rows)], body)
-
-
 def peer_table(rows: Sequence[Row]) -> str:
     """Return dual contouring of distances, and ours with as many triangles."""
     return listed([row for row in rows if "size" not in row], PEER_COLUMNS, heads=[""])
@@ -327,8 +245,6 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
     "quality.summary": summary_table,
     "quality.networks": network_table,
     **{f"quality.{n}": partial(size_table, size=n) for n in (32, 64, 128)},
-    "quality.gaps": gap_table,
-    "quality.worse": worse_line,
     **{f"edges.{n}": partial(edge_table, name="parts", size=n) for n in (32, 64)},
     "edges.validation": partial(edge_table, name="validation"),
     "peers.table": peer_table,
@@ -336,21 +252,14 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
     "kinds.distances": lambda rows: kind_table(rows, lambda k: k != "mask" and not is_unequal(k)),
     "kinds.masks": lambda rows: kind_table(rows, lambda kind: kind == "mask"),
     "kinds.unequal": lambda rows: kind_table(rows, is_unequal),
-    "kinds.forms": form_table,
-    "kinds.slices": slice_table,
     "speed.process": lambda rows: wide(rows, OPTION_LABELS, "option", SECONDS),
     "speed.memory": lambda rows: wide(rows, OPTION_LABELS, "option", PEAK),
-    "speed.warm": lambda rows: wide(rows, {"warm": "super-sdf"}, "option", SECONDS),
     "speed.dense": dense_table,
     "speed.large": large_table,
-    "speed.stages": stage_table,
-    "speed.networks": rate_table,
     "noise.table": noise_table,
     "scale.table": lambda rows: setting_table(rows, "scale", published.SCALED),
     "factors.table": lambda rows: setting_table(rows, "factor", {}),
     "simplify.table": simplify_table,
-    "check.table": check_table,
-    "memory.table": lambda rows: listed(rows, MEMORY, lambda r: [str(r["factor"])], ["factor"]),
 }
 
 
@@ -412,9 +321,8 @@ def number(rows: Sequence[Row], name: str, words: Sequence[str]) -> str:
 
 
 def row_of(rows: Sequence[Row], words: Sequence[str]) -> Row:
-    """Return the first row in which every word stands; of quality that is of all shapes first."""
+    """Return the first row in which every word stands."""
     found = [row for row in rows if set(words) <= {f"{value}" for value in row.values()}]
-    found.sort(key=lambda row: row.get("half", "") not in ("", *words))
     if not found:
         raise FileError(f"no row has {' '.join(words)}")
     return found[0]

@@ -1,21 +1,33 @@
-"""The rows of a measurement: a file of JSON lines that makes long runs resumable.
+"""The rows of a measurement, in a file of JSON lines, and the processes that make them.
 
 Rows are appended as they come, so a kill costs only the tasks under way. A row is valid as long as
-its key is asked for; a line that is damaged is measured again.
+its key is asked for; a line that is damaged is measured again. A process that crashes, or runs out
+of memory or time, fails the method that it was at, and harms no other.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import multiprocessing
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from super_sdf.batch.record import RecordFile
 from super_sdf.errors import WriteError
+
+from .measuring import Measurement, Task, measure_task, reason_of
+from .shapes import Shape
 
 Key = Mapping[str, Any]
 Row = dict[str, Any]
+OnTask = Callable[[int, int, str], None]
+"""Called after each task: (tasks done, tasks in all, name of the shape)."""
 
 
 class Rows:
@@ -23,28 +35,31 @@ class Rows:
 
     def __init__(self, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self.file = RecordFile(path)
-        self.rows: dict[str, Row] = {}
-        for record in self.file.read():
-            if isinstance(record, dict) and isinstance(record.get("key"), dict):
+        self.path, self.rows = path, dict[str, Row]()
+        for line in path.read_bytes().splitlines() if path.exists() else ():
+            with suppress(ValueError, KeyError, TypeError):  # a line that was torn
+                record = json.loads(line)
                 self.rows[name_of(record["key"])] = record
 
     def add(self, key: Key, figures: Row) -> None:
         """Keep a row, in memory and in the file."""
         record = {"key": dict(key), **figures}
         try:
-            self.file.append(record)
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(record) + "\n")
         except OSError as error:
             raise WriteError(
-                f"{self.file.path} cannot be written: {error.strerror}; the rows in it are kept, "
-                "and the same command goes on from there"
+                f"{self.path} cannot be written: {error.strerror}; the rows in it are kept, and "
+                "the same command goes on from there"
             ) from error
         self.rows[name_of(key)] = record
 
     def get(self, key: Key) -> Row | None:
         """Return the row of a key, its entries among the figures; None if there is none."""
         record = self.rows.get(name_of(key))
-        return None if record is None else flat(record)
+        if record is None:
+            return None
+        return {**record["key"], **{name: v for name, v in record.items() if name != "key"}}
 
     def is_final(self, key: Key, limit: float | None = None) -> bool:
         """Return whether a row need not be measured again.
@@ -55,11 +70,7 @@ class Rows:
         row = self.get(key)
         if row is None or row.get("error") is None:
             return row is not None
-        before = row.get("limit")
-        return before is not None and limit is not None and before >= limit
-
-    def __iter__(self) -> Iterator[Row]:
-        return map(flat, self.rows.values())
+        return limit is not None and row.get("limit") is not None and row["limit"] >= limit
 
 
 def name_of(key: Key) -> str:
@@ -67,6 +78,84 @@ def name_of(key: Key) -> str:
     return json.dumps(key, sort_keys=True)
 
 
-def flat(record: Row) -> Row:
-    """Return the entries of a row's key and its figures."""
-    return {**record["key"], **{name: value for name, value in record.items() if name != "key"}}
+@dataclass(frozen=True)
+class LeftOut:
+    """A shape that could not be measured, or not everywhere, and why."""
+
+    shape: str
+    reason: str
+
+
+def complete(
+    tasks: Sequence[Task], rows: Rows, jobs: int, on_task: OnTask | None = None
+) -> list[LeftOut]:
+    """Measure what the rows lack and keep it there; return the shapes that could not be read."""
+    left = [
+        replace(
+            task,
+            methods=tuple(m for m in task.methods if not rows.is_final(task.key(m), task.limit)),
+            triangles=tuple((m, row["faces"]) for m in task.methods
+                            if "faces" in (row := rows.get(task.key(m)) or {})),
+        )
+        for task in tasks
+    ]  # fmt: skip
+    left = sorted((task for task in left if task.methods), key=lambda t: (t.path, t.turned or 0))
+    unreadable = []
+    for done, (task, outcome) in enumerate(outcomes(left, jobs), 1):
+        if isinstance(outcome, str):
+            unreadable.append(LeftOut(task.path.stem, outcome))
+        else:
+            for method, figures in outcome.items():
+                rows.add(task.key(method), figures)
+        if on_task:
+            on_task(done, len(left), task.path.stem)
+    return unreadable
+
+
+def outcomes(
+    tasks: Sequence[Task], jobs: int
+) -> Iterator[tuple[Task, dict[str, Measurement] | str]]:
+    """Yield each task with the figures of its methods, or why its shape cannot be read.
+
+    When a process dies, the tasks under way are done again, one at a time and a method at a time.
+    """
+    if not jobs:
+        yield from ((task, measured(task)) for task in tasks)
+        return
+    context, waiting = multiprocessing.get_context("spawn"), list(tasks)
+    with suppress(BrokenProcessPool), ProcessPoolExecutor(jobs, context) as pool:
+        for future in as_completed(found := {pool.submit(measured, task): task for task in tasks}):
+            outcome = future.result()
+            waiting.remove(found[future])
+            yield found[future], outcome
+    for task in waiting:
+        figures: dict[str, Measurement] = {}
+        for method in task.methods:
+            try:
+                with ProcessPoolExecutor(1, context) as pool:
+                    outcome = pool.submit(measured, replace(task, methods=(method,))).result()
+                figures |= {method: {"error": outcome}} if isinstance(outcome, str) else outcome
+            except BrokenProcessPool:
+                late = {"limit": task.limit} if task.limit else {}
+                figures[method] = {"error": f"its process died (limit: {task.limit} s)", **late}
+        yield task, figures
+
+
+def measured(task: Task) -> dict[str, Measurement] | str:
+    """Return the figures of each method of a task, or why its shape cannot be read.
+
+    At the limit of the task the process is ended.
+    """
+    signal.setitimer(signal.ITIMER_REAL, task.limit or 0)  # 0: none
+    try:
+        return dict(measure_task(task, shape_of(task.path, task.turned)))
+    except Exception as problem:  # the other shapes still count
+        return reason_of(problem)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+@lru_cache(maxsize=1)
+def shape_of(path: Path, turned: int | None) -> Shape:
+    """Read a shape, once for tasks that follow one another."""
+    return Shape.read(path, turned)

@@ -19,20 +19,15 @@ from numpy.typing import NDArray
 from super_sdf.arrays import BoolArray, FloatArray, IntArray
 from super_sdf.errors import FileError, OptionError, seen
 from super_sdf.files.meshes import MESH_SUFFIXES
-from super_sdf.files.regular import check_regular_file
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
-from super_sdf.threads import check_fits
-from super_sdf.surface.mesh import Mesh
 from super_sdf.options import check_factor
 from super_sdf.refine.band import find_band, rescale
+from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import sample_grid, unit_layout
 from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
 
 from . import metrics
 from .edges import EdgeCurves
-
-# Peak memory per node of the fine lattice: dense fields, their masks, and meshing one of them.
-BYTES_PER_NODE = 20
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
 REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIELD_NOISE = range(7)
@@ -40,8 +35,6 @@ REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIE
 
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
 SUFFIXES = (*MESH_SUFFIXES, ".gltf")
-HALVES = ("choose", "final")
-HALVES_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -122,9 +115,6 @@ class Case:
 
     def __init__(self, shape: Shape, setting: Setting) -> None:
         self.triangles: dict[str, int] = {}
-        nodes = (setting.size * setting.factor + 1) ** 3
-        what = f"measuring {setting.size}^3 refined to {nodes:,} nodes"
-        check_fits(nodes * BYTES_PER_NODE, what, "use smaller sizes or fewer --jobs")
         self.shape, self.setting, self.factor = shape, setting, setting.factor
         longest = float(np.ptp(shape.mesh.vertices, axis=0).max())
         self.side = longest / setting.scale if setting.scale else 1.0
@@ -222,7 +212,7 @@ def find_meshes(sources: Sequence[Path]) -> tuple[Path, ...]:
             inside = sorted(p for p in source.iterdir() if p.suffix.lower() in SUFFIXES)
         if not inside:
             raise FileError(f"{source} holds no mesh: give {', '.join(SUFFIXES)}")
-        paths += [check_regular_file(path) for path in inside]
+        paths += inside
     names = [path.stem for path in paths]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice:
@@ -234,17 +224,3 @@ def spread(items: Sequence[Any], count: int) -> tuple[Any, ...]:
     """Return ``count`` of the items, evenly spread over them."""
     count = min(count, len(items))
     return tuple(items[i * len(items) // count] for i in range(count))
-
-
-def draw_halves(names: Sequence[str], seed: int = HALVES_SEED) -> dict[str, list[str]]:
-    """Split names by a seed: networks are chosen on the first half, the second is for the end.
-
-    The split depends on the names only, not on their order; of an odd number the second gets one
-    more.
-    """
-    chosen = np.random.default_rng(seed).permutation(sorted(names))[: len(names) // 2]
-    first = set(chosen.tolist())
-    return {
-        "choose": [name for name in names if name in first],
-        "final": [name for name in names if name not in first],
-    }

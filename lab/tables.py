@@ -48,12 +48,7 @@ EDGES = (
     *(Column("angle near", "angle_near", 1, 2), Column("angle beyond", "angle_beyond", 1, 2)),
     *(TRIANGLES, Column("slivers %", "slivers", 100, 2), Column("min angle", "min_angle", 1, 2)),
 )
-COST = (
-    Column("mean s", "seconds", 1, 2),
-    Column("slowest s", "seconds_max", 1, 2),
-    Column("mean peak MB", "peak_mb", 1, 0),
-    Column("highest peak MB", "peak_mb_max", 1, 0),
-)
+COST = (Column("mean s", "seconds", 1, 2),)
 GAPS = {  # the last is one-sided: lost thin parts do not count
     **{"f1": "F1", "nc": "NC", "p2s": "point to surface"},
     "p2s_back": "result to reference",
@@ -156,14 +151,3 @@ def gap_closed(
 def percent(share: float | None, digits: int = 0) -> str:
     """Return a share as text in percent, "-" if it is unknown."""
     return "-" if share is None else f"{100 * share:.{digits}f} %"
-
-
-def win_line(ours: Sequence[Row], others: Sequence[Row]) -> str:
-    """Return a line on how many shapes ours has the better F1, with the others by name."""
-    lost = [
-        f"{mine['shape']} ({mine['f1']:.3f}, B-spline {other['f1']:.3f})"
-        for mine, other in zip(ours, others)
-        if mine["f1"] <= other["f1"]
-    ]
-    line = f"super-sdf beats B-spline in F1 on {len(ours) - len(lost)} of {len(ours)}."
-    return f"{line} Not on: {', '.join(lost)}." if lost else line

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.check.check import check_mesh
 from super_sdf.grid.cubic import Resampled, cubic_grid, new_places, on_samples
-from super_sdf.surface.mesh import join_meshes
 from super_sdf.refine.survey import survey
 
 BALLS = np.array([(4.1, 3.6, 4.9, 2.3), (5.3, 4.1, 7.0, 1.4), (5.9, 3.0, 4.2, 1.2)])

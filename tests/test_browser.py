@@ -16,12 +16,8 @@ from pages import wedge
 from PIL import Image
 from playwright.sync_api import Error, sync_playwright
 
-from super_sdf import load_network
 from super_sdf.batch import page as batch_page
 from super_sdf.cli.main import cli
-from super_sdf.options import Options
-from super_sdf.pages.html import make_page, viewed_page, write_page
-from super_sdf.pages.items import entry_of
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
 WITHOUT_GPU = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
@@ -146,14 +142,6 @@ def test_the_page_opens_with_two_views_and_asks_for_nothing(visit, report):
     assert any("Content Security Policy" in said for said in page.complaints)
 
 
-def test_a_phone_shows_all_of_it_in_a_dark_scheme(visit, report):
-    page = visit(report, viewport={"width": 360, "height": 740}, color_scheme="dark")
-    page.locator("canvas").last.wait_for()
-    assert page.evaluate("document.documentElement.scrollWidth") == 360
-    colour = page.evaluate("getComputedStyle(document.body).backgroundColor")
-    assert sum(map(int, colour[4:-1].split(","))) < 380
-
-
 def test_turning_one_view_turns_both_alike_and_keys_turn_and_zoom(visit, report):
     page = visit(report)
     before = pictures(page)
@@ -192,21 +180,6 @@ def test_each_switch_changes_the_pictures_and_back(visit, report):
     assert blue.mean() > 0.01
 
 
-def test_the_cutting_plane_shows_the_inside_and_moves(visit, report):
-    page = visit(report)
-    whole, axis = pictures(page), page.get_by_label("Axis of the cutting plane")
-    axis.select_option("y")
-    cut = pictures(page)
-    assert all((np.abs(shot - OCHRE).max(2) < 6).mean() > 0.01 for shot in cut)
-    assert min(changed(whole, cut)) > 0.02
-    for _ in range(8):
-        page.get_by_label("Position of the cutting plane").press("PageUp")
-    assert min(changed(cut, pictures(page))) > 0.01
-    assert page.locator("output").inner_text().startswith("y = ")
-    axis.select_option("none")
-    assert max(changed(whole, pictures(page))) < 0.01
-
-
 def test_a_batch_loads_meshes_from_beside_the_page_when_they_are_asked_for(visit, batch, tmp_path):
     """Names with markup are text; meshes that are gone are said."""
     page = visit(batch)
@@ -228,40 +201,3 @@ def test_a_batch_loads_meshes_from_beside_the_page_when_they_are_asked_for(visit
     page.locator("summary", has_text="b.ply").click()
     said = page.get_by_text("The meshes cannot be shown: ").inner_text()
     assert said.endswith(".js is not beside this page")
-
-
-def test_many_files_are_searched_and_sorted(visit, tmp_path):
-    entries = [
-        entry_of(f"part-{n}.ply", seconds=float(n % 4), residual=n % 3 / 10) for n in range(8)
-    ]
-    said = {"title": "", "lead": "", "alert": "", "summary": [], "notes": [], "files": entries}
-    write_page(make_page(said), tmp_path / "many.html")
-    page = visit((tmp_path / "many.html").as_uri())
-
-    def names():
-        return [name.strip() for name in page.locator(".name:visible").all_inner_texts()]
-
-    page.get_by_label("Order").select_option("slowest first")
-    assert names()[:2] == ["part-3.ply", "part-7.ply"]
-    page.get_by_label("Order").select_option("largest residual first")
-    assert names()[:3] == ["part-2.ply", "part-5.ply", "part-1.ply"]
-    page.get_by_label("Order").select_option("failures first")
-    assert names() == [entry["name"] for entry in entries]
-    page.get_by_label("Find a file").fill("T-5")
-    assert names() == ["part-5.ply"] and page.complaints == []
-
-
-def test_view_shows_meshes_and_refined_grids_from_one_file(visit, report, tmp_path):
-    np.save(tmp_path / "a.npy", wedge())
-    mesh = Path(report.removeprefix("file://")).with_suffix(".ply")
-    options = Options(factor=2, spacing=(1.0,))
-    sources = [str(tmp_path / "a.npy"), str(mesh)]
-    text = viewed_page(sources, lambda: load_network("fast", device="cpu"), options)
-    write_page(text, tmp_path / "view.html")
-    page = visit((tmp_path / "view.html").as_uri())
-    for name, count in (("a.npy", 2), ("a.ply", 1)):
-        page.locator("summary", has_text=name).click()
-        page.locator(".file", has_text=name).locator("canvas").first.wait_for()
-        shots = pictures(page)
-        assert len(shots) == count and all(silhouette(shot).mean() > 0.1 for shot in shots)
-    assert page.requested == [(tmp_path / "view.html").as_uri()] and page.complaints == []

@@ -11,11 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_anisotropic import pear as to_pear
 
-from super_sdf import SdfGrid, make_grid, read_grid, reconstruct
+from super_sdf import make_grid, read_grid, reconstruct
 from super_sdf.errors import GridError
 from super_sdf.files.grids import write_grid
-from super_sdf.files.meshes import check_format_holds
-from super_sdf.surface.mesh import vertex_type
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 ORIGIN = np.array([10.0, -20.0, 5.0])
@@ -62,16 +60,6 @@ def test_what_is_no_direction_is_refused(said):
     assert refusal(GridError, make_grid, pear(), **place) == f"direction is {said}"
 
 
-def test_the_precision_follows_the_coordinates_of_the_turned_grid():
-    """Turned by a half, a long grid reaches as far to the other side."""
-    values = np.full((3, 3, 3), 1.0)
-    half = np.diag([-1.0, -1.0, 1.0])
-    grid = SdfGrid.trusted(values, 1.0, (1e4, 0, 0), direction=half)
-    assert vertex_type(grid, 4) is np.float64
-    assert vertex_type(SdfGrid.trusted(values, 1.0, (3, 0, 0), direction=half), 4) is np.float32
-    check_format_holds("a.glb", grid, 4)
-
-
 def test_npz_keeps_the_direction(folder):
     direction = turn(0.4, 0.1, -0.3) @ MIRROR
     grid = make_grid(pear(), spacing=0.5, origin=ORIGIN, direction=direction)
@@ -82,7 +70,7 @@ def test_npz_keeps_the_direction(folder):
     write_grid(make_grid(pear(), spacing=0.5), "b.npz")
     assert sorted(np.load("b.npz")) == ["origin", "spacing", "values"]
     np.savez("c.npz", values=pear(), direction=np.zeros(12))
-    with pytest.raises(GridError, match=r"c.npz\[direction\] has shape \(12,\).*: give nine numbers"):
+    with pytest.raises(GridError, match=r"direction\] has shape \(12,\).*: give nine num"):
         read_grid("c.npz")
 
 

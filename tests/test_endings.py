@@ -36,12 +36,12 @@ def run(*arguments, shell="", **options):
 # What stands in for a long step: it says that it is there, and waits for the signal.
 STAGE = """
 import sys, time
-from super_sdf import pipeline
+from super_sdf import convert
 from super_sdf.cli.main import main
 def wait(*_, **__):
     print("waiting", flush=True)
     time.sleep(600)
-pipeline.refine = wait
+convert.mesh_grid = wait
 main()
 """
 # The same in the midst of an import, by code that makes another error of what is raised in it.

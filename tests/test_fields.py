@@ -67,24 +67,6 @@ def same(one, other) -> bool:
     )
 
 
-@pytest.mark.parametrize("factor", [2, 4, 6])
-def test_positions_and_distances_are_those_of_a_plane(factor):
-    field = upsample(plane(), trilinear, factor)
-    points, distances = field.positions(), field.distances()
-    assert points.shape == (len(distances), 3) and distances.dtype == np.float64
-    assert np.abs(distances - to_plane(points)).max() < 1e-6
-    places = np.unique(np.rint(points / SPACING * factor * 2), axis=0)
-    assert len(places) == len(points)  # once each
-    assert (distances < 0).any() and (distances > 0).any()
-    some = slice(5, 9)
-    blocks = field.block_positions(some)
-    assert blocks.shape == (4, (factor + 1) ** 3, 3)
-    assert np.abs(field.block_distances(some) - to_plane(blocks)).max() < 1e-6
-    middle = plane().to_world(field.voxel_ijk[some])
-    assert np.abs(blocks.mean(1) - middle).max() < 1e-12  # a block lies round its sample
-    assert np.ptp(blocks[0], axis=0) == pytest.approx(SPACING)
-
-
 @pytest.mark.parametrize("name", GRIDS)
 @pytest.mark.parametrize("cap, mesher", [(False, "marching"), (True, "sharp")])
 def test_a_field_that_was_read_back_gives_the_same_mesh(name, cap, mesher):

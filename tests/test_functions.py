@@ -7,11 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from super_sdf import DistanceFunction, extract_mesh, make_grid, reconstruct, upsample
-from super_sdf.functions import function as functions
 from super_sdf.check.check import check_mesh
 from super_sdf.errors import GridError, OptionError, OptionTypeError
 from super_sdf.grid.near import sample_near
-from super_sdf.functions import zero
 
 H = 2 / 19
 BOX = (-1.0, 1.0)
@@ -89,51 +87,6 @@ def test_samples_near_the_surface_are_those_of_the_whole_lattice(seed):
     assert asked.evaluations == np.isfinite(near).sum()
 
 
-@pytest.mark.parametrize("spacing", [1, 0.5, 0.25])
-def test_a_solid_between_few_coarse_samples_is_found(spacing):
-    near, whole = (
-        DistanceFunction(lambda p: np.linalg.norm(p, axis=1) - 0.5).sample(BOX, spacing, reach)
-        for reach in (None, np.inf)
-    )
-    np.testing.assert_array_equal(near.values < 0, whole.values < 0)
-
-
-def test_balls_that_repeat_with_the_coarse_samples_are_found():
-    def balls(points):
-        return np.linalg.norm((points + 0.16) % 0.32 - 0.16, axis=1) - 0.06
-
-    near, whole = (
-        DistanceFunction(balls).sample((-0.8, 0.8), 0.04, reach) for reach in (None, np.inf)
-    )
-    np.testing.assert_array_equal(near.values < 0, whole.values < 0)
-
-
-def test_what_is_steeper_than_seen_is_found_if_nothing_else_is_there():
-    def speck(points):
-        return 0.5 - (np.linalg.norm(points - 0.1, axis=1) < 0.1)
-
-    assert (DistanceFunction(speck).sample(BOX, 0.04).values < 0).sum() == 56
-
-
-@pytest.mark.parametrize("reach", [0, -1, np.nan, "a"])
-def test_a_reach_is_a_distance(reach):
-    said = refusal(OptionError, DistanceFunction(torus).sample, BOX, H, reach)
-    assert said == f"reach is {reach!r}: give a number greater than 0, or infinity"
-
-
-def test_far_from_the_surface_few_points_are_asked():
-    asked = DistanceFunction(torus)
-    grid = asked.sample(BOX, 2 / 95)
-    assert asked.evaluations < 0.4 * 96**3
-    assert 0.99 * 8 / 95 < np.abs(grid.values).max() < 1.2 * 8 / 95
-    mesh, whole = (
-        reconstruct(DistanceFunction(torus).sample(BOX, 2 / 95, reach), trilinear)
-        for reach in (None, np.inf)
-    )
-    np.testing.assert_array_equal(mesh.faces, whole.faces)
-    np.testing.assert_array_equal(mesh.vertices, whole.vertices)
-
-
 def test_edges_and_corners_are_those_of_the_function():
     plain = reconstruct(DistanceFunction(block).sample(BOX, H))
     mesh = reconstruct(function=block, bounds=BOX, spacing=H)
@@ -201,56 +154,12 @@ def test_walls_that_nearly_touch_do_not_meet(name, far):
     assert off(function, mesh).mean() < 0.7 * off(function, plain).mean()
 
 
-def test_what_is_masked_is_unknown():
-    def masked(points):
-        far = torus(points) > 0.35
-        return np.ma.masked_array(np.where(far, -7.0, torus(points)), far)
-
-    mesh = reconstruct(None, trilinear, function=masked, bounds=BOX, spacing=H)
-    assert is_on(torus, mesh)
-
-
-def test_the_unit_is_that_of_the_grid():
-    grid = DistanceFunction(torus).sample(BOX, H)
-    for scale in (1000, -0.001):
-        mesh = reconstruct(grid, trilinear, function=lambda p, s=scale: s * torus(p), offset=0.05)
-        assert is_on(lambda points: torus(points) - 0.05, mesh)
-
-
 @pytest.mark.parametrize("sign", [1, -1])
 def test_an_offset_is_where_the_function_has_it(sign):
     mesh = reconstruct(
         None, trilinear, function=lambda p: sign * torus(p), bounds=BOX, spacing=H, offset=0.1
     )
     assert is_on(lambda points: torus(points) - 0.1, mesh)
-
-
-def test_on_the_border_vertices_stay():
-    def pillar(points):
-        return np.hypot(*points[:, :2].T) - 0.5
-
-    grid = DistanceFunction(pillar).sample(BOX, H)
-    plain = reconstruct(grid, trilinear)
-    mesh = reconstruct(grid, trilinear, function=pillar)
-    border = np.abs(plain.vertices[:, 2]) > 1 + H / 2 - H / 10
-    np.testing.assert_array_equal(mesh.vertices[border], plain.vertices[border])
-    inner = np.abs(plain.vertices[:, 2]) < 1
-    assert np.abs(pillar(mesh.vertices[inner])).max() < 3e-5
-    assert mesh.is_closed()
-
-
-def test_batches_do_not_change_the_mesh(monkeypatch):
-    most = []
-
-    def watched(points):
-        most.append(len(points))
-        return torus(points)
-
-    want = reconstruct(None, trilinear, function=torus, bounds=BOX, spacing=H)
-    monkeypatch.setattr(functions, "BATCH", 1000)
-    found = reconstruct(None, trilinear, function=watched, bounds=BOX, spacing=H)
-    np.testing.assert_array_equal(found.vertices, want.vertices)
-    assert max(most) == 1000
 
 
 class Tensor:
@@ -279,9 +188,6 @@ def test_tensors_are_taken():
     np.testing.assert_array_equal(grid.values, torus_samples())
 
 
-GRID = make_grid(torus_samples(), spacing=H)
-
-
 @pytest.mark.parametrize(
     ("arguments", "kind", "message"),
     [
@@ -290,25 +196,15 @@ GRID = make_grid(torus_samples(), spacing=H)
          "read_grid(path)"),
         ({"function": torus}, OptionError,
          "a function needs bounds and spacing, or a grid of its samples"),
-        ({"grid": GRID, "bounds": BOX}, OptionError,
-         "bounds and spacing are for a function without a grid: give that"),
         ({"function": torus, "bounds": (1, -1), "spacing": H}, OptionError,
          "bounds are (1, -1): the box is empty, give (lowest, highest)"),
-        ({"function": torus, "bounds": 3, "spacing": H}, OptionError,
-         "bounds are 3: give (lowest, highest), numbers or points"),
         ({"function": torus, "bounds": BOX, "spacing": 1e-4}, OptionError,
          "spacing is 0.0001: the box takes more than 2^31 samples"),
-        ({"function": torus, "bounds": BOX, "spacing": 0}, GridError,
-         "spacing is 0, 0, 0: it must be greater than 0"),
         ({"function": lambda p: p, "bounds": BOX, "spacing": H}, OptionTypeError,
          "the function returns an array of shape (162, 3) for 162 points: return one number for "
          "each"),
-        ({"function": lambda p: torus(p) + 1j, "bounds": BOX, "spacing": H}, OptionTypeError,
-         "the function returns array(["),
         ({"function": lambda p: np.full(len(p), np.nan), "bounds": BOX, "spacing": H}, GridError,
          "the function has no finite value at any sample: give other bounds"),
-        ({"function": lambda p: None, "bounds": BOX, "spacing": H}, OptionTypeError,
-         "the function returns None: return numbers"),
         ({"function": lambda p: np.tanh(8 * torus(p)), "bounds": BOX, "spacing": H, "offset": 0.01},
          OptionError, "offset is 0.01: the function is no distance, leave it out"),
         ({"function": lambda p: p[:, 0] + 9, "bounds": BOX, "spacing": H}, GridError,
@@ -321,41 +217,8 @@ def test_errors(arguments, kind, message):
     assert said.startswith(message), said
 
 
-def test_a_vertex_that_finds_no_surface_stays():
-    grid = DistanceFunction(torus).sample(BOX, H)
-    plain = reconstruct(grid, trilinear)
-    far = reconstruct(grid, trilinear, function=lambda p: torus(p) + np.sign(torus(p)))
-    np.testing.assert_array_equal(far.vertices, plain.vertices)
-    nan = reconstruct(grid, trilinear, function=lambda p: np.full(len(p), np.nan))
-    np.testing.assert_array_equal(nan.vertices, plain.vertices)
-
-
 def test_a_function_of_another_grid_is_refused():
     grid = DistanceFunction(torus).sample(BOX, H)
     said = refusal(OptionError, reconstruct, grid, trilinear, function=block)
     assert said.startswith("function has another side than the grid at ")
     assert said.endswith("give the function that the grid has samples of")
-
-
-def test_what_would_fold_goes_back():
-    """Of a flat patch, a vertex pushed across the opposite edge turns a triangle over."""
-    flat = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])
-    faces = np.array([[0, 1, 2], [1, 3, 2]])
-    moved = flat.copy()
-    moved[3] = 0.3, 0.3, 0
-    moved[0] = -0.1, 0, 0.05
-    found = zero.without_folds(moved, flat, faces, lambda points: points)
-    np.testing.assert_allclose(found[3], [0.65, 0.65, 0])  # half of the way does
-    np.testing.assert_array_equal(found[0], moved[0])
-
-
-def test_steps_down_go_round_an_edge():
-    """Of a maximum of planes, the gradient is that of one plane at a time."""
-
-    def ridge(points):
-        return np.maximum(points[:, 0], points[:, 1])
-
-    start = np.array([[0.3, 0.1, 0.0]])
-    at, now = zero.step_down(ridge, start, ridge(start))
-    np.testing.assert_allclose(at[0], 0, atol=1e-9)
-    assert now == pytest.approx(0, abs=1e-9)

@@ -11,10 +11,8 @@ import pyvista
 from conftest import refusal, trilinear
 from vtkmodules.vtkCommonDataModel import vtkImageData
 
-from super_sdf.functions import pyvista as _accessor
 from super_sdf import grid_from_image, load_network, read_grid, reconstruct
 from super_sdf.errors import GridError, OptionError, OptionTypeError
-from super_sdf.truth.mesh_files import read_mesh
 
 ROOT = Path(__file__).parent.parent
 SIZES = 20, 22, 24
@@ -68,17 +66,6 @@ def test_the_surface_is_the_one_of_the_file(direction, where, folder):
     assert np.array_equal(surface.regular_faces, mesh.faces)
 
 
-def test_the_surface_is_the_one_of_the_command(folder, command):
-    image, _ = sphere("turned")
-    image.save("image.vti")
-    given = {"factor": 2, "offset": 0.6, "scale": 1.0, "field": "exact"}
-    words = [f"--{name}={value}" for name, value in given.items()]
-    assert command("upsample", "image.vti", "mesh.ply", *words)[0] == 0
-    mesh, surface = read_mesh("mesh.ply"), image.super_sdf.contour(**given)
-    assert surface.points.tobytes() == mesh.vertices.astype(surface.points.dtype).tobytes()
-    assert np.array_equal(surface.regular_faces, mesh.faces)
-
-
 def test_where_the_solid_runs_out_of_the_image_the_surface_is_closed_unless_left_open():
     image, _ = sphere()
     half = image.extract_subset((0, 19, 0, 21, 0, 10))
@@ -121,17 +108,6 @@ def plain(**arrays: np.ndarray) -> vtkImageData:
         array = pyvista.convert_array(values, name=name)
         image.GetPointData().AddArray(array)
     return image
-
-
-def test_image_data_of_vtk_is_taken_too():
-    image, _ = sphere()
-    values = np.asarray(image.point_data["distance"])
-    bare, several = plain(distance=values), plain(a=values, b=values)
-    assert np.array_equal(grid_from_image(bare).values, image.super_sdf.grid().values)
-    assert refusal(GridError, grid_from_image, several) == (
-        "the image holds several arrays, a, b: give scalars='a', say"
-    )
-    assert grid_from_image(several, "b").shape == SIZES
 
 
 OF_NO_SAMPLES = {

@@ -172,17 +172,6 @@ def test_truncated_fields_are_closed(limit, error):
     assert mesh.is_closed() and mesh.volume() == pytest.approx(4 / 3 * np.pi * 6**3, rel=error)
 
 
-def test_exact_zeros_survive_merging_by_position():
-    """Many programs merge coincident vertices; this cube's faces run through nodes."""
-    import trimesh
-
-    values = (np.abs(np.indices((14, 14, 14)) - 6).max(0) - 3.0).astype(np.float32)
-    mesh = reconstruct(SdfGrid.trusted(values, (0.1, 0.1, 0.1)), trilinear)
-    merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
-    assert len(merged.vertices) == len(mesh.vertices)
-    assert merged.is_watertight and merged.volume == pytest.approx(0.6**3, rel=2e-3)
-
-
 def test_far_from_the_origin_vertices_are_double():
     grid = ball()
     field = upsample(grid, trilinear)

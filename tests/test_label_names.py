@@ -10,7 +10,7 @@ import trimesh
 from conftest import refusal
 
 from super_sdf.errors import FileError
-from super_sdf.labels.names import LabelName, in_file_name, numbers_of, read_names
+from super_sdf.labels.names import LabelName, read_names
 
 TABLES = {
     "slicer.ctbl": "# Color table file\n0 Background 0 0 0 0\n1 liver 221 130 101 255\n"
@@ -67,26 +67,6 @@ def test_what_is_no_table(name, content, message):
     Path(name).write_bytes(content if isinstance(content, bytes) else content.encode())
     assert refusal(FileError, read_names, name).startswith(message)
     assert refusal(FileError, read_names, "none.txt") == "none.txt does not exist"
-
-
-def test_names_become_numbers_and_file_names():
-    names = {1: LIVER, 5: KIDNEY}
-    assert numbers_of("all", names) == "all" and numbers_of([5, "liver"], names) == [5, 1]
-    assert in_file_name("left kidney/../(2)") == "left_kidney_.._2"
-    assert in_file_name("..") == "label" and in_file_name("Leber, groß") == "Leber_groß"
-
-
-def test_long_names_of_any_letters_fit_into_a_glb(command, image):
-    letters = "\U0001f600" * 80
-    Path("long.csv").write_text(f"1,{letters},1,2,3\n5,{letters}!,4,5,6\n", encoding="utf-8")
-    convert(command, image, "o.glb", "all", "--names", "long.csv")
-    parts = trimesh.load("o.glb").geometry
-    assert sorted(map(len, parts)) == [82, 82]  # " 1" and " 5"
-    convert(command, image, "o.stl", "all", "--names", "long.csv")
-    Path("empty.txt").write_text('1 255 0 0 1 1 1 "liver"\n5 0 255 0 1 1 1 ""\n')
-    assert read_names("empty.txt") == {1: LabelName("liver", (255, 0, 0))}
-    Path("empty.csv").write_text("1,liver\n5,,4,5,6\n")
-    assert read_names("empty.csv") == {1: LabelName("liver")}
 
 
 @pytest.fixture

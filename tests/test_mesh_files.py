@@ -12,11 +12,11 @@ from conftest import ball, refusal, trilinear
 
 from super_sdf import Mesh, reconstruct, write_mesh
 from super_sdf.convert import convert
-from super_sdf.options import Options
 from super_sdf.errors import FileError, GridError, OptionError
 from super_sdf.files import mesh_writers
 from super_sdf.files.mesh_writers import World
 from super_sdf.files.meshes import MESH_SUFFIXES, write_meshes
+from super_sdf.options import Options
 
 OPTIONS = Options(4, inside="negative")
 
@@ -127,19 +127,6 @@ def test_what_cannot_be_held_is_named_with_the_figures():
     said = refusal(GridError, convert, "in.npz", "out.ply", trilinear, OPTIONS)
     assert said.startswith("the grid reaches to 1e+17, too far from the origin for its spacing, 1:")
     assert os.listdir() == ["in.npz"]
-
-
-def test_glb_says_from_where_it_counts():
-    place(0.1, 5.4e6)
-    done = convert("in.npz", "out.glb", trilinear, OPTIONS)
-    assert done.notes[-1].startswith(
-        "out.glb has single precision: its vertices are relative to 5400000.56"
-    )
-    convert("in.npz", "out.ply", trilinear, OPTIONS)
-    np.testing.assert_allclose(read("out.glb").volume(), read("out.ply").volume(), rtol=1e-5)
-    np.testing.assert_allclose(
-        *[trimesh.load(f"out{s}").bounds for s in (".glb", ".ply")], rtol=1e-12
-    )
 
 
 def test_a_mesh_that_its_format_would_flatten_is_refused(mesh):

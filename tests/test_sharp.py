@@ -14,7 +14,6 @@ from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruc
 from super_sdf.check.samples import self_intersections
 from super_sdf.surface.sharp import features
 from super_sdf.surface.sharp.folds import intersecting, without_folds
-from super_sdf.surface.sharp.patches import Patches, Placed, triangles_of, unfolded
 from super_sdf.truth.mesh_files import read_mesh
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
@@ -192,38 +191,3 @@ def test_which_triangles_intersect(corners, want):
     second = np.array([[0 if not any(corners[0]) else 3, 4, 5]])
     for pair in ((np.array([[0, 1, 2]]), second), (second, np.array([[0, 1, 2]]))):
         assert len(intersecting(points, *pair)[0]) == want
-
-
-# Fans round the vertices of features, on two squares in a plane.
-SQUARES = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0, 0], [2, 1, 0]], float)
-
-
-def fans(loops, peaks):
-    """Return patches with four crossings each, and vertices on the squares, which face upwards."""
-    zeros, four = np.zeros(len(loops), np.int64), np.full(len(loops), 4)
-    patches = Patches(zeros, zeros, np.zeros((len(loops), 3)), zeros, four, np.array(loops))
-    upwards = np.tile([0.0, 0.0, 1.0], (len(SQUARES), 1))
-    return patches, Placed(SQUARES, upwards, np.arange(len(peaks)), np.array(peaks, float))
-
-
-@pytest.mark.parametrize(
-    ("peak", "want"),
-    [
-        ([0.9, 0.2, 0], [0.9, 0.2, 0]),
-        ([0.9, 0.2, 5], [0.9, 0.2, 5]),
-        ([2.5, 0.5, 0], [1.5, 0.5, 0]),
-    ],
-)
-def test_a_vertex_beyond_a_side_of_its_fan_goes_half_way_to_the_middle(peak, want):
-    """One over its patch stays."""
-    np.testing.assert_allclose(unfolded(*fans([[0, 1, 2, 3]], [peak])).peak, [want])
-
-
-@pytest.mark.parametrize("height, is_turned", [(0.5, True), (2, False)])
-def test_the_side_of_two_fans_joins_their_vertices_where_that_does_not_fold(height, is_turned):
-    two = fans([[0, 1, 2, 3], [1, 4, 5, 2]], [[0.5, 0.5, 0], [1.5, height, 0]])
-    _, triangles = triangles_of(*two, np.ones(2, bool))
-    edges = {(int(t[k]), int(t[k - 2])) for t in triangles for k in range(3)}
-    turned, kept = {(6, 7), (7, 6)}, {(1, 2), (2, 1)}
-    there, absent = (turned, kept) if is_turned else (kept, turned)
-    assert there <= edges and not absent & edges

@@ -18,8 +18,8 @@ ROOMS = [
     "batch",
     "pages",
     "convert",
-    "labels simplify check",
     "functions.pyvista",
+    "labels simplify check",
     "pipeline",
     "tiles",
     "functions",
@@ -178,7 +178,9 @@ def test_what_every_conversion_needs_is_few_packages(module):
     assert not others or is_extra or module in ("batch.cluster", "functions.pyvista")
 
 
-@pytest.mark.parametrize("room", sorted({room_of(m) for m in MODULES if "." in m} - {"functions.pyvista"}))
+@pytest.mark.parametrize(
+    "room", sorted({room_of(m) for m in MODULES if "." in m} - {"functions.pyvista"})
+)
 def test_every_room_says_what_lives_there(room):
     assert ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text()))
 

@@ -11,7 +11,6 @@ import pytest
 import pyvista
 from vtkmodules.vtkCommonDataModel import vtkPolyData
 
-from super_sdf.functions import pyvista as _accessor
 from super_sdf import read_grid, reconstruct
 from super_sdf.truth.mesh_files import read_mesh
 
@@ -49,13 +48,6 @@ def test_the_programmable_filter_makes_the_mesh_of_the_library(field, mesh):
     assert np.array_equal(surface.regular_faces, mesh.faces)
 
 
-def test_the_filter_takes_another_factor_and_mesher(field):
-    fill, made = recipe("paraview_filter")["fill_surface"], vtkPolyData()
-    fill(pyvista.read(field), made, "distance", 2, mesher="sharp")
-    sharp = reconstruct(read_grid(field), factor=2, mesher="sharp")
-    assert pyvista.wrap(made).points.tobytes() == sharp.vertices.tobytes()
-
-
 def test_blender_gets_the_same_mesh_from_the_library_and_from_the_command(
     field, mesh, tmp_path, monkeypatch
 ):
@@ -71,12 +63,6 @@ def test_blender_gets_the_same_mesh_from_the_library_and_from_the_command(
         recipes["run_command"](tmp_path / "none.npz", tmp_path / "none.ply")
 
 
-@pytest.mark.parametrize("name", ["paraview_render", "blender_import"])
-def test_a_recipe_loads_its_program_only_to_use_it(name):
-    assert callable(recipe(name)["main"])
-    assert not {"bpy", "paraview"} & set(sys.modules)
-
-
 def test_the_python_on_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with_pyvista, with_xarray = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)
@@ -87,9 +73,3 @@ def test_the_python_on_the_page_runs(tmp_path, monkeypatch):
     exec(compile(with_xarray, "tools.md", "exec"), names)
     points = names["mesh"].vertices - (12, 0, 0)
     assert np.abs(np.linalg.norm(points, axis=1) - 1.5).max() < 0.02
-
-
-def test_what_the_page_names_is_there():
-    for path in re.findall(r"\]\(([^)#]+)\)", PAGE):
-        assert (ROOT / "docs" / "guides" / path).exists(), path
-    assert {path.name for path in TOOLS.glob("*.py")} <= set(re.findall(r"\w+\.py", PAGE))

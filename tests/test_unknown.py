@@ -15,7 +15,6 @@ from trimesh import grouping
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.errors import GridError
 from super_sdf.grid.census import Census
-from super_sdf.surface.mesh import join_meshes
 from super_sdf.options import FIELDS
 
 FACES = ndimage.generate_binary_structure(3, 1)

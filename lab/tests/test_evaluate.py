@@ -1,34 +1,27 @@
-"""The evaluation as a whole: kept rows, processes that die, reports that come out the same."""
+"""The evaluation as a whole: kept rows, reports that come out the same, figures as measured."""
 
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from processes import wait_for_lines
 from solids import cube, saved, sphere, torus
 
-from lab import evaluate, measuring, processes, runner, tables
+from lab import costs, documents, quoted, tables
 from lab.__main__ import main as lab
-from lab.evaluate import Results
-from lab.measuring import Task
+from lab.documents import rendered
 from lab.rows import Rows
-from lab.runner import LeftOut, complete, worker
-from lab.shapes import Setting, find_meshes, spread
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.errors import FileError
-from super_sdf.network.network import KIND_MODELS, shipped_models
 
 ROOT = Path(__file__).parents[2]
-TIMES = ("seconds", "peak_mb")
-FAST = ("--methods", "mc", "ours", "--model", "fast", "--jobs", 0)
+MACHINE = {
+    "processor": "a processor", "cores": 2, "instructions": ["avx2"], "system": "Linux",
+    "python": "3.11", "numpy": "2", "onnxruntime": "1.32",
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -56,42 +49,15 @@ def command(capsys, monkeypatch):
     return run
 
 
-def task_of(path: Path, methods: tuple[str, ...] = ("mc",), **options) -> Task:
-    return Task(path, Setting(8), methods, **options)
-
-
-def quality_of(out: Path) -> dict[str, dict]:
-    """Return the figures of each row but for times."""
-    rows = [json.loads(line) for line in (out / "results.jsonl").read_text().splitlines()]
-    return {
-        json.dumps(row["key"]): {name: v for name, v in row.items() if name not in TIMES}
-        for row in rows
-    }
-
-
 def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path, command):
-    (meshes / "ring.ply").unlink()
-    words = ["evaluate", meshes, "--sizes", 8, "--methods", "mc", "--jobs", 1]
-    words += ["--no-pictures", "--out"]
+    words = ["evaluate", meshes, "--sizes", 8, "--methods", "mc", "--jobs", 0, "--out"]
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert command(*words, whole)[0] == 0
-    child = subprocess.Popen(
-        [sys.executable, "-m", "lab", *map(str, words), str(cut)],
-        cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    store = cut / "results.jsonl"
-    wait_for_lines(child, store)
-    child.kill()
-    child.wait()
-    with store.open("a") as file:
-        file.write('{"key": "torn')  # as if killed while writing
-    assert len(store.read_text().splitlines()) < len(quality_of(whole)) + 1
+    lines = (whole / "results.jsonl").read_text().splitlines(keepends=True)
+    cut.mkdir()
+    (cut / "results.jsonl").write_text(lines[0] + '{"key": "torn\n')  # killed while writing
     assert command(*words, cut)[0] == 0
-    store.write_text(store.read_text().replace('{"key": "torn\n', ""))
-    assert quality_of(cut) == quality_of(whole)
-    texts = [(out / "report.md").read_text().split("## Time")[0] for out in (cut, whole)]
-    assert texts[0] == texts[1]
-    assert (cut / "plots" / "resolution.png").stat().st_size > 5000
+    assert (cut / "report.md").read_text() == (whole / "report.md").read_text()
     code, _, err = command(*words, cut)
     assert (code, err) == (0, "")  # nothing is left to measure
 
@@ -99,89 +65,13 @@ def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path,
 def test_a_bad_shape_is_named_and_the_others_are_measured(meshes, tmp_path, command):
     saved(Mesh(cube().vertices, cube().faces[1:]), meshes / "lidless.ply")
     (meshes / "junk.stl").write_text("junk")
-    out = tmp_path / "out"
-    words = (*FAST, "--no-pictures", "--turned", 5, "--out", out)
-    code, _, err = command("evaluate", meshes, "--sizes", 8, *words)
+    fast = ("--methods", "mc", "ours", "--model", "fast", "--jobs", 2, "--turned", 5)
+    code, _, err = command("evaluate", meshes, "--sizes", 8, *fast, "--out", tmp_path / "out")
     assert code == 1
     assert "Left out: lidless: " in err and "is open: 3 edges" in err and "out: junk: " in err
-    text = (out / "report.md").read_text()
+    text = (tmp_path / "out" / "report.md").read_text()
     assert "# Quality of super-sdf on 3 shapes" in text and "Left out, lidless: " in text
-    assert "| super-sdf |" in text and "3 of 3" in text
-    assert "turned at random, by seed 5" in text
-
-
-@pytest.mark.graphics
-def test_pictures_of_the_best_and_worst(meshes, tmp_path, command):
-    out = tmp_path / "out"
-    assert command("evaluate", meshes, "--sizes", 8, *FAST, "--out", out)[0] == 0
-    lines = (out / "report.md").read_text().splitlines()
-    shown = [line for line in lines if "](pictures/" in line]
-    assert len(shown) == 3 and "## 3 of 3 shapes at 8^3, best and worst" in "\n".join(lines)
-    assert all((out / line.split("(")[1][:-1]).exists() for line in shown)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--sizes", 3), "size is 3: give at least 4 samples along an axis"),
-        (("--turned", -1), "turned is -1: give a seed of 0 or more"),
-        (("--factor", 3), "factor is 3"),
-    ],
-)
-def test_options_out_of_range_are_refused_in_a_line(meshes, tmp_path, command, words, said):
-    code, _, err = command("evaluate", meshes, "--out", tmp_path / "out", *words)
-    assert code == 2 and err.startswith(f"Error: {said}") and err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_folder_that_no_evaluation_made_is_refused(meshes, tmp_path, command):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "mine.md").write_text("mine")
-    code, _, err = command("evaluate", meshes, "--out", out)
-    assert code == 1 and err.count("\n") == 1
-    assert err.startswith(f"Error: {out} holds 'mine.md' and no results.jsonl, so no evaluation ")
-    assert command("nothing")[0] == 2 and "Usage" in command("--help")[1]
-
-
-def test_shapes_are_found_by_name(meshes, tmp_path):
-    paths = find_meshes([meshes])
-    assert [path.stem for path in paths] == ["ball", "box", "ring"]
-    assert [path.stem for path in spread(paths, 2)] == ["ball", "box"]
-    with pytest.raises(FileError, match="two meshes are named 'box'"):
-        find_meshes([meshes, meshes / "box.ply"])
-    with pytest.raises(FileError, match="holds no mesh: give"):
-        find_meshes([tmp_path])
-    os.mkfifo(meshes / "pipe.ply")
-    with pytest.raises(FileError, match="is a named pipe: give a file"):
-        find_meshes([meshes])
-
-
-def test_a_row_of_another_mesh_network_or_setting_is_another_row(meshes, tmp_path):
-    task, rows = task_of(meshes / "box.ply"), Rows(tmp_path / "rows.jsonl")
-    rows.add(task.key("ours"), {"f1": 0.5, "error": None})
-    with (tmp_path / "rows.jsonl").open("a") as file:
-        file.write('{"key": {"sha')
-    rows = Rows(tmp_path / "rows.jsonl")
-    assert rows.get(task.key("ours"))["f1"] == 0.5 and rows.is_final(task.key("ours"))
-    for change in ({"path": meshes / "ball.ply"}, {"model": "fast"}, {"precision": "float32"},
-                   {"turned": 0}, {"setting": Setting(8, noise=0.5)}):  # fmt: skip
-        assert rows.get(replace(task, **change).key("ours")) is None
-    assert task.key("ours@fast")["digest"] == replace(task, model="fast").key("ours")["digest"]
-    assert task.key("mc") == replace(task, model="fast").key("mc")  # not made by our code
-    own = ("ours on mask", "spline-coarsest on spacing 1:1:5, x", "bound-sharp", "ours/4")
-    others = ("mc on mask", "mc-gaussian-0.5 on mask", "bspline on exact", "bound", "floor")
-    assert list(map(measuring.is_of_our_code, own + others)) == [True] * 4 + [False] * 5
-
-
-@pytest.mark.parametrize("name", KIND_MODELS)
-def test_rows_are_measured_again_with_another_network_for_a_kind(name, tmp_path, monkeypatch):
-    files, digest = shipped_models(), measuring.digest_of_ours.__wrapped__
-    before = digest("fast")
-    other = tmp_path / "other.onnx"
-    other.write_bytes(files[name].read_bytes() + b"0")
-    monkeypatch.setattr(measuring, "shipped_models", lambda: {**files, name: other})
-    assert digest("fast") != before
+    assert "| super-sdf |" in text and "3 of 3" in text and "at random, by seed 5" in text
 
 
 def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
@@ -190,104 +80,74 @@ def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
     assert not rows.is_final(key)
     rows.add(key, {"error": "over the limit of 10 s", "limit": 10.0})
     assert rows.is_final(key, 10.0) and not rows.is_final(key, 20.0)
-
-
-def dies_of(task: Task) -> dict:
-    """Stand in for ``measured``: the method ours kills its process, bound takes its time."""
-    if "ours" in task.methods:
-        os.kill(os.getpid(), signal.SIGKILL)
-    if "bound" in task.methods:
-        time.sleep(60)
-    return {method: {"error": None} for method in task.methods}
-
-
-def stand_in():
-    """Put ``dies_of`` in place, in a worker process."""
-    runner.measured = dies_of
-    return worker()
-
-
-def test_a_process_that_dies_fails_one_method_and_the_rest_go_on(meshes, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "worker", stand_in)
-    several = ("mc", "ours", "bspline"), ("trilinear",)
-    tasks = [task_of(meshes / "box.ply", methods) for methods in several]
-    rows, seen = Rows(tmp_path / "rows.jsonl"), []
-    assert complete(tasks, rows, 1, lambda *step: seen.append(step)) == []
-    errors = {m: rows.get(task.key(m))["error"] for task in tasks for m in task.methods}
-    killed = "its process was killed by SIGKILL (most likely out of memory)"
-    assert errors == {"mc": None, "ours": killed, "bspline": None, "trilinear": None}
-    assert seen == [(number, 4, "box") for number in range(1, 5)]
-
-
-def test_as_many_triangles_as_a_method_that_was_measured_before(meshes, tmp_path):
-    rows, methods = Rows(tmp_path / "rows.jsonl"), ("mc", "ours/mc")
-    for some in (methods[:1], methods):
-        task = task_of(meshes / "box.ply", some)
-        assert complete([task], rows, 0) == []
-    measured = [rows.get(task.key(method)) for method in methods]
-    assert measured[1]["error"] is None and measured[1]["faces"] <= measured[0]["faces"]
-
-
-def test_a_process_over_its_limit_is_ended(meshes, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "worker", stand_in)
-    task, rows = task_of(meshes / "box.ply", ("bound", "mc"), limit=0.5), Rows(tmp_path / "rows")
-    assert complete([task], rows, 1) == []
-    for method in task.methods:
-        row = rows.get(task.key(method))
-        assert row["error"] == "over the limit of 0.5 s" and row["limit"] == 0.5
-        assert "f1" not in row  # a failure is no score
-
-
-def row(shape: str, f1: float, **more) -> dict:
-    """Return a row that is made up."""
-    keys = [column.key for column in tables.BY_KEY.values()]
-    figures = {**dict.fromkeys(keys, 0.001), "f1": f1, "closed": True, "outward": True, "faces": 4}
-    return {"shape": shape, **figures, "error": None, "notes": [], **more}
-
-
-def test_a_shape_that_failed_in_a_setting_is_left_out_for_all_methods(meshes, tmp_path):
-    rows, like = Rows(tmp_path / "rows.jsonl"), task_of(meshes / "box.ply", ("mc", "ours"))
-    tasks = evaluate.tasks_of(find_meshes([meshes]), [Setting(8)], like)
-    for task in tasks:
-        for method in task.methods:
-            rows.add(task.key(method), row(task.path.stem, 0.5, cd=0.25))
-    rows.add(tasks[-1].key("ours"), {"error": "out of memory"})
-    results = Results(tasks, rows, [LeftOut("lost", "it is")])
-    assert results.left_out == [
-        LeftOut("lost", "it is"),
-        LeftOut("ring", "ours (8^3, factor 4): out of memory"),
-    ]
-    found = results.by_method(Setting(8), ("mc", "ours", "floor"))
-    shapes = {name: [each["shape"] for each in some] for name, some in found.items()}
-    assert shapes == {name: ["ball", "box"] for name in ("mc", "ours", "floor")}
-    assert found["ours"][0]["excess_cd"] == 0 and len(results.floors) == 3
-
-
-def test_tables_show_means_gaps_and_what_has_no_surface():
-    by_method = {
-        "bspline": [row("a", 0.5), row("b", 0.7)],
-        "ours": [row("a", 0.8), row("b", 0.6)],
-        "bound": [row("a", 1.0), row("b", 0.8)],
-        "mc": [row("a", 0.5), row("b", 0.0, faces=0, closed=False, efv=None)],
-    }
-    halves = {"all": ["a", "b"], "choose": ["b"], "final": []}
-    wins, gaps = evaluate.comparisons(by_method, halves)
-    assert wins == "super-sdf beats B-spline in F1 on 1 of 2. Not on: b (0.600, B-spline 0.700)."
-    assert "| all (2) | 0.7, 33.3 % |" in gaps and "| choose (1) | 0.6, -100.0 % |" in gaps
-    assert "final" not in gaps
-    lines = tables.surface_table([{"method": "mc", **tables.summary(by_method["mc"])}], 32)
-    mine = next(line for line in lines.splitlines() if line.startswith("| MC |"))
-    assert "| 0.250 |" in mine and mine.endswith("| 1 of 2 |")
-    assert "*PoNQ, published, Thingi30*" in lines
-    assert evaluate.odd_meshes(by_method) == ["No surface (a dot stands in), MC: b."]
-    label = tables.label_of("ours-marching/4@base:float32")
-    assert label == "super-sdf, marching, base, float32, 1/4"
+    assert Rows(tmp_path / "rows.jsonl").get(key) == rows.get(key)
 
 
 def test_a_process_is_timed(tmp_path):
-    grid = processes.write_torus(tmp_path / "torus.npy", 12)
-    taken = processes.run_python(processes.upsample_words(grid, "--spacing", "0.0833"))
-    assert taken.seconds > 0.05 and 20 < taken.peak_mb < 2000 and not taken.code
+    grid = costs.write_torus(tmp_path / "torus.npy", 12)
+    seconds, peak, _ = costs.run_python(costs.upsample_words(grid, "--spacing", "0.0833"))
+    assert seconds > 0.05 and 20 < peak < 2000
     with pytest.raises(SuperSdfError, match=r"upsample none\.npz .* ended with 1: Error: none"):
-        processes.run_python(processes.upsample_words(Path("none.npz")))
-    assert processes.run_python(["-c", "print('hi')"]).printed == "hi"
+        costs.run_python(costs.upsample_words(Path("none.npz")))
+
+
+def test_random_fields_are_closed_manifolds(command):
+    assert command("fields", "--count", 28) == (0, "28 fields, 0 faults\n", "\n")
+
+
+@pytest.fixture
+def speeds(tmp_path):
+    """A folder with figures of speed."""
+    rows = [
+        {"size": 32, "option": "default", "seconds": 0.5, "peak_mb": 100.0},
+        {"size": 64, "option": "default", "seconds": 1.0, "peak_mb": 1234.0},
+        {"size": 64, "option": "scipy", "seconds": 16.2, "peak_mb": 400.0},
+    ]
+    content = {"name": "speed", "networks": {"base": "0123"}, "commit": "abc", "rows": rows}
+    content |= {"machine": MACHINE, "date": "2026-01-01"}
+    (tmp_path / "speed.json").write_text(json.dumps(content))
+    return tmp_path
+
+
+def test_tables_and_numbers_stand_where_they_are_marked(speeds):
+    text = "a\n<!-- figures: speed.process -->\nold\n<!-- /figures -->\nb"
+    table = ["|  | 32^3 | 64^3 |", "| --- | ---: | ---: |", "| default | 0.50 | 1.00 |"]
+    assert rendered(text, speeds).splitlines()[3:6] == table
+    assert rendered(rendered(text, speeds), speeds) == rendered(text, speeds)
+    for marker, shown in {
+        "speed.seconds 32 default": "0.50",
+        "speed.seconds 64 scipy over 64 default": "16",
+    }.items():
+        line = f"it is <!-- figures: {marker} -->?<!-- /figures --> so"
+        assert rendered(line, speeds) == line.replace("?", shown)
+    assert "2 cores of a processor (avx2)" in quoted.shown("speed.about", speeds)
+    for marker, said in {
+        "spead.process": "there is no figure 'spead'",
+        "speed.procss": "there is no table 'speed.procss'",
+        "speed.scnds 32": "there is no column 'scnds'",
+        "speed.seconds 33 default": "no row has 33 default",
+    }.items():
+        with pytest.raises(FileError, match=said):
+            rendered(f"<!-- figures: {marker} -->x<!-- /figures -->", speeds)
+
+
+def test_documents_show_what_was_measured():
+    texts = {path: path.read_text(encoding="utf-8") for path in documents.documents()}
+    differ = [path.name for path, text in texts.items() if rendered(text) != text]
+    assert not differ, "run python -m lab documents"
+
+
+def test_figures_are_measured_kept_and_printed(meshes, tmp_path, command):
+    out = tmp_path / "out"
+    words = ["figures", "--shapes", meshes, "--parts", meshes, "--sizes", 8, "--jobs", 0]
+    code, printed, _ = command(*words, "--only", "simplify", "--out", out)
+    assert code == 0
+    assert "simplify.table" in printed and "| CAD parts, marching | CAD parts, sharp |" in printed
+    content = quoted.read(out / "simplify.json")
+    assert len(content["rows"]) == 8 and content["networks"].keys() == {"base"}
+    assert tables.label_of("ours/4@base:float32") == "super-sdf, base, float32, 1/4"
+
+
+def test_the_commands_are_listed():
+    done = subprocess.run([sys.executable, "-m", "lab"], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0 and "evaluate" in done.stdout

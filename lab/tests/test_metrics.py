@@ -42,15 +42,6 @@ def test_two_samplings_of_a_square_show_the_floor() -> None:
     assert figures["nc"] == figures["signed_nc"] == pytest.approx(1)
 
 
-def test_samples_are_uniform_in_area_and_lie_on_the_surface() -> None:
-    stretched = Mesh(cube().vertices * [1, 2, 3], cube().faces)  # faces of 2, 3 and 6
-    drawn = metrics.sample_surface(stretched, (7, 0))
-    shares = np.abs(drawn.normals).mean(0)
-    np.testing.assert_allclose(shares, np.array([6, 3, 2]) / 11, atol=0.01)
-    assert metrics.distance_or_dot(Solid(stretched), drawn.points).max() < 1e-12
-    np.testing.assert_allclose(drawn.points.mean(0), 0, atol=0.01)
-
-
 @pytest.mark.parametrize("gap", [0.002, 0.004, 0.25])
 def test_parallel_planes(gap: float) -> None:
     low, high = square(), square(gap)
@@ -63,14 +54,6 @@ def test_parallel_planes(gap: float) -> None:
     # Within 0.003 are the points of a disc whose radius is what the gap leaves.
     disc = max(metrics.F1_DISTANCE**2 - gap**2, 0)
     assert sampled["f1"] == pytest.approx(1 - np.exp(-N * np.pi * disc), abs=0.005)
-
-
-def test_a_shape_inside_out_has_opposite_normals() -> None:
-    outside = metrics.sample_surface(sphere(), (7, 0))
-    inside = metrics.sample_surface(inverted(sphere()), (7, 0))
-    figures = metrics.compare_samples(outside, inside)
-    assert figures["nc"] == pytest.approx(1, abs=0.001)
-    assert figures["signed_nc"] == pytest.approx(-1, abs=0.001)
 
 
 def test_an_empty_result_is_a_dot_at_the_origin() -> None:
@@ -124,24 +107,6 @@ def test_the_sharp_edges_of_a_cube() -> None:
     assert edges.compare_edges(sharp, np.zeros((0, 3)))["ef1"] == 0
 
 
-def test_a_smooth_shape_has_no_edge_to_compare() -> None:
-    ball = sphere()
-    sharp = EdgeCurves.of(ball, SEED)
-    near = edges.edge_points(metrics.sample_surface(ball, SEED))
-    assert len(sharp.edges) == len(sharp.drawn) == len(near) == 0
-    assert edges.compare_edges(sharp, near) == {"ecd": None, "ef1": None}
-    assert in_voxels(ball, ball) == {"efv": None, "edge_distance": None}
-    assert angles_of(ball, ball) == (None, pytest.approx(0, abs=1e-5))
-
-
-def test_the_result_itself_scores_full_marks_on_any_grid() -> None:
-    """Unlike EF1, whose edge points lie beside the edges, EFv has no floor."""
-    figures = in_voxels(cube(), cube())
-    assert figures == {"efv": 1.0, "edge_distance": pytest.approx(0, abs=1e-12)}
-    near, beyond = angles_of(cube(), cube())
-    assert near == pytest.approx(0, abs=1e-5) and beyond == pytest.approx(0, abs=1e-5)
-
-
 @pytest.mark.parametrize(("share", "efv"), [(0.09, 1.0), (0.2, 1 / 3)])
 def test_a_shift_moves_the_edges_across_it(share: float, efv: float) -> None:
     """Those along the shift, a third, stay where they are, but for their ends."""
@@ -164,28 +129,12 @@ def test_a_chamfer_cuts_an_edge_off_by_its_width_over_root_2(cut: float) -> None
     assert figures["efv"] == pytest.approx(expected, abs=0.01)
 
 
-@pytest.mark.parametrize("degrees", [10.0, 170.0])
-def test_the_angle_of_a_tilted_square(degrees: float) -> None:
-    """A square has no edge between two faces, so all of it is beyond."""
-    angle = np.radians(degrees)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    turn = np.array([[cosine, 0, -sine], [0, 1, 0], [sine, 0, cosine]])
-    tilted = Mesh(square().vertices @ turn.T, square().faces)
-    assert angles_of(square(), tilted) == (None, pytest.approx(degrees, abs=1e-4))
-
-
 def test_a_result_without_a_surface_is_the_worst() -> None:
     assert in_voxels(cube(), EMPTY)["efv"] == 0
     assert in_voxels(cube(), EMPTY)["edge_distance"] > 0.7 / H
     assert angles_of(cube(), EMPTY) == (90, 90)
     assert angles_of(sphere(), EMPTY) == (None, 90)
     assert angles_of(cube(), inverted(cube())) == (pytest.approx(180), pytest.approx(180))
-
-
-def test_a_reference_triangle_without_area_has_no_normal() -> None:
-    flat = square()
-    split = Mesh(np.vstack([flat.vertices, [0.5, 0, 0]]), np.vstack([flat.faces, [0, 1, 4]]))
-    assert angles_of(split, square()) == (None, pytest.approx(0, abs=1e-5))
 
 
 def test_marching_cubes_cuts_a_cube_off_as_computed() -> None:
@@ -212,21 +161,3 @@ def test_the_smallest_angle_of_a_triangle(tip: list[float], angle: float) -> Non
     figures = metrics.compare_triangles(mesh)
     assert figures["min_angle"] == pytest.approx(angle) and figures["slivers"] == (angle < 5)
     assert metrics.compare_triangles(EMPTY) == {"min_angle": None, "slivers": None}
-
-
-def test_slivers_are_counted() -> None:
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0.01, 0]])
-    mesh = Mesh(corners, np.array([[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]], np.int32))
-    figures = metrics.compare_triangles(mesh)
-    assert figures["slivers"] == 0.25
-    assert figures["min_angle"] == pytest.approx(np.degrees(np.arctan2(0.01, 0.5)))
-
-
-@pytest.mark.parametrize("size", [1.0, 0.2, 0.027, 0.001])
-def test_edge_points_are_those_with_an_edge_among_their_nearest(size: float) -> None:
-    """By the definition, for all points. The smaller the box, the more have too many neighbours."""
-    drawn = metrics.sample_surface(Mesh(cube().vertices * size, CUBE_FACES), SEED, 5000)
-    index = np.arange(len(drawn.points))
-    among_all = edges.edge_among_nearest(drawn, index)
-    np.testing.assert_array_equal(edges.edge_points(drawn), drawn.points[among_all])
-    assert among_all.any()

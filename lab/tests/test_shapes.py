@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import trilinear
 from scipy import ndimage
-from solids import cube, saved, sphere, torus
+from solids import cube, saved, torus
 
 from lab import methods
-from lab.measuring import Task, measure_method, measure_task
-from lab.metrics import distance_or_dot
-from lab.shapes import HALVES, Case, Setting, Shape, draw_halves, random_rotation
+from lab.measuring import Task, measure_method
+from lab.shapes import Case, Setting, Shape
 from lab.surfaces import interpolate_spline
-from super_sdf import Mesh, pipeline
-from super_sdf.errors import NoSurfaceError
-from super_sdf.truth.solid import Solid
+from super_sdf import Mesh
 
 TASK = Task(Path(), Setting(8), ())
 
@@ -50,42 +45,12 @@ def test_the_truth_is_exact_near_the_surface_and_right_in_sign(setting):
     np.testing.assert_allclose(case.truth[case.band & away], exact[case.band & away], atol=1e-6)
 
 
-@pytest.fixture
-def unfitted(monkeypatch):
-    """Leave the network's values as they are."""
-    monkeypatch.setattr(pipeline, "fit_to_spheres", lambda *_: None)
-    monkeypatch.setattr(pipeline, "keep_within_bounds", lambda *_: None)
-
-
-@pytest.mark.usefixtures("unfitted")
-def test_ours_with_a_trilinear_network_is_the_trilinear_baseline():
-    case = case_of(sphere(), Setting(16))
-    ours = methods.our_surface(case, trilinear)
-    baseline = methods.spline_surface(case, trilinear, order=1)
-    near = case.band & (np.abs(baseline.field()) < case.spacing)  # patches are cut off at 3 h
-    np.testing.assert_allclose(ours.field()[near], baseline.field()[near], atol=1e-6)
-    assert ours.mesh.is_closed()
-    assert ours.mesh.volume() == pytest.approx(baseline.mesh.volume(), rel=1e-3)
-    assert distance_or_dot(Solid(baseline.mesh), ours.mesh.vertices).max() < case.fine / 4
-
-
 @pytest.mark.parametrize("method", methods.METHODS)
 def test_every_method_finds_the_torus_where_it_is(method):
     row = measure_method(*shape_and_case(torus(), Setting(24)), method, TASK)
     assert row["error"] is None and row["closed"] and row["outward"]
     assert row["p2s"] < 0.05 / 24 and row["nc"] > 0.98
     assert row["seconds"] > 0
-
-
-def test_a_peer_without_its_checkout_says_what_to_give(monkeypatch, tmp_path):
-    case = shape_and_case(torus(), Setting(12))
-    for folder in (None, str(tmp_path)):
-        monkeypatch.delenv("NDC_FOLDER", raising=False)
-        if folder:
-            monkeypatch.setenv("NDC_FOLDER", folder)
-        path = Path(folder or "", "model.py")
-        error = measure_method(*case, "ndc", TASK)["error"]
-        assert error == f"{path} is missing: give a checkout of NDC at c036901 (--ndc FOLDER)"
 
 
 def test_the_bound_is_better_than_ours_and_ours_than_the_coarse_grid():
@@ -95,68 +60,10 @@ def test_the_bound_is_better_than_ours_and_ours_than_the_coarse_grid():
     assert rows["mc"]["f1"] < rows["ours"]["f1"] < rows["bound"]["f1"] + 0.001  # of random points
 
 
-def test_noise_is_seeded_bounded_and_only_where_asked():
-    clean, noisy, again = (case_of(torus(), Setting(16, noise=noise)) for noise in (0, 0.5, 0.5))
-    np.testing.assert_array_equal(clean.grid.values, clean.coarse)
-    np.testing.assert_array_equal(noisy.grid.values, again.grid.values)
-    np.testing.assert_array_equal(noisy.coarse, clean.coarse)
-    error = np.abs(noisy.grid.values - clean.coarse)
-    assert 0.24 / 16 < error.max() <= 0.25 / 16 + 1e-7
-
-
-def test_a_scale_is_the_longest_side_over_that_of_the_grid():
-    case = case_of(Mesh(cube().vertices * [3, 1, 1], cube().faces), Setting(32, scale=0.25))
-    longest = 3 / np.sqrt(11)
-    assert case.side == pytest.approx(4 * longest)
-    assert (case.coarse[:, 16, 16] < 0).sum() == 8
-
-
-def test_a_method_that_raises_has_no_figures_and_is_named(monkeypatch):
-    def broken(case, network):
-        raise ValueError("no luck\nat all")
-
-    monkeypatch.setitem(methods.BY_NAME, "mc", broken)
-    row = measure_method(*shape_and_case(cube(), Setting(8)), "mc", TASK)
-    assert row.keys() == {"error"}
-    assert re.fullmatch(r"ValueError: no luck \(test_shapes\.py:\d+\)", row["error"])
-
-
-def test_a_surface_that_is_not_found_counts_as_a_dot():
-    thin = Mesh(cube().vertices * [1, 1, 1e-4], cube().faces)  # no sample lies in it
-    row = measure_method(*shape_and_case(thin, Setting(8)), "mc", TASK)
-    assert row["error"] is None and row["f1"] < 1e-4 and row["faces"] == 0 and not row["closed"]
-
-    def nothing(*_, **__):
-        raise NoSurfaceError("no surface at 0")
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(methods, "reconstruct", nothing)
-        row = measure_method(*shape_and_case(cube(), Setting(8)), "ours", TASK)
-    assert row["error"] is None and row["f1"] == 0 and row["faces"] == 0
-
-
-def test_a_lattice_beyond_memory_fails_its_methods_and_not_the_shape(tmp_path):
-    path = saved(cube(), tmp_path / "box.ply")
-    task = Task(path, Setting(8000, 16), ("mc", "bound"))
-    rows = dict(measure_task(task, Shape.read(path)))
-    assert list(rows) == ["mc", "bound"]
-    assert all("measuring 8000^3 refined to " in row["error"] for row in rows.values())
-    assert all("f1" not in row for row in rows.values())  # that is no score
-
-
 def shape_and_case(mesh: Mesh, setting: Setting) -> tuple[Shape, Case]:
     """Return a shape and its case in a setting."""
     shape = Shape("some", mesh)
     return shape, Case(shape, setting)
-
-
-def test_the_halves_are_drawn_by_name_alone():
-    names = [f"shape-{n}" for n in range(63)]
-    halves = draw_halves(names)
-    assert [len(halves[half]) for half in HALVES] == [31, 32]
-    assert sorted(halves["choose"] + halves["final"]) == sorted(names)
-    assert set(draw_halves(names[::-1])["choose"]) == set(halves["choose"])
-    assert draw_halves(names, seed=1)["choose"] != halves["choose"]
 
 
 @pytest.mark.parametrize("seed", [0, 3])
@@ -170,15 +77,6 @@ def test_a_shape_is_turned_by_its_name_and_a_seed(tmp_path, seed):
     np.testing.assert_allclose(np.linalg.norm(turned.mesh.vertices, axis=1), side * 0.75**0.5)
     for differs in (Shape.read(path, seed + 1), Shape.read(other, seed)):
         assert np.abs(turned.mesh.vertices - differs.mesh.vertices).max() > 0.01
-
-
-def test_turns_are_rotations_and_favour_no_direction():
-    random = np.random.default_rng(0)
-    turns = np.array([random_rotation(random) for _ in range(4000)])
-    same = np.eye(3)[None] + 0 * turns
-    np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), same, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(turns), 1)
-    np.testing.assert_allclose(turns.mean(0), 0, atol=0.03)
 
 
 def test_ours_with_fewer_triangles_and_another_mesher():

@@ -56,48 +56,48 @@ QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
 """The file of each shipped network, and over how many turns of the grid it is averaged."""
 GOALS = ("simplify", "tolerance", "triangles")
 """Of these at most one may be given."""
-BYTES = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}
-
-Check = Callable[[Any, str], Any]
-"""Returns a value as the program takes it; OptionError, by a name, if it is wrong."""
 
 
 class Kind(NamedTuple):
     """What the values of an option are."""
 
-    check: Check
+    check: Callable[[Any, str], Any]  # returns the value; OptionError, by a name, if it is wrong
     parse: Callable[[str], Any] = str  # makes a value of text; ValueError says what to give instead
     choices: tuple[str, ...] = ()  # all values, if there are only some
 
 
-def whole(least: int, give: str, kind: str = "a whole number", most: float = inf) -> Kind:
-    """Return the kind of whole numbers in a range."""
+def number(
+    kind: str = "a number",
+    give: str = "a finite number",
+    *,
+    above: float = -inf,
+    most: float = inf,
+    step: int | None = None,
+    text: str = "",
+) -> Kind:
+    """Return the kind of numbers in a range, or of multiples of a step.
 
-    def check(value: Any, name: str) -> int:
-        if not isinstance(value, Integral) or isinstance(value, bool):
+    Messages say to give ``kind`` instead of what is no such number, ``give`` for one that is out of
+    range, and ``text`` for text that is no number.
+    """
+    of: Any = Integral if step else Real
+    make: Any = int if step else float
+
+    def check(value: Any, name: str) -> Any:
+        if not isinstance(value, of) or isinstance(value, bool):
             raise OptionTypeError(f"{name} is {seen(value)}: give {kind}")
-        if not least <= int(value) <= most:
-            raise OptionError(f"{name} is {seen(int(value))}: give {give}")
-        return int(value)
+        with suppress(OverflowError):  # a whole number beyond 1.8e308
+            found = make(value)
+            if isfinite(found) and above < found <= most and not (step and found % step):
+                return found
+        raise OptionError(f"{name} is {seen(int(value) if step else value)}: give {give}")
 
-    return Kind(check, _parser(int, kind))
+    def parse(given: str) -> Any:
+        with suppress(ValueError):
+            return make(given)
+        raise ValueError(f"give {text or kind}")
 
-
-def number(give: str = "a number", finite: str = "a finite number", above: float = -inf) -> Kind:
-    """Return the kind of finite numbers above another."""
-
-    def check(value: Any, name: str) -> float:
-        if not isinstance(value, Real) or isinstance(value, bool):
-            raise OptionTypeError(f"{name} is {seen(value)}: give {give}")
-        try:
-            found = float(value)
-        except OverflowError:  # a whole number beyond 1.8e308
-            found = inf
-        if not (isfinite(found) and found > above):
-            raise OptionError(f"{name} is {seen(value)}: give {finite}")
-        return found
-
-    return Kind(check, _parser(float, give))
+    return Kind(check, parse)
 
 
 def numbers(counts: tuple[int, ...], give: str) -> Kind:
@@ -132,27 +132,10 @@ def one_of(names: Iterable[str]) -> Kind:
     return Kind(check, choices=choices)
 
 
-def _parser(make: Callable[[str], Any], give: str) -> Callable[[str], Any]:
-    def parse(text: str) -> Any:
-        with suppress(ValueError):
-            return make(text)
-        raise ValueError(f"give {give}")
-
-    return parse
-
-
 def _flag(value: Any, name: str) -> bool:
     if not isinstance(value, bool) and type(value).__name__ not in ("bool_", "bool"):  # NumPy's
         raise OptionTypeError(f"{name} is {seen(value)}: give True or False, in JSON true or false")
     return bool(value)
-
-
-def _factor(value: Any, name: str) -> int:
-    give = "an even number from 2 to 16 (an odd one has no node on the samples)"
-    found: int = whole(2, give, most=16).check(value, name)
-    if found % 2:
-        raise OptionError(f"{name} is {found}: give {give}")
-    return found
 
 
 def check_label(label: Any, name: str = "label") -> int:
@@ -185,19 +168,22 @@ def parse_size(text: str) -> int:
     """Parse a number of bytes, such as "1500M" or "4G"; the units are powers of ten."""
     amount, unit = (text, "") if text[-1:].isdigit() else (text[:-1], text[-1:].upper())
     with suppress(KeyError, ValueError, OverflowError):
-        if (size := int(float(amount) * BYTES[unit])) > 0:
+        if (size := int(float(amount) * {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}[unit])) > 0:
             return size
     raise ValueError("give a number of bytes such as 1500M or 4G")
 
 
-FLAG = Kind(_flag)
-ABOVE_0 = number("a number greater than 0", "a number greater than 0", above=0)
-VOXELS = ABOVE_0._replace(parse=_parser(float, "a number of voxels; --tolerance takes world units"))
-WORLD = ABOVE_0._replace(parse=_parser(float, "a number without a unit; it is in world units"))
-POINT = numbers((1, 3), "one number, or three")
-MEMORY = Kind(whole(1, "a number of bytes greater than 0", "a whole number of bytes").check, parse_size)
-THREADS = whole(0, "1 or more, or 0 for one per core", "a whole number, 0 for one per core")
-TEXT = Kind(lambda value, name: str(check_path(value, name)))
+# fmt: off
+WHOLE, ABOVE_0 = "a whole number", "a number greater than 0"
+FLAG, POINT = Kind(_flag), numbers((1, 3), "one number, or three")
+FACTOR = number(WHOLE, "an even number from 2 to 16 (an odd one has no node on the samples)",
+    above=0, most=16, step=2)
+VOXELS = number(ABOVE_0, ABOVE_0, above=0, text="a number of voxels; --tolerance takes world units")
+WORLD = number(ABOVE_0, ABOVE_0, above=0, text="a number without a unit; it is in world units")
+MEMORY = number("a whole number of bytes", "a number of bytes greater than 0", above=0, step=1)
+THREADS = number("a whole number, 0 for one per core", "1 or more, or 0 for one per core",
+    above=-1, step=1)
+# fmt: on
 
 
 class Option(NamedTuple):
@@ -238,7 +224,6 @@ class Values(TypedDict, total=False):
     scale: float | None
 
 
-# fmt: off  # a row an option
 @dataclass(frozen=True)
 class Options:
     """What a conversion may be told; see ``read_grid``, ``reconstruct``, ``load_network``.
@@ -247,7 +232,8 @@ class Options:
     of a batch and what the mesh depends on, "labels" for what goes with ``labels``.
     """
 
-    factor: int = _option(4, MESH, "list labels", Kind(_factor, _parser(int, "a whole number")),
+    # fmt: off
+    factor: int = _option(4, MESH, "list labels", FACTOR,
         "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.", metavar="K")
     _: KW_ONLY
     spacing: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
@@ -285,7 +271,7 @@ class Options:
     level: float | None = _option(None, VALUES, "read list", number(),
         "Mesh the surface at the value L of densities; what is above L is inside, unless --inside "
         "is negative.", metavar="L")
-    scale: float | None = _option(None, VALUES, "read list", ABOVE_0,
+    scale: float | None = _option(None, VALUES, "read list", number(ABOVE_0, ABOVE_0, above=0),
         "World units per unit of the values, if they have another unit than the spacing.",
         metavar="S")
     offset: float = _option(0.0, MESH, "list",
@@ -306,7 +292,8 @@ class Options:
     tolerance: float | None = _option(None, MESH, "list", WORLD,
         "Simplify as with --simplify, but within D in world units, such as millimetres.",
         metavar="D")
-    triangles: int | None = _option(None, MESH, "list", whole(4, "4 or more, as a closed mesh has"),
+    triangles: int | None = _option(None, MESH, "list",
+        number(WHOLE, "4 or more, as a closed mesh has", above=3, step=1),
         "Simplify the mesh to at most N triangles, instead of --simplify. If the shape needs more, "
         "a warning says how many are left.", metavar="N")
     keep_volume: bool = _option(False, MESH, "list labels", FLAG,
@@ -318,7 +305,8 @@ class Options:
     quality: Quality | None = _option(None, WORK, "labels", one_of(QUALITIES),
         "Network: fast is smaller and quicker than base, the default; best averages base over 4 "
         "turns of the grid, and takes 4 times as long.")
-    model: str | None = _option(None, WORK, "labels", TEXT,
+    model: str | None = _option(None, WORK, "labels",
+        Kind(lambda value, name: str(check_path(value, name))),
         "Use the network in this ONNX file instead of --quality.", metavar="FILE")
     precision: Precision = _option(AUTO, WORK, "labels", one_of(PRECISIONS),
         "Arithmetic of the network: auto is int8 on the CPU if the network has it, otherwise "
@@ -327,7 +315,7 @@ class Options:
         "Where the network runs; auto uses CUDA if it works here, else the CPU.")
     threads: int = _option(0, WORK, "labels", THREADS,
         "CPU threads; 0 means one per core.", metavar="N")
-    max_memory: int | None = _option(None, WORK, "labels", MEMORY,
+    max_memory: int | None = _option(None, WORK, "labels", MEMORY._replace(parse=parse_size),
         "Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
         "Larger grids are refined in several boxes, whose meshes are joined.", metavar="SIZE")
     # fmt: on
@@ -342,13 +330,9 @@ class Options:
             said = f"label {self.label} and field {self.field}"
             raise OptionError(f"{said}: the samples of a label are a mask")
 
-    def some(self, where: str) -> dict[str, Any]:
-        """Return the options that show somewhere, by name."""
-        return {name: getattr(self, name) for name in OPTIONS if where in OPTIONS[name].shows}
-
     def reading(self) -> dict[str, Any]:
         """Return the keywords of ``read_grid``."""
-        return {**self.some("read"), "max_memory": self.max_memory}
+        return {name: getattr(self, name) for name in (*READ, "max_memory")}
 
     def values(self) -> Values:
         """Return what the values are: keywords of ``make_grid``."""
@@ -364,7 +348,7 @@ class Options:
 
     def digest(self) -> dict[str, Any]:
         """Return all that the mesh depends on besides the network, for JSON."""
-        return self.some("list")
+        return {name: getattr(self, name) for name in BATCH_LISTS}
 
     def network(self) -> dict[str, Any]:
         """Return the keywords of ``load_network``."""
@@ -378,8 +362,10 @@ OPTIONS = {
     for each in fields(Options)
     if each.metadata
 }
-BATCH_LISTS = tuple(name for name, row in OPTIONS.items() if "list" in row.shows)
-LABELS = tuple(name for name, row in OPTIONS.items() if "labels" in row.shows)
+READ, BATCH_LISTS, LABELS = (
+    tuple(name for name, row in OPTIONS.items() if where in row.shows)
+    for where in ("read", "list", "labels")
+)
 
 check_factor = OPTIONS["factor"].check
 check_distance = OPTIONS["offset"].check

@@ -17,7 +17,6 @@ from ..pages.items import (
     entry_of,
     entry_of_report,
     find_item,
-    item_name,
     item_of_files,
     item_path,
     items_folder,
@@ -71,14 +70,16 @@ class BatchPage:
                 )
             elif name in items:
                 report = {**row, "input": row["in"], "output": name}
-                entry = entry_of_report(name, report, items[name]) | {"id": item_name(name)}
+                path = item_path(self.folder, name)
+                entry = entry_of_report(name, report, items[name]) | {"id": path.stem}
                 if name in drawn:
-                    beside = f"{quote(self.folder.name)}/{item_name(name)}.js"
+                    beside = quote(f"{self.folder.name}/{path.name}")
                     entry["meshes"] = "page" if within else beside
                 entries.append(entry)
         entries.sort(key=lambda entry: (_rank(entry), entry["name"]))
         packed = {
-            item_name(name): read_meshes(item_path(self.folder, name)) for name in drawn if within
+            path.stem: read_meshes(path)
+            for path in (item_path(self.folder, name) for name in drawn if within)
         }
         counts = {
             "files": len(entries),

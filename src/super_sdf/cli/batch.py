@@ -41,27 +41,29 @@ Examples:
 """
 MOST_FAILURES = 20  # printed; the report has all
 
-
 # fmt: off
-@click.command(cls=common.Command, context_settings=common.CONTEXT, epilog=EXAMPLES, help=HELP,
-    short_help="Convert many grids; can be stopped and resumed.")
-@click.argument("sources", metavar="IN...", nargs=-1, required=True)
-@option("--out", "folder", metavar="DIR", required=True, type=common.FILE,
-    help="Folder for the meshes and report.jsonl; subfolders of IN are kept.")
-@option("--format", "kind", type=click.Choice(MESH_FORMATS), default=MESH_FORMATS[0],
-    show_default=True, help="Mesh file format.")
-@common.table_options(*OPTIONS)
-@common.shared("names", "cluster", "jobs")
-@option("--fail-fast", is_flag=True, group=WORK,
-    help="Start no further file after the first failure.")
-@option("--retry", is_flag=True, group=WORK,
-    help="Retry inputs that failed before and have not changed.")
-@option("--dry-run", is_flag=True, group=WORK, help="Show what would be done; write nothing.")
-@common.shared("check", "report")
-@option("--force", is_flag=True,
-    help="Convert everything again; replace files that are not as a batch wrote them.")
-@common.shared("json", "quiet")
+TAKES = (
+    click.argument("sources", metavar="IN...", nargs=-1, required=True),
+    option("--out", "folder", metavar="DIR", required=True, type=common.FILE,
+        help="Folder for the meshes and report.jsonl; subfolders of IN are kept."),
+    option("--format", "kind", type=click.Choice(MESH_FORMATS), default=MESH_FORMATS[0],
+        show_default=True, help="Mesh file format."),
+    common.table_options(*OPTIONS),
+    common.shared("names", "cluster", "jobs"),
+    option("--fail-fast", is_flag=True, group=WORK,
+        help="Start no further file after the first failure."),
+    option("--retry", is_flag=True, group=WORK,
+        help="Retry inputs that failed before and have not changed."),
+    option("--dry-run", is_flag=True, group=WORK, help="Show what would be done; write nothing."),
+    common.shared("check", "report"),
+    option("--force", is_flag=True,
+        help="Convert everything again; replace files that are not as a batch wrote them."),
+    common.shared("json", "quiet"),
+)
 # fmt: on
+
+
+@common.make_command("Convert many grids; can be stopped and resumed.", EXAMPLES, *TAKES, text=HELP)
 def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     """Find the inputs, convert what is not done yet, print a summary."""
     start, page, quiet = time.perf_counter(), given["report"], given["quiet"]
@@ -220,7 +222,10 @@ def sentence(batch: Batch) -> str:
         counts = [f"{facts['done']} done, {facts['failed']} failed"]
         more = {"done before": facts["done_before"], "not begun": facts["not_begun"]}
     else:
-        counts, retry = [f"nothing to do: {facts['done_before']} done before"], "--retry tries again"
+        counts, retry = (
+            [f"nothing to do: {facts['done_before']} done before"],
+            "--retry tries again",
+        )
         more = {f"failed before ({retry})": facts["failed_before"], "refused": facts["refused"]}
     counts += [f"{count} {kind}" for kind, count in more.items() if count]
     time_ = f"{batch.seconds:.1f} s" if seconds < 60 else f"{seconds // 60} min {seconds % 60} s"

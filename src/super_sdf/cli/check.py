@@ -10,55 +10,50 @@ from typing import Any
 import click
 
 from ..errors import check_modules
-from ..options import OPTIONS, Options
-from .common import (
-    CONTEXT,
-    FILE,
-    Command,
-    option,
-    print_stderr,
-    print_stdout,
-    shared,
-    table_options,
-)
+from ..options import READ, Options
+from . import common
+from .common import option, print_stderr, print_stdout
 
 EXAMPLES = """\b
 Examples:
   super-sdf check part.ply part.npz
   super-sdf check part.ply part.npz --out coloured.ply --max-mean 0.01 --no-faults
 """
-READ = tuple(name for name, row in OPTIONS.items() if "read" in row.shows)
-
 
 # fmt: off
-@click.command(cls=Command, context_settings=CONTEXT, epilog=EXAMPLES,
-    short_help="Check a mesh against the grid that it was made from.")
-@click.argument("mesh", metavar="MESH", type=FILE)
-@click.argument("grid", metavar="GRID", type=FILE)
-@option("--out", type=FILE, metavar="COLOURED.ply",
-    help="Write the mesh with a colour and the property residual (voxels) for each vertex, from "
-    "the samples nearest to which it lies. White: the mesh touches their balls; red: it pierces "
-    "them; blue: it does not reach them, both fully at 0.1 voxel; olive: no sample is near.")
-@option("--max-residual", type=float, metavar="VOXELS",
-    help="Fail if the largest residual of a sample is above this.")
-@option("--tolerance", type=float, metavar="D",
-    help="The same in world units: fail if the largest residual is above D.")
-@option("--max-mean", type=float, metavar="VOXELS", help="Fail if the mean residual is above this.")
-@option("--max-share", type=float, metavar="SHARE",
-    help="Fail if more than this share of the samples, from 0 to 1, has a residual above 0.1 "
-    "voxel.")
-@option("--no-faults", is_flag=True,
-    help="Fail if the mesh is open, not manifold, not oriented outward, intersects itself, has "
-    "samples on the wrong side, or vertices where the grid has no surface.")
-@option("--skip-intersections", is_flag=True,
-    help="Do not count self-intersections, which takes up to half of the time.")
-@table_options(*READ, "offset", "unit", "max_memory",
-    offset="The --offset that the mesh was made with.",
-    unit="The --unit that a .glb was made with.",
-    max_memory="Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free "
-    "memory. Larger meshes are refused.")
-@shared("force", "json", "quiet")
+TAKES = (
+    click.argument("mesh", metavar="MESH", type=common.FILE),
+    click.argument("grid", metavar="GRID", type=common.FILE),
+    option("--out", type=common.FILE, metavar="COLOURED.ply",
+        help="Write the mesh with a colour and the property residual (voxels) for each vertex, "
+        "from the samples nearest to which it lies. White: the mesh touches their balls; red: it "
+        "pierces them; blue: it does not reach them, both fully at 0.1 voxel; olive: no sample is "
+        "near."),
+    option("--max-residual", type=float, metavar="VOXELS",
+        help="Fail if the largest residual of a sample is above this."),
+    option("--tolerance", type=float, metavar="D",
+        help="The same in world units: fail if the largest residual is above D."),
+    option("--max-mean", type=float, metavar="VOXELS",
+        help="Fail if the mean residual is above this."),
+    option("--max-share", type=float, metavar="SHARE",
+        help="Fail if more than this share of the samples, from 0 to 1, has a residual above 0.1 "
+        "voxel."),
+    option("--no-faults", is_flag=True,
+        help="Fail if the mesh is open, not manifold, not oriented outward, intersects itself, has "
+        "samples on the wrong side, or vertices where the grid has no surface."),
+    option("--skip-intersections", is_flag=True,
+        help="Do not count self-intersections, which takes up to half of the time."),
+    common.table_options(*READ, "offset", "unit", "max_memory",
+        offset="The --offset that the mesh was made with.",
+        unit="The --unit that a .glb was made with.",
+        max_memory="Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free "
+        "memory. Larger meshes are refused."),
+    common.shared("force", "json", "quiet"),
+)
 # fmt: on
+
+
+@common.make_command("Check a mesh against the grid that it was made from.", EXAMPLES, *TAKES)
 def command(mesh: Path, grid: Path, **given: Any) -> None:
     """Check the mesh file MESH against the signed distance grid GRID that it was made from.
 

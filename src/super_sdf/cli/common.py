@@ -52,6 +52,20 @@ class Command(click.Command):
             raise click.ClickException(f"{named}{error.strerror or error}") from error
 
 
+def make_command(
+    short: str, examples: str, *takes: Decorator, text: str | None = None
+) -> Decorator:
+    """Return what makes a command of a function, with its arguments and options in this order."""
+
+    def make(function: Callable[..., Any]) -> Command:
+        for take in reversed(takes):
+            function = take(function)
+        told = {"epilog": examples, "short_help": short, "help": text}
+        return click.command(None, Command, context_settings=CONTEXT, **told)(function)
+
+    return make
+
+
 class GroupedOption(click.Option):
     """An option with the heading under which help lists it."""
 
@@ -92,7 +106,9 @@ def table_options(*names: str, **helps: str) -> Decorator:
             row, word = OPTIONS[name], f"--{name.replace('_', '-')}"
             more: dict[str, Any] = {"is_flag": True}
             if not isinstance(row.default, bool):
-                kind: Any = click.Choice(row.kind.choices) if row.kind.choices else Parsed(row, word)
+                kind: Any = (
+                    click.Choice(row.kind.choices) if row.kind.choices else Parsed(row, word)
+                )
                 shown = row.default is not None
                 more = {"type": kind, "metavar": row.metavar, "show_default": shown}
             word, text = f"{word}/--{row.off}" if row.off else word, helps.get(name, row.help)

@@ -12,7 +12,8 @@ import click
 
 from .. import __version__, errors
 from ..options import EXACT, FLOAT32, MARCHING, MASK, MESHERS, Device
-from .common import CONTEXT, Command, option, print_stdout, shared, table_options
+from . import common
+from .common import option, print_stdout
 
 EXAMPLES = """\b
 Examples:
@@ -24,16 +25,20 @@ OK, MISSING, FAILED = "ok", "missing", "failed"
 SAMPLES, CENTRE, RADIUS = 32, 15.63, 12.0  # of a ball, in voxels; the centre is on no sample
 MOST_OFF, MOST_OFF_OF_MASK = 0.05, 0.6  # voxels; a mask shows the surface to half a voxel
 
-
 # fmt: off
-@click.command(cls=Command, context_settings=CONTEXT, epilog=EXAMPLES,
-    short_help="Show versions, devices and networks, check them, or describe a grid file.")
-@click.argument("source", metavar="[GRID]", required=False)
-@option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails.")
-@table_options("device",
-    device="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work.")
-@shared("json")
+TAKES = (
+    click.argument("source", metavar="[GRID]", required=False),
+    option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails."),
+    common.table_options("device",
+        device="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work."),
+    common.shared("json"),
+)
 # fmt: on
+
+
+@common.make_command(
+    "Show versions, devices and networks, check them, or describe a grid file.", EXAMPLES, *TAKES
+)
 def command(source: str | None, check: bool, device: Device, as_json: bool) -> None:
     """Show versions, devices, and the shipped networks with their metadata.
 
@@ -52,7 +57,9 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
             if not as_json:
                 print_stdout(f"{state:<8} {what}: {says}")
         failed = sum(finding["state"] == FAILED for finding in findings)
-        said = f"{failed} of {len(findings)} checks failed" if failed else "What is installed works."
+        said = (
+            f"{failed} of {len(findings)} checks failed" if failed else "What is installed works."
+        )
         facts: dict[str, Any] = {"works": not failed, "findings": findings}
     else:
         if source is not None:

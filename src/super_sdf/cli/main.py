@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import io
 import json
 import os
 import signal
@@ -73,7 +74,7 @@ def run() -> int:
             os.fstat(number)
             continue
         os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
-    sys.stdout, sys.stderr = sys.stdout or open(os.devnull, "w"), sys.stderr or open(os.devnull, "w")
+    sys.stdout, sys.stderr = sys.stdout or io.StringIO(), sys.stderr or io.StringIO()
     try:
         code = cli.main(standalone_mode=False)  # a number if a command ended early
         return code if isinstance(code, int) else 0
@@ -83,7 +84,8 @@ def run() -> int:
         if heard:  # also what a library has made of the interrupt
             name = signal.Signals(heard[0]).name
             said = "interrupted" if name == "SIGINT" else f"ended by {name}"
-            kept = getattr(error.__cause__, "args", ())  # of a command that says what it has kept
+            cause = error.__cause__  # a command may say what it has kept
+            kept = cause.args if isinstance(cause, KeyboardInterrupt) else ()
             return end(f"{said}: {kept[0]}" if kept else said, 128 + heard[0])
         if isinstance(error, click.ClickException):
             return end(error.format_message(), error.exit_code)

@@ -10,7 +10,8 @@ import click
 from click.core import ParameterSource
 
 from ..errors import OptionError, check_modules
-from .common import CONTEXT, FILE, Command, option, print_stderr, progress_bar, shared
+from . import common
+from .common import option, print_stderr
 
 EXAMPLES = """\b
 Examples:
@@ -18,25 +19,28 @@ Examples:
   super-sdf sample part.stl part.npz --spacing 0.5 --padding 4
 """
 
-
 # fmt: off
-@click.command(cls=Command, context_settings=CONTEXT, epilog=EXAMPLES,
-    short_help="Sample a closed mesh as a signed distance grid.")
-@click.argument("source", metavar="MESH", type=FILE)
-@click.argument("target", metavar="OUT", type=FILE)
-@option("-n", "samples", type=int, help="Samples along the longest axis.")
-@option("--spacing", type=float, metavar="H", help="World distance between samples, instead of -n.")
-@option("--padding", type=float, default=2.0, show_default=True,
-    help="Voxels between the bounding box of the mesh and the outermost samples.")
-@option("--frame", type=click.Choice(["world", "unit"]), default="world", show_default=True,
-    help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and centres "
-    "it in a unit cube, sampled at n^3 voxel centres.")
-@option("--band", type=float, metavar="VOXELS",
-    help="Exact distances up to this many voxels from the surface, clamped beyond. Default: exact "
-    "everywhere up to 256^3 samples, within 4 voxels in larger grids.")
-@option("--allow-open", is_flag=True, help="Accept a mesh with holes; its inside is a guess.")
-@shared("force", "quiet")
+TAKES = (
+    click.argument("source", metavar="MESH", type=common.FILE),
+    click.argument("target", metavar="OUT", type=common.FILE),
+    option("-n", "samples", type=int, help="Samples along the longest axis."),
+    option("--spacing", type=float, metavar="H",
+        help="World distance between samples, instead of -n."),
+    option("--padding", type=float, default=2.0, show_default=True,
+        help="Voxels between the bounding box of the mesh and the outermost samples."),
+    option("--frame", type=click.Choice(["world", "unit"]), default="world", show_default=True,
+        help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and "
+        "centres it in a unit cube, sampled at n^3 voxel centres."),
+    option("--band", type=float, metavar="VOXELS",
+        help="Exact distances up to this many voxels from the surface, clamped beyond. Default: "
+        "exact everywhere up to 256^3 samples, within 4 voxels in larger grids."),
+    option("--allow-open", is_flag=True, help="Accept a mesh with holes; its inside is a guess."),
+    common.shared("force", "quiet"),
+)
 # fmt: on
+
+
+@common.make_command("Sample a closed mesh as a signed distance grid.", EXAMPLES, *TAKES)
 def command(source: Path, target: Path, **given: Any) -> None:
     """Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
 
@@ -67,7 +71,7 @@ def command(source: Path, target: Path, **given: Any) -> None:
         solid, layout = Solid(normalise(solid.mesh)), unit_layout(size["n"])
     else:
         layout = fitted_layout(solid.mesh, **size, padding=padding)
-    with progress_bar("sampling", given["quiet"]) as progress:
+    with common.progress_bar("sampling", given["quiet"]) as progress:
         grid = sample_solid(solid, layout, band=given["band"], progress=progress)
     write_grid(grid, target, force=given["force"])
     if not given["quiet"]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from typing import Any
 
 import click
@@ -30,22 +31,25 @@ Examples:
   super-sdf upsample organs.nii.gz organs.glb --labels all
 """
 MANY = 50_000  # triangles of which simplifying is worth a hint
+TILES_PER_THREAD = 2  # of a cluster: one that dies costs little
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
-
 # fmt: off
-@click.command(cls=common.Command, context_settings=common.CONTEXT, epilog=EXAMPLES, help=HELP,
-    short_help="Refine a grid and write its surface as a mesh.")
-@click.argument("source", metavar="IN")
-@click.argument("target", metavar="OUT")
-@common.table_options(*OPTIONS)
-@common.shared("names", "cluster", "jobs", "check")
-@option("--save-field", metavar="FIELD",
-    help="Also write the refined field: .npz for the values near the surface, .vdb for a level set "
-    "of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti.")
-@common.shared("report", "force", "json", "quiet")
-@option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage.")
+TAKES = (
+    click.argument("source", metavar="IN"),
+    click.argument("target", metavar="OUT"),
+    common.table_options(*OPTIONS),
+    common.shared("names", "cluster", "jobs", "check"),
+    option("--save-field", metavar="FIELD",
+        help="Also write the refined field: .npz for the values near the surface, .vdb for a level "
+        "set of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti."),
+    common.shared("report", "force", "json", "quiet"),
+    option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage."),
+)
 # fmt: on
+
+
+@common.make_command("Refine a grid and write its surface as a mesh.", EXAMPLES, *TAKES, text=HELP)
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
     options, watch = common.chosen_options(given), Stopwatch()
@@ -56,12 +60,21 @@ def command(source: str, target: str, **given: Any) -> None:
     watch.lap("load network")
     done: Any
     force = given["force"]
-    with common.progress_bar("upsampling", given["quiet"]) as progress:
+    with ExitStack() as stack:
+        progress = stack.enter_context(common.progress_bar("upsampling", given["quiet"]))
         where = source, target, network, options
         if options.labels is None:
             from ..convert import convert
 
-            done = convert(*where, progress=progress, save_field=given["save_field"], force=force)
+            how: dict[str, Any] = {"save_field": given["save_field"]}
+            if given["cluster"] is not None:
+                from ..batch.cluster import connect, tiles_on
+
+                to = connect(given["cluster"], given["jobs"], options.max_memory)
+                client = stack.enter_context(to)
+                least = TILES_PER_THREAD * sum(client.nthreads().values())
+                how |= {"map_tiles": tiles_on(client), "least_tiles": least}
+            done = convert(*where, progress=progress, force=force, **how)
         else:
             from ..labels.files import convert_labels
             from ..labels.names import read_names
@@ -140,9 +153,9 @@ def check_outputs(source: str, target: str, options: Options, given: dict[str, A
     if given["report"]:
         outputs = (target, field) if field else (target,)
         common.check_page("--report", given["report"], [*files_of(source), *outputs], force=force)
-    if given["cluster"] is not None:
-        raise OptionError("--cluster is for batch: leave it out")
-    if given["jobs"]:
+    if given["cluster"] is not None and field is not None:
+        raise OptionError("--save-field needs the whole field in one place: leave out --cluster")
+    if given["jobs"] and given["cluster"] is None:
         raise OptionError(f"--jobs {given['jobs']} is for --cluster local: give that, or no --jobs")
 
 
@@ -154,7 +167,8 @@ def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:
     lines = [
         f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "
         f"{'closed' if report['closed'] else 'open'}, from {low} to {high}, {seconds}"
-        + hint * (not few and triangles > MANY)
+        + hint
+        * (not few and triangles > MANY)
     ]
     if field:
         shape = " x ".join(map(str, field["shape"]))

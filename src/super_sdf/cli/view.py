@@ -9,17 +9,8 @@ from typing import Any
 import click
 
 from ..options import OPTIONS
-from .common import (
-    CONTEXT,
-    FILE,
-    Command,
-    check_page,
-    chosen_options,
-    option,
-    print_stderr,
-    shared,
-    table_options,
-)
+from . import common
+from .common import option, print_stderr
 
 EXAMPLES = """\b
 Examples:
@@ -27,23 +18,23 @@ Examples:
   super-sdf view part.ply other.stl --out page.html --no-browser
 """
 
+# fmt: off
+TAKES = (
+    click.argument("sources", metavar="MESH|GRID...", nargs=-1, required=True),
+    option(
+        "--out",
+        type=common.FILE,
+        metavar="PAGE.html",
+        help="File for the page. Default: one in the temporary folder that only you can read.",
+    ),
+    common.shared("force"),
+    option("--no-browser", is_flag=True, help="Print the address and open no browser."),
+    common.table_options(*(name for name in OPTIONS if name != "labels")),
+)
+# fmt: on
 
-@click.command(
-    cls=Command,
-    context_settings=CONTEXT,
-    epilog=EXAMPLES,
-    short_help="Look at meshes and grids in the browser.",
-)
-@click.argument("sources", metavar="MESH|GRID...", nargs=-1, required=True)
-@option(
-    "--out",
-    type=FILE,
-    metavar="PAGE.html",
-    help="File for the page. Default: one in the temporary folder that only you can read.",
-)
-@shared("force")
-@option("--no-browser", is_flag=True, help="Print the address and open no browser.")
-@table_options(*(name for name in OPTIONS if name != "labels"))
+
+@common.make_command("Look at meshes and grids in the browser.", EXAMPLES, *TAKES)
 def command(
     sources: tuple[str, ...], out: Path | None, force: bool, no_browser: bool, **given: Any
 ) -> None:
@@ -60,8 +51,8 @@ def command(
     from ..pages.html import viewed_page, write_page
 
     if out:
-        check_page("--out", out, sources, force=force)
-    options = chosen_options(given)
+        common.check_page("--out", out, sources, force=force)
+    options = common.chosen_options(given)
     text = viewed_page(sources, lambda: load_network(**options.network()), options)
     page = out or Path(mkdtemp(prefix="super-sdf-"), "view.html")  # only this user can read it
     write_page(text, page, force=force)

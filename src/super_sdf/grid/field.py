@@ -28,7 +28,7 @@ from .census import BESIDE, Census, Extremes, Looked
 from .placement import check_spacing, steps_of
 from .planes import SampleArray, changed
 from .slopes import BENT as STRAIGHT
-from .slopes import ENOUGH, LARGEST_VALUE, Floats, distinct, median, quantile
+from .slopes import ENOUGH, LARGEST_VALUE, Floats
 
 NONE_EXACT: Extremes = (0.0, 0.0)
 
@@ -221,11 +221,11 @@ def weigh(looked: Looked, spacing: Triple) -> Evidence:
     noisy = (apart > LIPSCHITZ * unit) & (second.max(1, initial=0) > BENT * unit)
     h, rough, noise = max(steps), 0.0, 0.0
     if len(fourth):  # of noise, their standard deviation is sqrt(70) times its own
-        rough = median(fourth.ravel()) / 70**0.5 / 0.6745
-        noise = quantile(fourth, 0.25) / 70**0.5 / 0.3186
+        rough = float(np.median(fourth.ravel())) / 70**0.5 / 0.6745
+        noise = float(np.quantile(fourth, 0.25)) / 70**0.5 / 0.3186
     contradicting = _contradict(around / (h * unit), steps / h, noise / unit)
     off, beyond, steep = (float(x.mean()) if len(x) else 0.0 for x in (wrong, contradicting, noisy))
-    least = float(np.diff(distinct(lines)).min(initial=np.inf))
+    least = float(np.diff(np.unique(lines)).min(initial=np.inf))
     digit = least if least < MOST_DIGIT else 0.0  # by so much no rounded values differ
     cut = bool(is_cut[0]), bool(is_cut[1])
     return Evidence(len(lines), typical, off, beyond, steep, uneven, rough, *cut, digit)
@@ -242,10 +242,10 @@ def _known_slopes(lines: Floats, third: Floats, fourth: Floats) -> tuple[float, 
     slope, far = slope[known], np.abs(middle[known, 0])
     if len(slope) < ENOUGH:
         return float("nan"), 0.0
-    near = far <= median(far)
-    typical = median(slope)
-    beyond = median(slope[~near]) if not near.all() else typical
-    return typical, (beyond - median(slope[near])) / typical
+    near = far <= float(np.median(far))
+    typical = float(np.median(slope))
+    beyond = float(np.median(slope[~near])) if not near.all() else typical
+    return typical, (beyond - float(np.median(slope[near]))) / typical
 
 
 def _contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
@@ -256,8 +256,8 @@ def _contradict(around: Floats, steps: Floats, noise: float) -> BoolArray:
     matters = MATTERS * min(steps)
     boxes = np.clip(around.reshape(len(around), 5**3), -matters, matters)
     middle = boxes[:, 5**3 // 2]
-    digits = np.diff(distinct(middle.astype(np.float32)))
-    digit = median(digits) if len(digits) else 0.0
+    digits = np.diff(np.unique(middle.astype(np.float32)))
+    digit = float(np.median(digits)) if len(digits) else 0.0
     places = np.indices((5,) * 3).reshape(3, -1).T - BESIDE
     beyond = np.abs(boxes - middle[:, None]) - np.linalg.norm(places * steps, axis=1)
     allowed = max(APART, BY_NOISE * noise, digit * (1 + ROUNDING))
@@ -276,7 +276,7 @@ def slope_within(looked: Looked, spacing: Triple) -> float:
     change = np.where(free[..., 1:] & free[..., :-1], np.abs(np.diff(line)), 0).max(-1)
     known = (change > 0).all(1)
     lengths = np.sqrt(((change[known] / np.array(steps_of(spacing))) ** 2).sum(1))
-    return median(lengths) if len(lengths) >= ENOUGH else float("nan")
+    return float(np.median(lengths)) if len(lengths) >= ENOUGH else float("nan")
 
 
 def is_projective(looked: Looked, spacing: Triple) -> bool:
@@ -293,8 +293,8 @@ def is_projective(looked: Looked, spacing: Triple) -> bool:
     slope = np.sqrt((((high - low) / steps / 2) ** 2).sum(1))
     bend = (np.abs(high - 2 * middle + low) / steps).sum(1)
     straight = slope[bend < STRAIGHT * slope]
-    steep = quantile(straight, STEEPEST) if len(straight) >= FEW else 0.0
-    return steep > 0 and steep > MOST_STEEP * median(straight)
+    steep = float(np.quantile(straight, STEEPEST)) if len(straight) >= FEW else 0.0
+    return steep > 0 and steep > MOST_STEEP * float(np.median(straight))
 
 
 def _are_whole(lines: Floats, looked: Looked) -> BoolArray:

@@ -23,7 +23,7 @@ from .field import NONE_EXACT, Case, Field, Interpreted, is_normalised, is_proje
 from .placement import check_kind, check_spacing, is_cubic, steps_of
 from .planes import SampleArray, changed
 from .refusals import MOST_NAMED, choose_label, choose_level, is_density, named, refusal, way_out
-from .slopes import ENOUGH, median
+from .slopes import ENOUGH
 from .transforms import Transform, find_transform
 from .unknown import filled, without_unseen
 
@@ -183,7 +183,7 @@ def _is_step(looked: Looked) -> bool:
     if len(across) < ENOUGH:
         return False
     low, high = np.quantile(looked.lines, [STEP_TAIL, 1 - STEP_TAIL])
-    return bool(median(np.abs(across[:, 1] - across[:, 0])) > STEP * (high - low))
+    return bool(np.median(np.abs(across[:, 1] - across[:, 0])) > STEP * (high - low))
 
 
 def _of_signs(case: Case, zeros: int = 0) -> Interpreted:

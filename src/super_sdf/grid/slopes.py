@@ -32,31 +32,6 @@ MOST_BESIDE = 1 << 18  # samples beside the surface of which gradients are taken
 
 Floats: TypeAlias = NDArray[np.float64]
 
-# NumPy's own median, quantile and unique import its masked arrays, which takes 9 ms.
-
-
-def median(values: NDArray[Any]) -> float:
-    """Return the median of some values."""
-    ordered = np.sort(values)
-    return float(ordered[(len(ordered) - 1) // 2 : len(ordered) // 2 + 1].mean())
-
-
-def quantile(values: NDArray[Any], share: float) -> float:
-    """Return the value below which a share of some values lies, interpolated linearly."""
-    ordered = np.sort(values, axis=None)
-    place = (len(ordered) - 1) * share
-    low, high = float(ordered[int(place)]), float(ordered[min(int(place) + 1, len(ordered) - 1)])
-    rest = place - int(place)
-    return low + (high - low) * rest if rest < 0.5 else high - (high - low) * (1 - rest)
-
-
-def distinct(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the different values, in order."""
-    ordered = np.sort(values, axis=None)
-    different: NDArray[Any] = ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]]
-    return different
-
-
 @dataclass(frozen=True, eq=False)
 class Gradients:
     """Gradients (n, 3) of a field at some samples, in index units, and how bent it is there.
@@ -80,7 +55,7 @@ class Gradients:
     @cached_property
     def straighter(self) -> BoolArray:
         """Which are in the less bent half of the field, (n,); of enough, below ``STRAIGHT``."""
-        limit = median(self.bend)
+        limit = float(np.median(self.bend))
         if (self.bend < STRAIGHT).sum() >= ENOUGH:
             limit = min(limit, STRAIGHT)
         return self.bend <= limit

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray, Triple
 from .census import BESIDE, Looked
 from .placement import is_cubic
-from .slopes import Floats, median
+from .slopes import Floats
 
 MOST_PATCHES = 1 << 12  # samples that are compared with all round them
 LEAST = 20  # samples from which shares of them are evidence
@@ -80,7 +80,7 @@ def _beside(patches: Floats, inside: BoolArray, steps: Floats) -> tuple[float, f
     centre, is_in = (x[beside, BESIDE, BESIDE, BESIDE] for x in (patches, inside))
     ends: list[float] = []
     for side in (-centre[is_in], centre[~is_in]):
-        middle = median(side) if len(side) else 0.0
+        middle = float(np.median(side)) if len(side) else 0.0
         alike = np.abs(side - middle) <= ERROR * np.abs(centre).max(initial=0)
         if len(side) < LEAST // 2 or alike.mean() < MOST:
             return None

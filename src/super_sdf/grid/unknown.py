@@ -22,7 +22,7 @@ from ..errors import GridError
 from .census import Census, Extremes, not_finite
 from .planes import SampleArray, SamplePlanes
 from .regions import Ints, Regions, with_the_one_before
-from .slopes import as_float64, distinct, quantile
+from .slopes import as_float64
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
 WAY_OUT = "replace each by a distance of the right sign (the cut-off value of its side)"
@@ -260,7 +260,7 @@ def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
 def _least_steep(pairs: Floats, ordered: Floats, has: BoolArray, extreme: BoolArray) -> float:
     """Return what ``_steepest`` exceeds, by all changes in order; 0 where that does not show."""
     inner = pairs[~(has | extreme)]
-    if len(distinct(inner[:MANY])) < LEAST_VALUES:
+    if len(np.unique(inner[:MANY])) < LEAST_VALUES:
         return 0.0
     first, last = np.searchsorted(ordered, [0, np.ptp(inner)], "right")
     rest = last - first - int((has[0] | has[1]).sum())  # if all others are steeper
@@ -289,13 +289,13 @@ def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
     changes = change[(pairs != value).all(0)]
     span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
     changes = changes[(changes > 0) & (changes <= span)]
-    if len(changes) < ENOUGH or len(distinct(inner[:MANY])) < LEAST_VALUES:
+    if len(changes) < ENOUGH or len(np.unique(inner[:MANY])) < LEAST_VALUES:
         low, high = rest.min(initial=0), rest.max(initial=0)
         return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
     # A field that levels off, or with far spacings along one axis, is steepest at the surface.
     across = change[is_inner.all(0) & ((pairs[0] > 0) != (pairs[1] > 0))]
-    steepest = quantile(changes, STEEPEST)
-    return max(steepest, quantile(across, STEEPEST)) if len(across) >= ENOUGH else steepest
+    steepest = float(np.quantile(changes, STEEPEST))
+    return max(steepest, float(np.quantile(across, STEEPEST))) if len(across) >= ENOUGH else steepest
 
 
 def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:

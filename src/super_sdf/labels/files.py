@@ -61,7 +61,7 @@ class LabelConversion:
             **describe_place(self.grid),
             "labels": self.labels,
             "missing": self.missing,
-            "inferred": [*self.grid.notes, *self.notes],
+            "inferred": list(self.notes),
         }
 
 
@@ -131,7 +131,7 @@ def convert_labels(
         grid,
         rows,
         [{"label": label, "name": entry.name} for label, entry in missing.items()],
-        (*local_origin_note(target, meshes), *off),
+        (*grid.notes, *local_origin_note(target, meshes), *off),
         watch.seconds,
     )
 

@@ -88,10 +88,9 @@ def item_of_files(
         item.certificate = {"error": str(error)}
     item.show(RESULT, shown, certificate)
     lattice = cubic_grid(samples, options.offset)
-    hidden = lattice.field.unseen is not None
-    if lattice.field.unseen is None and len(
-        (coarse := coarse_surface(lattice, options.offset)).faces
-    ):
+    known = lattice.field.unseen is None  # beside what is unknown, a coarse surface is made up
+    coarse = coarse_surface(lattice, options.offset) if known else None
+    if coarse and len(coarse.faces):
         if certificate:
             checked = check_mesh(coarse, samples, options, intersections=False)
         title = COARSE + (", made equally spaced" if lattice.shape != samples.shape else "")
@@ -104,14 +103,10 @@ def items_folder(page: Path) -> Path:
     return page.with_name(f"{page.stem}-files")
 
 
-def item_name(target: str) -> str:
-    """Return the name of an item by its output: 16 hexadecimal digits."""
-    return hashlib.sha256(target.encode("utf-8", "surrogatepass")).hexdigest()[:16]
-
-
 def item_path(folder: Path, target: str) -> Path:
-    """Return the file of the item of an output."""
-    return folder / f"{item_name(target)}.js"
+    """Return the file of the item of an output; its stem is the id that the page uses."""
+    digest = hashlib.sha256(target.encode("utf-8", "surrogatepass")).hexdigest()
+    return folder / f"{digest[:16]}.js"
 
 
 def keep_item(item: Item, folder: Path, target: str, sha256: str) -> None:
@@ -210,28 +205,20 @@ def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
     if not found:
         return []
     surface, residual = found["surface"], found["residual"]
-    rows = [["checked", f"{found['samples']['exact']:,} exact samples near the surface"]]
+    kinds, pairs = ("closed", "oriented", "manifold"), surface["self_intersections"]
+    facts = {"checked": f"{found['samples']['exact']:,} exact samples near the surface"}
     if residual:
-        rows += [
-            ["mean residual", f"{residual['mean']:.4f} voxels"],
-            ["99th percentile", f"{residual['p99']:.4f} voxels"],
-            ["largest residual", f"{residual['largest_signed']:+.4f} voxels"],
-            ["above 0.1 voxel", f"{residual['share_above_tenth']:.2%} of the samples"],
-        ]
+        facts["mean residual"] = f"{residual['mean']:.4f} voxels"
+        facts["99th percentile"] = f"{residual['p99']:.4f} voxels"
+        facts["largest residual"] = f"{residual['largest_signed']:+.4f} voxels"
+        facts["above 0.1 voxel"] = f"{residual['share_above_tenth']:.2%} of the samples"
     else:
-        rows.append(["residual", "unknown, since no sample is exact"])
-    qualities = [
-        ("" if surface[key] else "not ") + key for key in ("closed", "oriented", "manifold")
-    ]
-    pairs = surface["self_intersections"]
-    return [
-        *rows,
-        ["surface", ", ".join(qualities)],
-        ["components", f"{surface['components']:,}"],
-        ["self-intersections", "not counted" if pairs is None else f"{pairs:,}"],
-        ["volume", f"{surface['volume']:.6g}"],
-        ["area", f"{surface['area']:.6g}"],
-    ]
+        facts["residual"] = "unknown, since no sample is exact"
+    facts["surface"] = ", ".join(("" if surface[kind] else "not ") + kind for kind in kinds)
+    facts["self-intersections"] = "not counted" if pairs is None else f"{pairs:,}"
+    facts["components"] = f"{surface['components']:,}"
+    facts["volume, area"] = f"{surface['volume']:.6g}, {surface['area']:.6g}"
+    return [[label, text] for label, text in facts.items()]
 
 
 def numbers(values: Iterable[float]) -> str:

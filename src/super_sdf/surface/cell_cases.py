@@ -77,18 +77,9 @@ def with_triangles(
     used = np.arange(places.shape[1]) < sides[:, None] - 2
     loop = np.nonzero(used)[0]
     times = np.bincount(np.repeat(np.arange(len(loops)), loops)[loop], minlength=len(loops))
-    return Tables(
-        ambiguous,
-        number,
-        loops,
-        first_loop,
-        sides.astype(np.int64),
-        edges,
-        places,
-        times,
-        np.cumsum(times) - times,
-        edges[loop[:, None], places[used]].astype(np.int64),
-    )
+    of_loops = loops, first_loop, sides.astype(np.int64), edges, places
+    triangles = edges[loop[:, None], places[used]].astype(np.int64)
+    return Tables(ambiguous, number, *of_loops, times, np.cumsum(times) - times, triangles)
 
 
 def make_tables() -> Tables:

@@ -117,8 +117,7 @@ def keys_of(node_ijk: IntArray, shape: NDArray[Any], factor: int) -> NDArray[np.
     """Return the keys of nodes (n, 3), counted from the first of the whole: see ``extract``."""
     _, ny, nz = (factor * (shape + 2) + 1).tolist()
     i, j, k = node_ijk.T.astype(np.int64) + factor
-    keys: NDArray[np.int64] = KEYS_PER_NODE * ((i * ny + j) * nz + k)
-    return keys
+    return np.asarray(KEYS_PER_NODE * ((i * ny + j) * nz + k))
 
 
 def to_world(positions: NDArray[np.float64], factor: int, lattice: SdfGrid) -> NDArray[np.float64]:

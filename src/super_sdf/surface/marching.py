@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -50,51 +50,49 @@ class Crossings:
     cell: NDArray[np.int16]  # (c,), ... crossed cells of their blocks ...
     case: NDArray[np.int16]  # (c,), ... and the cases of these cells (``cell_cases``)
 
+    def with_cells(self, chosen: BoolArray) -> Crossings:
+        """Return the crossings with some of the cells, a mask (c,)."""
+        cells = self.cell_row[chosen], self.cell[chosen], self.case[chosen]
+        return Crossings(self.own_row, self.own_edge, self.other_row, self.other_edge, *cells)
+
 
 def find_crossings(field: FineField, threads: int = 1) -> Crossings:
     """Return the edges and cells that the surface crosses."""
-    chunks = map_chunks(
-        lambda rows: _crossings_of_chunk(field, rows.start, rows.stop),
-        len(field.voxel_ijk),
-        4 * len(field.blocks),
-        threads,
-    )
-    empty = _crossings_of_chunk(field, 0, 0)
+    work, width = partial(_crossings_of_chunk, field), 4 * len(field.blocks)
+    chunks = map_chunks(work, len(field.voxel_ijk), width, threads)
+    empty = work(slice(0, 0))
     return Crossings(*(np.concatenate(arrays) for arrays in zip(empty, *chunks)))
 
 
-def _crossings_of_chunk(field: FineField, start: int, stop: int) -> tuple[NDArray[Any], ...]:
-    """Return the arrays of ``Crossings`` for the voxels from ``start`` to before ``stop``."""
-    inside = field.blocks[:, start:stop] <= 0
-    crossed = np.flatnonzero(inside.any(0) & ~inside.all(0))
-    rows = (start + crossed).astype(np.int32)
-    inside = inside.take(crossed, 1).reshape(*(field.factor + 1,) * 3, -1)
-    slot, edge = _split(_crossed_edges(inside), rows, 3 * len(field.blocks))
-    owner = field.parts.owner[part_of_edge(field.factor)[edge], slot]
-    own = owner == CENTRE
-    corners = _corners_inside(inside)
+def _crossings_of_chunk(field: FineField, chunk: slice) -> tuple[NDArray[Any], ...]:
+    """Return the arrays of ``Crossings`` for some of the voxels."""
+    inside, factor, edges = field.blocks[:, chunk] <= 0, field.factor, 3 * len(field.blocks)
+    some = np.flatnonzero(inside.any(0) & ~inside.all(0))
+    rows = (chunk.start + some).astype(np.int32)
+    inside = inside.take(some, 1).reshape(*(factor + 1,) * 3, -1)
+    crossed = np.zeros((3, *inside.shape), bool)  # the edges
+    np.not_equal(inside[1:], inside[:-1], out=crossed[0, :-1])
+    np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[1, :, :-1])
+    np.not_equal(inside[:, :, 1:], inside[:, :, :-1], out=crossed[2, :, :, :-1])
+    row, edge = _split(np.flatnonzero(np.moveaxis(crossed, -1, 0)), rows, edges)
+    own = field.parts.owner[part_of_edge(factor)[edge], row] == CENTRE
+    bits: NDArray[Any] = inside.view(np.uint8)  # for the corners of each cell
+    bits = bits[:, :, :-1] | bits[:, :, 1:] << 1
+    bits = bits[:, :-1] | bits[:, 1:] << 2
+    bits = bits[:-1] | bits[1:] << 4
+    corners = np.moveaxis(bits, -1, 0).ravel()
     active = np.flatnonzero(corners - np.uint8(1) < 254)  # 0 and 255 are not crossed
-    cell_row, cell = _split(active, rows, field.factor**3)
-    if field.octants is not None:
-        seen = (field.octants[cell_row] >> octant_of_cells(field.factor)[cell] & 1).astype(bool)
+    cell_row, cell = _split(active, rows, factor**3)
+    if field.octants is not None:  # only cells between known samples, and the edges of these
+        seen = (field.octants[cell_row] >> octant_of_cells(factor)[cell] & 1).astype(bool)
         cell_row, cell, active = cell_row[seen], cell[seen], active[seen]
-        kept = _are_edges_of(cell_row, cell, slot, edge, field.factor)
-        slot, edge, own = slot[kept], edge[kept], own[kept]
+        # An edge on a face is kept in all blocks that share it, or in none: the cells on either
+        # side of the face lie between the same samples.
+        low = cell_row * np.int64(edges) + cells_low_nodes(factor)[cell]
+        kept = np.isin(row * np.int64(edges) + edge, low[:, None] + edge_steps(factor))
+        row, edge, own = row[kept], edge[kept], own[kept]
     case = choose_cases(field, corners[active], cell_row, cell)
-    return slot[own], edge[own], slot[~own], edge[~own], cell_row, cell, case
-
-
-def _are_edges_of(
-    cell_row: IntArray, cell: NDArray[np.int16], row: IntArray, edge: NDArray[np.int16], factor: int
-) -> BoolArray:
-    """Return which edges of voxels' blocks belong to some cells of these blocks.
-
-    On the faces of a block this is so in all blocks that share the edge: the cells on either side
-    of a face lie between the same samples.
-    """
-    edges = 3 * (factor + 1) ** 3
-    low = cell_row * np.int64(edges) + cells_low_nodes(factor)[cell]
-    return np.isin(row * np.int64(edges) + edge, low[:, None] + edge_steps(factor))
+    return row[own], edge[own], row[~own], edge[~own], cell_row, cell, case
 
 
 def _split(
@@ -103,24 +101,6 @@ def _split(
     """Return the row and the column of flat indices into a table; ``rows`` names its rows."""
     line = places // width
     return rows[line], (places - line * width).astype(np.int16)
-
-
-def _crossed_edges(inside: BoolArray) -> NDArray[np.intp]:
-    """Return the crossed edges of blocks (K+1, K+1, K+1, n), flat in a table (n, 3 Q)."""
-    crossed = np.zeros((3, *inside.shape), bool)
-    np.not_equal(inside[1:], inside[:-1], out=crossed[0, :-1])
-    np.not_equal(inside[:, 1:], inside[:, :-1], out=crossed[1, :, :-1])
-    np.not_equal(inside[:, :, 1:], inside[:, :, :-1], out=crossed[2, :, :, :-1])
-    return np.flatnonzero(np.moveaxis(crossed, -1, 0))
-
-
-def _corners_inside(inside: BoolArray) -> NDArray[np.uint8]:
-    """Return a bit for each corner of all cells of such blocks, (n K^3,), voxel by voxel."""
-    bits: NDArray[Any] = inside.view(np.uint8)
-    bits = bits[:, :, :-1] | bits[:, :, 1:] << 1
-    bits = bits[:, :-1] | bits[:, 1:] << 2
-    bits = bits[:-1] | bits[1:] << 4
-    return np.moveaxis(bits, -1, 0).ravel()
 
 
 def choose_cases(
@@ -205,15 +185,9 @@ def connect(field: FineField, crossings: Crossings, threads: int = 1) -> IntArra
         first, last = planes[run[0]], planes[run[1]]
         before = planes[max(run[0] - 1, 0)]
         own = _between(crossings.own_row, before, last)
-        vertex_at = edge_table(
-            field,
-            crossings,
-            lambda row: row - before,
-            int(last - before),
-            own,
-            _between(crossings.other_row, first, last),
-            np.arange(own.start, own.stop),
-        )
+        others, numbers = _between(crossings.other_row, first, last), np.arange(own.start, own.stop)
+        slot, size = (lambda row: row - before), int(last - before)
+        vertex_at = edge_table(field, crossings, slot, size, own, others, numbers)
         some = _between(crossings.cell_row, first, last)
         low = (crossings.cell_row[some] - before) * (3 * len(field.blocks))
         low += cells_low_nodes(field.factor)[crossings.cell[some]]
@@ -272,8 +246,7 @@ def owners_of(
 @lru_cache
 def edge_shifts(factor: int) -> NDArray[np.int64]:
     """Return an edge's number in a block minus its number in each neighbouring block, (27,)."""
-    shifts: NDArray[np.int64] = factor * NEIGHBOURHOOD.astype(np.int64) @ strides(factor)
-    return shifts
+    return np.asarray(factor * NEIGHBOURHOOD @ strides(factor), np.int64)
 
 
 def strides(factor: int) -> NDArray[np.int64]:
@@ -285,8 +258,7 @@ def strides(factor: int) -> NDArray[np.int64]:
 def octant_of_cells(factor: int) -> NDArray[np.uint8]:
     """Return the octant of the voxel, 0 to 7, in which each cell of a block lies, (K^3,)."""
     low = block_ijk(factor)[cells_low_nodes(factor)]
-    octant: NDArray[np.uint8] = ((low >= factor // 2) @ np.array([4, 2, 1])).astype(np.uint8)
-    return octant
+    return np.asarray((low >= factor // 2) @ np.array([4, 2, 1]), np.uint8)
 
 
 @lru_cache

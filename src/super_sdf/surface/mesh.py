@@ -117,16 +117,9 @@ class Mesh:
     def pair_edges(self) -> tuple[IntArray, NDArray[np.intp], int]:
         """Find the neighbour of each triangle across each of its edges, by sorting all edges.
 
-        Returns
-        -------
-        (3 m,) int32
-            The other half of each half-edge; half-edge 3 f + i runs from corner i of face f to the
-            next corner. -1 if the edge is not shared by exactly two triangles that pass it in
-            opposite directions.
-        (e,) int
-            How many triangles each edge has.
-        int
-            The number of edges that two triangles pass in the same direction.
+        Returned are the other half of each half-edge, (3 m,): 3 f + i runs from corner i of face f
+        to the next one, and has -1 if not exactly two triangles pass it, in opposite directions.
+        Then how many triangles each edge has, and how many edges two pass in the same direction.
         """
         faces = self.faces
         start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
@@ -167,16 +160,6 @@ def check_mesh(mesh: Any) -> None:
     """Raise OptionTypeError if ``mesh`` is not a ``Mesh``."""
     if not isinstance(mesh, Mesh):
         raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
-
-
-def join_meshes(pieces: list[Mesh]) -> Mesh:
-    """Join pieces, in order, whose faces index the vertices of all pieces."""
-    if len(pieces) == 1:
-        return pieces[0]
-    return Mesh(
-        np.concatenate([piece.vertices for piece in pieces]),
-        np.concatenate([piece.faces for piece in pieces]),
-    )
 
 
 def row_keys(rows: NDArray[np.float64]) -> NDArray[np.uint64]:

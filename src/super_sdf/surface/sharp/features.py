@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -166,20 +166,9 @@ def find_features(
     count, features = len(crossings.own_row), len(placed.peak)
     numbers = np.concatenate([used, np.arange(count, count + features)]).astype(np.int32)
     feature = patches.chosen(placed.feature)
-    return Features(
-        used,
-        placed.position,
-        placed.peak,
-        feature.low.astype(np.int64),
-        feature.loop - tables().first_loop[crossings.case[feature.cell]],
-        numbers[corners],
-        replace(
-            crossings,
-            cell_row=crossings.cell_row[plain],
-            cell=crossings.cell[plain],
-            case=crossings.case[plain],
-        ),
-    )
+    nth = feature.loop - tables().first_loop[crossings.case[feature.cell]]
+    where = placed.position, placed.peak, feature.low.astype(np.int64), nth
+    return Features(used, *where, numbers[corners], crossings.with_cells(plain))
 
 
 def _kept_in_grid(position: Vectors, start: Vectors, box: Vectors) -> Vectors:
@@ -218,12 +207,8 @@ def find_candidates(
     planes = settle_planes(some, own, threads) if len(inside) else own
     sharp = np.flatnonzero(is_sharp(some, planes.normal, own.trust))
     chosen = some.chosen(sharp)
-    parts = map_chunks(
-        lambda rows: _measure(chosen.chosen(rows), planes, own, field),
-        len(sharp),
-        TEMPORARIES,
-        threads,
-    )
+    work = partial(_measure, chosen, planes, own, field)
+    parts = map_chunks(work, len(sharp), TEMPORARIES, threads)
     empty = np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 10)), np.empty(0, np.int32)
     middle, point, evidence, spheres = (np.concatenate(arrays) for arrays in zip(empty, *parts))
     evidence[:, OF_PATCH:] = _mean_along_chain(chosen, evidence[:, OF_PATCH:])
@@ -354,7 +339,7 @@ class Contact(NamedTuple):
 
 
 def _measure(
-    patches: Patches, planes: Planes, own: Planes, field: FineField
+    patches: Patches, planes: Planes, own: Planes, field: FineField, rows: slice
 ) -> tuple[Vectors, Vectors, Vectors, IntArray]:
     """Return the middle of some patches, the point on the edge, evidence, and how many spheres.
 
@@ -365,7 +350,8 @@ def _measure(
     how much a sphere is pierced; how many are touched; how far spheres moved the point; how far it
     is outside.
     """
-    factor, crossing, there, count = field.factor, patches.crossing, patches.there, len(patches.row)
+    patches, factor = patches.chosen(rows), field.factor
+    crossing, there, count = patches.crossing, patches.there, len(patches.row)
     wedges = wedges_of(planes.point[crossing] / factor, planes.normal[crossing], there)
     assert field.spheres is not None  # otherwise no features are looked for
     near = find_spheres(wedges, field.voxel_ijk[patches.row].astype(np.int64), field.spheres)
@@ -467,12 +453,12 @@ def contact_of(point: Vectors, near: Nearby) -> Contact:
     away = point[:, near.wedge] - near.centre
     along = _along(away, near.tangent)
     across = away - along * near.tangent
-    length = np.sqrt(_along(across, across))
-    direction = across / np.maximum(length, 1e-12)
+    apart = np.sqrt(_along(across, across))
+    direction = across / np.maximum(apart, 1e-12)
     first, second = _along(direction, near.outward[0]), _along(direction, near.outward[1])
     in_cone = (first > near.cosine * second) & (second > near.cosine * first)
-    in_cone &= near.may_touch & (length > LEAST_RADIUS)
-    return Contact(direction, along, length - near.radius, in_cone, np.abs(along) < CLOSE_BY)
+    in_cone &= near.may_touch & (apart > LEAST_RADIUS)
+    return Contact(direction, along, apart - near.radius, in_cone, np.abs(along) < CLOSE_BY)
 
 
 def lean(wedges: Wedges, near: Nearby) -> Vectors:

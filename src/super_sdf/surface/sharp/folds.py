@@ -183,8 +183,7 @@ def _cells_of(first: Index, last: Index, rows: Index) -> tuple[Index, Index]:
 def keys_of(ijk: NDArray[Any]) -> Index:
     """Return a number for each cell, (n,)."""
     i, j, k = ijk.astype(np.int64).T
-    keys: Index = (i * FARTHEST + j) * FARTHEST + k
-    return keys
+    return np.asarray((i * FARTHEST + j) * FARTHEST + k)
 
 
 def intersecting(points: Vectors, first: Index, second: Index) -> tuple[Index, Index]:

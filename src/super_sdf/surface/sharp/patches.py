@@ -17,7 +17,7 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -50,12 +50,8 @@ PULL = 0.5  # share of the way to the middle of its crossings that a vertex whic
 
 def voxels_near_kinks(field: FineField, threads: int = 1) -> BoolArray:
     """Return the voxels, (D,), in which slopes change at a node as at an edge."""
-    bends = map_chunks(
-        lambda rows: _largest_bends(field, rows),
-        len(field.voxel_ijk),
-        TEMPORARIES * len(field.blocks),
-        threads,
-    )
+    work, width = partial(_largest_bends, field), TEMPORARIES * len(field.blocks)
+    bends = map_chunks(work, len(field.voxel_ijk), width, threads)
     near: BoolArray = np.concatenate([np.empty(0, np.float32), *bends]) > BEND
     return near
 

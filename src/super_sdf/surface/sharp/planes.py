@@ -173,9 +173,22 @@ def settle_planes(patches: Patches, own: Planes, threads: int = 1) -> Planes:
     planes, rows = Planes(own.point, own.normal, trust), np.flatnonzero(near)
     chunks = _chunks_of_loops([loop[:, near[loop].any(0)] for loop in loops])
     threads = worthwhile_threads(PAIR_TEMPORARIES * sum(loop.size for loop in chunks), threads)
+    if not chunks:
+        return planes
+    crossing = np.concatenate([loop.ravel() for loop in chunks])
+    start = own.point[rows]
     for _ in range(ROUNDS):
         parts = map_threads(partial(_sums_in_loops, planes, own), chunks, threads)
-        planes = _settle_once(planes, own, parts, rows)
+        sums = np.concatenate(parts, 1)
+        summed = np.stack([np.bincount(crossing, each, len(trust))[rows] for each in sums])
+        total, off, passed_on = summed[:3]
+        mine, trusted = planes.normal[rows], planes.trust[rows]
+        mean = unit(summed[3:].T + trusted[:, None] * mine)
+        here = dot(start - planes.point[rows], mine)
+        height = (off + trusted * here) / (total + trusted)
+        planes = Planes(planes.point.copy(), planes.normal.copy(), planes.trust.copy())
+        planes.point[rows], planes.normal[rows] = start - height[:, None] * mean, mean
+        planes.trust[rows] = np.maximum(trusted, WEAKENING * passed_on / (total + 1e-12))
     return planes
 
 
@@ -187,26 +200,8 @@ def _chunks_of_loops(loops: list[Index]) -> list[Index]:
     ]
 
 
-def _settle_once(
-    planes: Planes, own: Planes, parts: list[tuple[Index, Vectors]], rows: Index
-) -> Planes:
-    """Return the planes after one round; only those of some rows change."""
-    crossing, sums = (np.concatenate(arrays, -1) for arrays in zip(*parts))
-    total, off, passed_on, *normal = (
-        np.bincount(crossing, each, len(own.trust))[rows] for each in sums
-    )
-    start, mine, trust = own.point[rows], planes.normal[rows], planes.trust[rows]
-    mean = unit(np.stack(normal, 1) + trust[:, None] * mine)
-    here = dot(start - planes.point[rows], mine)
-    height = (off + trust * here) / (total + trust)
-    point, new, trusted = planes.point.copy(), planes.normal.copy(), planes.trust.copy()
-    point[rows], new[rows] = start - height[:, None] * mean, mean
-    trusted[rows] = np.maximum(trust, WEAKENING * passed_on / (total + 1e-12))
-    return Planes(point, new, trusted)
-
-
-def _sums_in_loops(planes: Planes, own: Planes, loop: Index) -> tuple[Index, Vectors]:
-    """Return crossings of patches (e,), and for each sums over the others of its patch, (6, e).
+def _sums_in_loops(planes: Planes, own: Planes, loop: Index) -> Vectors:
+    """Return for each crossing of patches (S, p) sums over the others of its patch, (6, S p).
 
     Of the weights, and weighted: how far it lies off their planes, their trust, their normals.
     """
@@ -223,7 +218,7 @@ def _sums_in_loops(planes: Planes, own: Planes, loop: Index) -> tuple[Index, Vec
         sums[1] += weight * off
         sums[2] += weight * trust[here]
         sums[3:] += weight * normal[:, here]
-    return loop.ravel(), sums.reshape(6, -1)
+    return sums.reshape(6, -1)
 
 
 def _along(a: Vectors, b: Vectors) -> Numbers:
