@@ -29,7 +29,6 @@ import xarray as xr
 from conftest import refusal
 from pydicom.uid import CTImageStorage, ExplicitVRLittleEndian, generate_uid
 from test_formats import (
-    CENTRE,
     DATA,
     OBLIQUE,
     ORIENTED,
@@ -46,7 +45,7 @@ from vtkmodules.vtkIOHDF import vtkHDFWriter
 
 from super_sdf import read_grid
 from super_sdf.errors import SuperSdfError
-from super_sdf.files.formats import DICOM, FORMATS, find_format, is_grid, split_member
+from super_sdf.files.formats import DICOM, find_format, is_grid
 from super_sdf.files.grids import open_volume
 
 STEPS = np.array([0.5, 0.7, 0.9])
@@ -245,29 +244,6 @@ def test_legacy_vtk(name):
     check(read_grid(path), STEPS)
 
 
-def test_one_of_several_arrays_of_vtk():
-    image = image_of(AFFINE)
-    image["other"] = image["distance"] + 1
-    image["vector"] = image.points
-    image.save("a.vtk")
-    check(read_grid("a.vtk:distance"), STEPS)
-    said = "a.vtk holds several arrays, distance, other: give a.vtk:distance, say"
-    assert said_of("a.vtk") == said
-    said = "its array 'vector' has 3 numbers per sample: give an array of one"
-    assert said in said_of("a.vtk:vector")
-
-
-def test_uneven_coordinates_are_refused_with_a_line_that_resamples():
-    x, y, z = (CORNER[a] + STEPS[a] * np.arange(SIZES[a]) for a in range(3))
-    y = np.linspace(0, 1, len(y)) ** 1.3 * (y[-1] - y[0]) + y[0]
-    image = pyvista.RectilinearGrid(x, y, z)
-    image["distance"] = part(image.points)
-    image.save("a.vtk")
-    assert said_of("a.vtk").startswith("a.vtk: its coordinates along y are uneven: resample it")
-    pyvista.create_grid(image, dimensions=image.dimensions).sample(image).save("even.vti")
-    check(read_grid("even.vti:distance"), STEPS, 0.25)  # linear, in steps of up to 0.9
-
-
 # NetCDF
 
 
@@ -309,23 +285,6 @@ def test_netcdf_packed_with_units_a_time_and_named_axes():
         array[name].attrs["axis"] = axis.upper()
     array.to_netcdf("c.nc")
     check(read_grid("c.nc"), STEPS)
-
-
-def test_one_of_several_variables_and_uneven_ones():
-    array = array_of()
-    xr.Dataset({"a": array, "b": array + 1, "flat": array[0]}).to_netcdf("a.nc")
-    check(read_grid("a.nc:a"), STEPS)
-    assert said_of("a.nc") == "a.nc holds several arrays, /a, /b: give a.nc:/a, say"
-    array = array.assign_coords(z=array["z"] ** 2)
-    array.to_netcdf("uneven.nc")
-    assert re.fullmatch(
-        r"uneven\.nc: coordinates of 'z' are not evenly spaced: \S+ is followed by \S+, a step of "
-        r"\S+ among steps of \S+; resample the array \(array\.interp\(z=\.\.\.\)\)",
-        said_of("uneven.nc"),
-    )
-    array = array_of().drop_vars(list("xyz"))
-    array.to_netcdf("bare.nc")
-    check(read_grid("bare.nc", spacing=STEPS, origin=CORNER), STEPS)
 
 
 # MATLAB

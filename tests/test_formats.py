@@ -21,12 +21,12 @@ import SimpleITK as sitk  # noqa: N813
 import tifffile
 import trimesh
 import zarr
-from conftest import ball, refusal
+from conftest import ball
 from numpy.typing import ArrayLike
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
 from super_sdf import SdfGrid, read_grid
-from super_sdf.errors import FileError, GridError, OptionError
+from super_sdf.errors import GridError
 from super_sdf.files import formats
 
 DATA = Path(__file__).parent / "data"
@@ -172,38 +172,6 @@ def test_a_direction_is_given_where_the_file_has_none():
         check(grid)
         assert np.allclose(grid.direction, OBLIQUE)
     assert read_grid("a.npz", direction=np.eye(3)).is_straight
-
-
-def test_nifti_by_qform_and_slope():
-    affine = affine_of(TURNS[5])
-    raw = nibabel.Nifti1Image(sampled(affine), None)
-    raw.set_qform(affine, code=1)
-    raw.header.set_data_dtype(np.int16)  # nibabel chooses slope and intercept
-    nibabel.save(raw, "scaled.nii")
-    assert nibabel.load("scaled.nii").dataobj.slope != 1
-    check(read_grid("scaled.nii"), tolerance=1e-3)
-
-
-def test_hdf5_datasets():
-    affine = affine_of(np.eye(3))
-    with h5py.File("a.h5", "w") as file:
-        file["deep/field"] = sampled(affine).T
-        packed = {"chunks": (4, 5, 6), "compression": "gzip"}
-        file.create_dataset("xyz", data=sampled(affine), **packed)
-        file["xyz"].attrs["spacing"] = [SPACING] * 3
-        file["xyz"].attrs["origin"] = affine[:3, 3]
-        file["flat"] = np.zeros((3, 3))
-        file.create_dataset("um", data=sampled(affine).T)
-        file["um"].attrs["element_size_um"] = [SPACING] * 3
-    check(read_grid("a.h5:/deep/field", spacing=SPACING, origin=affine[:3, 3]))
-    check(read_grid("a.h5:xyz", axes="xyz"))
-    check(read_grid("a.h5:/um", origin=affine[:3, 3]))
-    assert refusal(FileError, read_grid, "a.h5") == (
-        "a.h5 holds several arrays, /deep/field, /um, /xyz: give a.h5:/deep/field, say"
-    )
-    assert refusal(FileError, read_grid, "a.h5:no") == (
-        "a.h5 has no 3D dataset 'no': it holds /deep/field, /um, /xyz"
-    )
 
 
 def text_sdf(affine: np.ndarray) -> str:

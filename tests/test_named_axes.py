@@ -7,7 +7,6 @@ from conftest import refusal, trilinear
 
 from super_sdf import SdfGrid, make_grid, reconstruct
 from super_sdf.errors import GridError, OutOfMemoryError
-from super_sdf.grid import placement
 
 SHAPE = 18, 20, 22  # along x, y, z
 STEP = 0.5, 0.5, 0.5
@@ -54,17 +53,6 @@ def test_without_coordinates_it_is_an_array_with_named_axes():
     assert grid.notes == ("origin not given: sample (0, 0, 0) is at 0, 0, 0",)
     unnamed = make_grid(xarray.DataArray(sphere().values), spacing=0.5)
     assert np.array_equal(grid.values, unnamed.values)
-
-
-def test_coordinates_in_single_precision_are_even_up_to_their_rounding():
-    places = np.float32(1e5) + np.arange(18, dtype=np.float32) / 7
-    steps = np.diff(places)
-    assert steps.max() > 1.03 * steps.min()  # float32 does not hold them
-    found = placement.placed(sphere().assign_coords(x=places))
-    assert found.origin[0] == 1e5 and found.spacing[0] == pytest.approx(1 / 7, rel=0.01)
-    assert "'x' are not evenly spaced" in refusal(
-        GridError, make_grid, sphere().assign_coords(x=places.astype(float))
-    )
 
 
 def test_arrays_of_dask_are_computed_if_they_fit(monkeypatch):

@@ -6,7 +6,6 @@ grid that is read is then its distance there. Files are written by the format's 
 
 from __future__ import annotations
 
-import gzip
 import json
 import re
 from collections.abc import Callable
@@ -26,9 +25,8 @@ from conftest import refusal
 from numpy.typing import ArrayLike
 
 from super_sdf import SdfGrid, read_grid
-from super_sdf.errors import FileError, GridError
-from super_sdf.files.formats import find_format
-from super_sdf.files.grids import describe_grid_file, open_volume
+from super_sdf.errors import FileError
+from super_sdf.files.grids import describe_grid_file
 from super_sdf.files.readers.axes import in_metres
 
 SIZES = 24, 20, 17  # along x, y, z
@@ -100,14 +98,6 @@ def test_imagej_has_a_unit_for_each_axis_and_origins_in_pixels(name, with_origin
     grid = read_grid("a.tif")
     check(grid, steps, FIRST if with_origin else None)
     assert grid.notes[0].endswith(f", {unit}") or grid.notes[0].endswith(f"are in {unit}")
-
-
-def test_a_stack_without_calibration_states_no_spacing():
-    tifffile.imwrite("a.tif", sampled(0.5).T, imagej=True, metadata={"axes": "ZYX"})
-    tifffile.imwrite("b.tif", sampled(0.5).T, photometric="minisblack")
-    for name in ("a.tif", "b.tif"):
-        assert describe_grid_file(name)["spacing"] is None
-        assert not describe_grid_file(name)["notes"]
 
 
 @pytest.mark.parametrize("options", [{}, {"imagej": True, "metadata": {"axes": "ZYX"}}])
@@ -263,46 +253,6 @@ def test_a_size_of_elements_is_in_the_order_of_the_axes():
 # Axes of length 1
 
 
-def write_ones(name: str, shape: tuple[int, ...]) -> None:
-    """Write the part with axes of length 1 among its own."""
-    array = sampled() if name[0] == "n" else sampled().T
-    array = array.reshape(shape)
-    if name.endswith(".npy"):
-        np.save(name, np.asfortranarray(array) if name == "nf.npy" else array)
-    elif name.endswith(".npz"):
-        np.savez(name, values=array)
-    elif name.endswith(".h5"):
-        with h5py.File(name, "w") as file:
-            file.create_dataset("m", data=array, chunks=tuple(min(n, 7) for n in shape))
-    else:
-        made = zarr.create_array(name, shape=shape, dtype="f4", chunks=(5,) * len(shape))
-        made[...] = array
-
-
-@pytest.mark.parametrize("where", [(3,), (1,), (0, 1, 5)])
-@pytest.mark.parametrize("name", ["n.npy", "nf.npy", "n.npz", "a.h5", "a.zarr"])
-def test_axes_of_length_1_are_dropped(name, where):
-    sizes = SIZES if name[0] == "n" else SIZES[::-1]
-    shape = np.expand_dims(np.empty(sizes), where).shape
-    write_ones(name, shape)
-    check(read_grid(name, spacing=STEPS, origin=FIRST))
-    assert describe_grid_file(name)["shape"] == list(SIZES)
-
-
-def test_metaimage_of_four_axes_keeps_its_place():
-    for k, packed in enumerate((False, True)):
-        image = sitk.GetImageFromArray(sampled().T)
-        image.SetSpacing(STEPS.tolist())
-        image.SetOrigin(FIRST.tolist())
-        series = sitk.JoinSeries([image], 7.0, 2.0)
-        assert series.GetDimension() == 4
-        sitk.WriteImage(series, f"{k}.mha", packed)
-        check(read_grid(f"{k}.mha"))
-    turned = sitk.Flip(image, [True, False, True])
-    sitk.WriteImage(sitk.JoinSeries([turned]), "t.mha")
-    check(read_grid("t.mha"))
-
-
 def header_of(**fields: object) -> dict[str, object]:
     """Return an NRRD header with the place of the part, and further fields."""
     place = {"space directions": np.diag(STEPS), "space origin": FIRST}
@@ -385,18 +335,6 @@ def test_nrrd_places_without_directions():
     falling = {"axis mins": [high[0], *FIRST[1:]], "axis maxs": [FIRST[0], *high[1:]], **nodes}
     nrrd.write("f.nrrd", sampled()[::-1], falling)
     check(read_grid("f.nrrd"))
-
-
-def test_units_of_an_nrrd_space():
-    factors = np.array([1, 1, 1000])
-    header = header_of() | {"space directions": np.diag(STEPS * factors)}
-    header |= {"space origin": FIRST * factors, "space units": ["mm", "mm", "um"]}
-    nrrd.write("a.nrrd", sampled(), header)
-    grid = read_grid("a.nrrd")
-    check(grid)
-    assert grid.notes[0] == ("its axes have different units (x mm, y mm, z um): lengths are in mm")
-    nrrd.write("b.nrrd", sampled(), header_of(**{"space units": ["um"] * 3}))
-    assert read_grid("b.nrrd").notes[0] == "lengths are in the unit of its axes, um"
 
 
 # NIfTI
@@ -496,11 +434,28 @@ def test_arrays_of_cells_beside_those_of_points():
     assert read_grid("b.vti:field").shape == tuple(n + 1 for n in SIZES)
 
 
-def test_vectors_and_marks_are_read_only_by_name():
-    image = image_of_both(normal=lambda points: points)
-    image.cell_data["vtkGhostType"] = np.zeros(image.n_cells, np.uint8)
-    image.save("a.vti")
-    check(read_grid("a.vti"))
-    said = refusal(GridError, read_grid, "a.vti:normal")
-    said_ = "a.vti:normal: its array 'normal' has 3 numbers per sample: give an array of one"
-    assert said == said_
+@pytest.mark.parametrize("where", [(3,), (1,), (0, 1, 5)])
+def test_axes_of_length_1_are_dropped(where):
+    shape, turned = (np.expand_dims(each, where).shape for each in (sampled(), sampled().T))
+    np.save("c.npy", sampled().reshape(shape))
+    np.save("f.npy", np.asfortranarray(sampled().reshape(shape)))
+    np.savez("a.npz", values=sampled().reshape(shape))
+    with h5py.File("a.h5", "w") as file:
+        file.create_dataset("m", data=sampled().T.reshape(turned), chunks=(1,) * len(turned))
+    zarr.create_array("a.zarr", shape=turned, dtype="f4")[...] = sampled().T.reshape(turned)
+    for name in ("c.npy", "f.npy", "a.npz", "a.h5", "a.zarr"):
+        check(read_grid(name, spacing=STEPS, origin=FIRST))
+        assert describe_grid_file(name)["shape"] == list(SIZES)
+
+
+def test_one_of_several_arrays_is_named():
+    with h5py.File("a.h5", "w") as file:
+        file["deep/field"], file["other"] = sampled().T, sampled()
+        file["other"].attrs.update(spacing=STEPS, origin=FIRST)
+        file["flat"] = np.zeros((3, 3))
+    check(read_grid("a.h5:/deep/field", spacing=STEPS, origin=FIRST))
+    check(read_grid("a.h5:other", axes="xyz"))
+    said = "a.h5 holds several arrays, /deep/field, /other: give a.h5:/deep/field, say"
+    assert refusal(FileError, read_grid, "a.h5") == said
+    said = "a.h5 has no 3D dataset 'no': it holds /deep/field, /other"
+    assert refusal(FileError, read_grid, "a.h5:no") == said

@@ -18,7 +18,7 @@ from conftest import ball, refusal
 from test_formats import affine_of, sampled, save_vti, text_sdf
 
 from super_sdf import read_grid
-from super_sdf.errors import FileError, GridError, SuperSdfError, seen
+from super_sdf.errors import GridError, SuperSdfError, seen
 from super_sdf.files.readers.zarr import CODECS
 
 VALUES = sampled(affine_of(np.eye(3)))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from math import prod
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
 from ..grid.placement import check_kind
-from ..grid.planes import SamplePlanes
+from ..grid.planes import Index, SamplePlanes
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import AxisOrder, Options, Space, Values, check_path
 from ..threads import held_memory, memory_bound
@@ -161,7 +161,7 @@ class StoredPlanes(SamplePlanes):
             planes[low - first : high - first] = held[1][low - start : high - start]
         return planes
 
-    def crop(self, low: Sequence[int], high: Sequence[int]) -> NDArray[Any]:
+    def crop(self, low: Index, high: Index) -> NDArray[Any]:
         """Return the samples in a box, which alone is read."""
         box = [slice(None)] * 3
         for world, (start, stop, count) in enumerate(zip(low, high, self.shape)):

@@ -80,7 +80,7 @@ class Later:
         loaded = np.asarray(self.load())
         if loaded.shape != self.shape:
             raise FileError(f"its header promises {self.shape} samples, it holds {loaded.shape}")
-        return loaded[which]
+        return np.asarray(loaded[which])
 
 
 @dataclass(frozen=True)

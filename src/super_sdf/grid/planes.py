@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
@@ -18,6 +19,7 @@ from ..threads import check_fits
 FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 LEAST_AT_ONCE = 4  # planes
+LARGE_FILE = 1 << 27  # bytes
 WORKING_BYTES = 1 << 26  # taken at a time when planes are made of others
 EVENLY = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: its multiples, modulo 2^64
 
@@ -215,6 +217,7 @@ def over_planes(
     if not isinstance(samples, SamplePlanes):
         for first, last, *more in ranges:
             yield work(samples[first:last], *more)
+            let_go(samples)
         return
     held = max((last - first for first, last, *_ in ranges), default=0)
     planes = np.empty((held, *samples.shape[1:]), samples.dtype)
@@ -228,6 +231,15 @@ def over_planes(
             planes[low - first : high - first] = samples[low:high]
         start, end = first, max(last, first + kept)
         yield work(planes[: last - first], *more)
+
+
+def let_go(samples: SampleArray) -> None:
+    """Let the system take back the pages of a large mapped file: they count as held memory."""
+    while hasattr(samples, "source"):
+        samples = samples.source
+    mapped = getattr(samples, "_mmap", None)
+    if hasattr(mapped, "madvise") and len(mapped) > LARGE_FILE:
+        mapped.madvise(mmap.MADV_DONTNEED)
 
 
 def in_blocks(samples: SampleArray) -> list[tuple[int, int]]:

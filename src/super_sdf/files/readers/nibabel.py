@@ -8,20 +8,18 @@ from __future__ import annotations
 
 from contextlib import suppress
 from itertools import product
-from math import prod
 from typing import Any
 
 import numpy as np
 
-from ...errors import FileError, GridError
+from ...errors import GridError
 from ...options import RAS
 from ..regular import check_beside
-from ..volume import XYZ, Later, Request, Volume, from_affine, in_words_of
+from ..volume import XYZ, Later, Request, Volume, from_affine, triple
 
 PAIRS = (".img", ".IMG", ".img.gz")
 UNITS = {1: "metre", 3: "micrometre"}  # of lengths, but for millimetres
 ASTRAY = 0.1  # of a voxel: how far sform and qform may place a corner apart without a note
-MOST_DEFLATED = 1100  # deflate reaches 1,030 on zeros
 NO_PLACE = (
     "Analyze files state no place and not which side is left: x, y and z are taken as stored, from "
     "0 on"
@@ -37,15 +35,14 @@ def read_nifti(request: Request) -> Volume:
     """
     image, header = _load(request)
     unit = UNITS.get(int(header["xyzt_units"]) & 7)
-    notes = (f"lengths are in the unit that it states, {unit}",) if unit else ()
+    notes: tuple[str, ...] = (f"lengths are in the unit that it states, {unit}",) * bool(unit)
     codes = int(header["sform_code"]), int(header["qform_code"])
     if codes == (0, 0):
         notes += (
             "it states no place (sform_code and qform_code are 0): its axes are taken as x, y and "
             "z, as ITK does; nibabel would mirror x",
         )
-        steps = np.abs(header.get_zooms()[:3])
-        return Volume(image, tuple(steps.tolist()), None, XYZ, notes=notes)
+        return Volume(image, triple(np.abs(header.get_zooms()[:3])), None, XYZ, notes=notes)
     if min(codes) > 0:
         corners = np.array(list(product(*((0, size - 1) for size in image.shape), [1])))
         off = 0.0
@@ -73,8 +70,7 @@ def read_analyze(request: Request) -> Volume:
         if file.read(348)[344:347] == b"ni1":
             return read_nifti(request)
     image, header = _load(request)
-    steps = tuple(map(float, header.get_zooms()[:3]))
-    return Volume(image, steps, None, XYZ, notes=(NO_PLACE,))
+    return Volume(image, triple(header.get_zooms()[:3]), None, XYZ, notes=(NO_PLACE,))
 
 
 def _load(request: Request) -> tuple[Later, Any]:
@@ -82,20 +78,9 @@ def _load(request: Request) -> tuple[Later, Any]:
     import nibabel
 
     image: Any = nibabel.load(request.path, mmap=False)
-    shape, dtype = image.shape, image.get_data_dtype()
+    proxy, shape, dtype = image.dataobj, image.shape, image.get_data_dtype()
     if len(shape) < 3 or any(size != 1 for size in shape[3:]):
         raise GridError(f"{request.path} has shape {shape}: give a file of three axes (x, y, z)")
-    file = next(each.filename for each in image.file_map.values() if each.filename)
-    file = image.file_map["image"].filename or file
-    size = check_beside(request.path, file.rsplit("/", 1)[-1]).stat().st_size
-    most = MOST_DEFLATED * size if file.lower().endswith(("gz", "bz2")) else size
-    start = int(image.dataobj.offset)
-    if min(shape) < 1 or start + prod(map(int, shape)) * dtype.itemsize > most:
-        raise FileError(
-            f"{file} is truncated: its header promises {in_words_of(shape, dtype)} from byte "
-            f"{start:,} on, but the file has {size:,}"
-        )
-    proxy, scaled = image.dataobj, dtype
     if (getattr(proxy, "slope", 1), getattr(proxy, "inter", 0)) != (1, 0):
-        scaled = np.asarray(proxy[(slice(0, 1),) * len(shape)]).dtype
-    return Later(shape[:3], scaled, lambda: np.asarray(proxy).reshape(shape[:3])), image.header
+        dtype = np.asarray(proxy[(slice(0, 1),) * len(shape)]).dtype
+    return Later(shape[:3], dtype, lambda: np.asarray(proxy).reshape(shape[:3])), image.header

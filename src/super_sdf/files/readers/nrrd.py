@@ -108,6 +108,7 @@ def _place(header: dict[str, Any], space: tuple[int, ...]) -> tuple[tuple[Any, A
     is not stated are cells, as for ITK and teem.
     """
     notes: tuple[str, ...] = ()
+    columns: NDArray[np.float64] | None
     origin, units = header.get("space origin"), header.get("space units")
     if header.get("space directions") is not None:
         columns = np.asarray(header["space directions"], np.float64)[list(space), :3].T

@@ -6,7 +6,6 @@ Or they are those of Open3D's ``VoxelBlockGrid``.
 
 from __future__ import annotations
 
-import zipfile
 from math import prod
 from typing import IO, Any
 
@@ -61,7 +60,8 @@ def read_npz(request: Request) -> Volume:
     archive = request.files.enter_context(np.load(request.path, allow_pickle=False))
     if not isinstance(archive, np.lib.npyio.NpzFile):
         raise FileError(f"{request.path} is not a readable .npz archive: it is one array")
-    names = archive.zip.namelist()
+    zipped: Any = archive.zip
+    names = zipped.namelist()
     if OPEN3D.issubset(names):
         return _read_blocks(archive, request)
     if {"voxels", "factor"} <= set(archive.files):
@@ -72,7 +72,7 @@ def read_npz(request: Request) -> Volume:
     if "values" not in archive.files:
         held = ", ".join(archive.files) or "nothing"
         raise FileError(f"{request.path} has no key 'values' (it holds {held})")
-    place = {}
+    place: dict[str, Any] = {}
     for key in PLACE:
         if key in archive.files:
             place[key] = archive[key]
@@ -81,8 +81,8 @@ def read_npz(request: Request) -> Volume:
                 said = f"shape {place[key].shape} and dtype {place[key].dtype}"
                 raise GridError(f"{request.path}[{key}] has {said}: give {asked}")
     member = "values.npy" if "values.npy" in names else "values"
-    info = archive.zip.getinfo(member)
-    with archive.zip.open(info) as file:
+    info = zipped.getinfo(member)
+    with zipped.open(info) as file:
         shape, order, dtype = _header(file, info.file_size, f"{request.path}[values]")
     return _volume(
         Later(shape, dtype, lambda: archive["values"]), order, request.axes, **place

@@ -36,8 +36,8 @@ def read_metaimage(request: Request) -> Volume:
     pairs = (re.split("[=:]", line, maxsplit=1) for line in lines)
     fields = {pair[0].strip(): pair[-1].strip() for pair in pairs}
     named = found[1].decode(errors="surrogateescape").strip()
-    files = [] if named.lower() == "local" else _names(named, beginning[found.end() :])
-    files = [check_beside(request.path, name) for name in files]
+    names = [] if named.lower() == "local" else _names(named, beginning[found.end() :])
+    files = [check_beside(request.path, name) for name in names]
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(request.path))
@@ -65,8 +65,8 @@ def read_metaimage(request: Request) -> Volume:
         if not is_packed:
             return SimpleITK.GetArrayFromImage(reader.Execute()).T
         is_big = any(_is_true(fields, f"{name}ByteOrderMSB") for name in ("BinaryData", "Element"))
-        data = _unpacked(path, start, promised)
-        return np.frombuffer(data, dtype.newbyteorder("><"[not is_big])).reshape(size[::-1]).T
+        stored = dtype.newbyteorder(">" if is_big else "<")
+        return np.frombuffer(_unpacked(path, start, promised), stored).reshape(size[::-1]).T
 
     steps = np.array(reader.GetSpacing())[list(kept)]
     direction = np.array(reader.GetDirection()).reshape(len(size), -1)[np.ix_(kept, kept)]

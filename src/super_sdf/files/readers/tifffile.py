@@ -23,7 +23,7 @@ def read_tiff(request: Request) -> Volume:
     # not as a file of MicroManager, whose other files would be opened
     opened = tifffile.TiffFile(request.path, is_mmstack=False, is_ndtiff=False)
     file = request.files.enter_context(opened)
-    ome = ElementTree.fromstring(file.ome_metadata) if file.is_ome else None
+    ome = ElementTree.fromstring(file.ome_metadata or "") if file.is_ome else None
     for element in () if ome is None else ome.iter():
         named = element.get("FileName") or element.get("MetadataFile")
         if named and named != request.path.name:

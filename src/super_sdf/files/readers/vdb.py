@@ -26,7 +26,8 @@ Ints = NDArray[np.int64]
 
 OLDEST = 222  # version of the file format, of OpenVDB 3
 MARGIN = 2  # voxels of background around the others, so that the border is outside
-TYPES = {"Tree_float_5_4_3": np.dtype("<f4"), "Tree_double_5_4_3": np.dtype("<f8")}
+FLOAT, DOUBLE = np.dtype("<f4"), np.dtype("<f8")
+TYPES: dict[str, np.dtype[Any]] = {"Tree_float_5_4_3": FLOAT, "Tree_double_5_4_3": DOUBLE}
 HALF = "_HalfFloat"  # ends the type of a grid whose values are stored in 16 bits
 NUMBERS = {"float": "f", "double": "d", "int32": "i", "int64": "q", "bool": "?"}  # of metadata
 # How many vectors a map has, and which are the translation and the scale.
@@ -66,7 +67,7 @@ def read_vdb(request: Request) -> Volume:
     margin = 0 if unknown else MARGIN
     low, high = np.min(lows, 0) - margin, np.max(highs, 0) + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
-    shape, notes = tuple((high - low).tolist()), ()
+    shape, notes = tuple((high - low).tolist()), tuple[str, ...]()
 
     def load() -> NDArray[Any]:
         voxels = tree.voxels(low, shape, unknown=unknown)

@@ -56,11 +56,11 @@ def read_zarr(request: Request) -> Volume:
     total = prod(-(-size // chunk) for size, chunk in zip(array.shape, array.chunks))
     absent = max(total - array.nchunks_initialized, 0)
     none = array.fill_value if version == 2 else None  # as xarray takes it
-    said = values_of(array.dtype, stated, none, absent, total, array.fill_value)
+    kind = values_of(array.dtype, stated, none, absent, total, array.fill_value)
     about = {"chunks": list(array.chunks), "zarr format": version}
     if shards := getattr(array, "shards", None):
         about["shards"] = list(shards)
-    return Volume(array, **place, **said, about=about)
+    return Volume(array, **place, **kind, about=about)
 
 
 class _Store:
