@@ -14,18 +14,19 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import OptionTypeError, OutOfMemoryError, seen
+from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .functions.function import Function, as_function, sampled
 from .grid.cubic import cubic_grid
 from .grid.sdf_grid import SdfGrid, check_grid, crop
 from .network.decoder import Adapter, Decoder, adapt
-from .network.network import given_or_loaded, network_for
+from .network.network import load_network, network_for
 from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
@@ -276,10 +277,14 @@ def reconstruct(
     """
     exact = None if function is None else as_function(function)
     grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
-    network = given_or_loaded(network, quality, device=device, precision=precision, threads=threads)
-    chosen = Options(
-        factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory
-    )
+    where = {"model": quality, "device": device, "precision": precision, "threads": threads}
+    asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
+    if network is None:
+        network = load_network(**asked)
+    elif asked:
+        name = next(iter(asked)).replace("model", "quality")
+        raise OptionError(f"a network and {name} are given: give only one of them")
+    chosen = Options(factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
-from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD
 from ..refine.band import plane_blocks, rescale
 from ..refine.nodes import VoxelIndex
 from ..refine.survey import Band
