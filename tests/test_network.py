@@ -115,7 +115,7 @@ WRONG = {
     "double": (
         [("Cast", ("sum",), "values", {"to": DOUBLE})],
         (DOUBLE, "D", "Q"),
-        r" is no super-sdf network of format 1 .*outputs \{'values': 'tensor\(double\)'\}\): export",
+        r" is no super-sdf network of format 1 .*outputs \{'values': 'tensor\(double\)'\}\)",
     ),
 }
 

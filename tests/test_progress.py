@@ -5,8 +5,11 @@ import sys
 import numpy as np
 import pytest
 from conftest import ball, trilinear
+from test_tiles import Close
 
 from super_sdf import load_network, reconstruct, upsample
+from super_sdf.options import Options
+from super_sdf.pipeline import mesh_grid
 
 
 def reported(work, *arguments):
@@ -20,6 +23,12 @@ def reported(work, *arguments):
 def test_steps_are_reported_in_thousandths_of_their_usual_time():
     assert reported(reconstruct, ball(), trilinear) == [30, 480, 630, 1000]
     assert reported(upsample, ball(), trilinear) == [48, 762, 1000]
+
+
+def test_tiles_are_reported_as_they_are_made():
+    done = []
+    mesh_grid(ball(), Close(), Options(2), progress=lambda n, _: done.append(n), least_tiles=3)
+    assert done == sorted(done) and (done[0], done[-1]) == (30, 1000) and len(set(done)) == 4
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])

@@ -53,7 +53,7 @@ class Network:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how another process, which unpickles it, loads the same file."""
-        return _load_again, (self.path, self.device, self.threads, self.symmetries)
+        return _load_once, (self.path, self.device, self.threads, self.symmetries)
 
     @property
     def receptive_field(self) -> int | None:
@@ -184,7 +184,9 @@ def load_network(
     if runs_on == "cpu":
         session = open_session(path, "cpu", used)  # the file may be the cause of the failure
         if failure and asked == "cuda":
-            raise DeviceError(f"cuda was asked for, but {failure}; or use --device cpu") from failure
+            raise DeviceError(
+                f"cuda was asked for, but {failure}; or use --device cpu"
+            ) from failure
         if failure and has_driver():
             notes += [f"a GPU seems to be here, but the network runs on the CPU: {failure}"]
     card = read_card(session, path)
@@ -197,11 +199,16 @@ def load_network(
     return Network(session, card, runs_on, symmetries, used, tuple(notes), shipped, path)
 
 
-def _load_again(path: Path, device: options.Device, threads: int, symmetries: int) -> Network:
-    return replace(load_network(path, device=device, threads=threads), symmetries=symmetries)
-
-
-_load_once = lru_cache(maxsize=4)(load_network)
+@lru_cache(maxsize=4)
+def _load_once(
+    model: str | Path,
+    device: options.Device,
+    threads: int,
+    symmetries: int,
+    precision: options.Precision = AUTO,
+) -> Network:
+    loaded = load_network(model, device=device, threads=threads, precision=precision)
+    return replace(loaded, symmetries=symmetries)
 
 
 def network_for(network: Decoder, kind: str) -> Decoder:
@@ -215,5 +222,4 @@ def network_for(network: Decoder, kind: str) -> Decoder:
         return network
     if kind == options.NOISY and network.card.get("inputs") != EXACT_DISTANCES:
         return network
-    where = {"device": network.device, "threads": network.threads, "precision": network.precision}
-    return replace(_load_once(kind, **where), symmetries=network.symmetries)
+    return _load_once(kind, network.device, network.threads, network.symmetries, network.precision)
