@@ -43,7 +43,7 @@ from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, pl
 
 def refine(
     grid: SdfGrid,
-    network: Decoder,
+    network: Decoder | Adapter,
     factor: int = 4,
     offset: float = 0.0,
     *,

@@ -49,8 +49,8 @@ class Tile:
 
     def owns(self, voxel_ijk: NDArray[np.integer]) -> BoolArray:
         """Return which voxels (n, 3) belong to the tile, (n,)."""
-        inside: BoolArray = ((voxel_ijk >= self.inner_low) & (voxel_ijk < self.inner_high)).all(1)
-        return inside
+        inside = (voxel_ijk >= self.inner_low) & (voxel_ijk < self.inner_high)
+        return np.asarray(inside.all(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,7 +277,7 @@ def check_closed(
     if not cap:
         place = lattice.to_index(mesh.vertices[edges].reshape(-1, 3)).reshape(-1, 2, 3)
         border = (place < ON_BORDER - 0.5) | (place > np.array(lattice.shape) - 0.5 - ON_BORDER)
-        bad = edges[~border.all(1).any(1)]
+        bad = edges[~np.any(border.all(1), axis=1)]
     if len(bad):
         last = np.cumsum([count for _, count in names])
         some = np.unique(np.searchsorted(last, bad.ravel(), "right"))
