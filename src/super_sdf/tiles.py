@@ -1,9 +1,9 @@
 """A grid that is too large for the memory, or for one machine, as tiles: cut, and joined again.
 
-A tile is a box of samples with a margin as wide as all that a vertex depends on; it is refined as a
-grid of its own. The lattice of samples is parted by the tiles without their margins. A vertex
-belongs to the tile that has the node of its key (see ``surface.extract``), a triangle to that of its
-smallest key; the position of a vertex is that of its owner.
+A tile is a box of samples with a margin as wide as all that a vertex depends on, refined as a grid
+of its own. Without their margins the tiles part the grid. A vertex belongs to the tile that has the
+node of its key (see ``surface.extract``), a triangle to that of its smallest key; the position of a
+vertex is that of its owner.
 """
 
 from __future__ import annotations
@@ -119,9 +119,7 @@ class Room:
         )
 
 
-def margin_of(
-    grid: SdfGrid, receptive_field: int | None, mesher: MesherName, factor: int
-) -> int:
+def margin_of(grid: SdfGrid, receptive_field: int | None, mesher: MesherName, factor: int) -> int:
     """Return how many samples to every side a tile's vertices and triangles depend on."""
     if receptive_field is None:
         raise OptionError(

@@ -148,9 +148,7 @@ def plane_blocks(
         yield start, min(start + step, end)
 
 
-def _flat_steps(
-    voxel_ijk: IntArray, shape: tuple[int, ...]
-) -> tuple[NDArray[np.int64], list[int]]:
+def _flat_steps(voxel_ijk: IntArray, shape: tuple[int, ...]) -> tuple[NDArray[np.int64], list[int]]:
     """Return flat indices (V,) into the grid padded by one, and the 27 steps to neighbours."""
     strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1], np.int64)
     return (voxel_ijk + 1) @ strides, [int(step) for step in NEIGHBOURHOOD @ strides]

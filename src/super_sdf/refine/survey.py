@@ -58,7 +58,7 @@ class BandSummary:
         return not self.told or self.noisy / self.told > MAX_NOISY_SHARE
 
 
-class BandTooLarge(Exception):
+class BandTooLargeError(Exception):
     """A band has more voxels than fit in memory."""
 
 
@@ -115,15 +115,15 @@ def survey(
 ) -> Band:
     """Read a cubic grid once and return its band.
 
-    With ``whole`` the grid is a part of another one, of which that is the summary. BandTooLarge is
-    raised as soon as there are more than ``most`` voxels.
+    With ``whole`` the grid is a part of another one, of which that is the summary.
+    BandTooLargeError is raised as soon as there are more than ``most`` voxels.
     """
     blocks, count = list[_Block](), 0
     for block in _blocks(grid, offset, threads, is_checked=whole is None):
         blocks.append(block)
         count += len(block.voxel_ijk)
         if count > most:
-            raise BandTooLarge
+            raise BandTooLargeError
     if offset and whole is None:
         _check_offset([block.jumps for block in blocks if block.jumps], grid, offset)
     leaves = any(block.leaves for block in blocks) if whole is None else whole.leaves
