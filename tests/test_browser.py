@@ -180,21 +180,6 @@ def test_each_switch_changes_the_pictures_and_back(visit, report):
     assert blue.mean() > 0.01
 
 
-def test_the_cutting_plane_shows_the_inside_and_moves(visit, report):
-    page = visit(report)
-    whole, axis = pictures(page), page.get_by_label("Axis of the cutting plane")
-    axis.select_option("y")
-    cut = pictures(page)
-    assert all((np.abs(shot - OCHRE).max(2) < 6).mean() > 0.01 for shot in cut)
-    assert min(changed(whole, cut)) > 0.02
-    for _ in range(8):
-        page.get_by_label("Position of the cutting plane").press("PageUp")
-    assert min(changed(cut, pictures(page))) > 0.01
-    assert page.locator("output").inner_text().startswith("y = ")
-    axis.select_option("none")
-    assert max(changed(whole, pictures(page))) < 0.01
-
-
 def test_a_batch_loads_meshes_from_beside_the_page_when_they_are_asked_for(visit, batch, tmp_path):
     """Names with markup are text; meshes that are gone are said."""
     page = visit(batch)

@@ -17,7 +17,6 @@ from super_sdf import write_mesh
 from super_sdf.cli import main as cli
 from super_sdf.files.formats import GRID_SUFFIXES
 from super_sdf.files.meshes import MESH_SUFFIXES
-from super_sdf.network.network import shipped_models
 from super_sdf.options import MESH_FORMATS, OPTIONS, Options, parse_size
 
 
@@ -82,18 +81,6 @@ def test_noise_is_told(here, command):
     assert " % of the band the values differ by more than distances can: they are taken" in err
 
 
-def test_fine_values_that_contradict_the_coarse_ones_are_warned_of(here, command, monkeypatch):
-    from super_sdf.network.network import Network
-
-    def all_inside(self, patches, table, voxels, offsets):
-        return np.full((len(voxels), len(offsets)), -1, np.float32)
-
-    monkeypatch.setattr(Network, "__call__", all_inside)
-    code, _, err = command("upsample", "in.npy", "out.ply")
-    assert code == 0 and "fine values contradict the coarse ones around them" in err
-    assert trimesh.load("out.ply").is_watertight
-
-
 def test_version_help_info_and_usage_errors(command):
     assert command("--version") == (0, f"super-sdf, version {super_sdf.__version__}\n", "")
     assert "Turn coarse signed distance grids into fine meshes" in command("-h")[1]
@@ -153,15 +140,15 @@ FACTOR = "give an even number from 2 to 16 (an odd one has no node on the sample
 WRONG = {
     "in.raw": f"in.raw is not a grid file: give one of {', '.join(GRID_SUFFIXES)}",
     "in.npy --label 1.5": "--label is '1.5': give a whole number, -2^63 to 2^64 - 1",
-    "in.npy --scale 0": "--scale is 0.0: give a number greater than 0",
-    "in.npy --simplify -1": "--simplify is -1.0: give a number greater than 0",
+    "in.npy --scale 0": "--scale is 0: give a number greater than 0",
+    "in.npy --simplify -1": "--simplify is -1: give a number greater than 0",
     "in.npy --factor 18": f"--factor is 18: {FACTOR}",
     "in.npy --factor four": "--factor is 'four': give a whole number",
     "in.npy --spacing 1,2": "--spacing is '1,2': give one number, or three, separated by commas",
     "in.npy --spacing 1,nan,1": "--spacing is nan: give a finite number",
-    "in.npy --level 1.5 --label 2": "label 2 and level 1.5: give only one of them",
+    "in.npy --level 1.5 --label 2": "--label 2 and --level 1.5: give only one of them",
     "in.npy --max-memory much": "--max-memory is 'much': give a number of bytes",
-    "in.npy --model x.onnx --quality fast": "model 'x.onnx' and quality 'fast': give only one",
+    "in.npy --model x.onnx --quality fast": "--model 'x.onnx' and --quality 'fast': give only one",
     "in.npy --direction 1,0,0": "--direction is '1,0,0': give nine numbers, row by row",
 }
 
@@ -235,9 +222,3 @@ def test_wrong_values_are_named_in_lists_by_their_names(here, command):
     Path("list.jsonl").write_text('{"in": "in.npy", "simplify": -1}')
     _, _, err = command("batch", "list.jsonl", "--out", "out", "--simplify", "0.5")
     assert "'simplify' is -1: give a number" in err and "--simplify" not in err
-
-
-def test_a_network_is_chosen_by_its_file(here, command):
-    model = str(shipped_models()["fast"])
-    words = ("batch", "in.npy", "--out", "meshes", "--model", model, "--factor", 2)
-    assert command(*words)[0] == 0 and os.listdir("meshes")

@@ -5,19 +5,13 @@ import pytest
 from conftest import ball, refusal
 
 from super_sdf.errors import GridError
-from super_sdf.grid.sdf_grid import SdfGrid, make_grid
+from super_sdf.grid.sdf_grid import make_grid
 
 
 def torus(n: int, unit: float = 1.0) -> np.ndarray:
     """A torus in [-1/2, 1/2]^3, sampled at the n^3 voxel centres, distances times unit."""
     x, y, z = (np.indices((n, n, n)) + 0.5) / n - 0.5
     return (np.hypot(np.hypot(x, y) - 0.28, z) - 0.11) * unit
-
-
-def test_walls_thinner_than_the_spacing_are_not_taken_for_unequal_axes():
-    x, y, z = np.abs(np.indices((40, 40, 40)) - 19.4)
-    shell = np.abs(np.maximum(x - 14, np.maximum(y - 12, z - 9))) - 0.45
-    assert make_grid(shell, origin=0).spacing == (1.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -35,28 +29,11 @@ def test_usual_spacings_are_recognised(unit, want, said):
     assert any(f"spacing not given: {said}" in note for note in grid.notes)
 
 
-def test_samples_are_negative_inside_whatever_was_stored():
-    values = np.arange(24, dtype=np.uint8).reshape(4, 3, 2)
-    grid = SdfGrid.trusted(values, 1.0, positive_inside=True)
-    for found, stored in ((grid.planes(1, 3), values[1:3]), (grid.values, values)):
-        np.testing.assert_array_equal(found, -stored.astype(float))
-    assert (grid.low, grid.high) == (-23, 0)
-
-
 @pytest.mark.parametrize("inside, flips", [("auto", True), ("positive", True), ("negative", False)])
 def test_the_sign_is_negative_inside_in_the_end(inside, flips):
     values = -torus(32)
     grid = make_grid(values, spacing=1 / 32, origin=0, inside=inside)
     np.testing.assert_array_equal(grid.values, -values if flips else values)
-
-
-@pytest.mark.parametrize("rounded, steps", [(np.trunc, 16), (np.rint, 64), (np.floor, 32)])
-def test_distances_in_whole_steps_are_exact_ones(rounded, steps):
-    values = rounded(torus(32) * 32 * steps)
-    for given in (values.astype(np.int16), (values / steps).astype(np.float32)):
-        grid = make_grid(given, spacing=steps if given.dtype == np.int16 else 1, origin=0)
-        assert grid.field.kind == "exact" and grid.notes == ()
-        np.testing.assert_array_equal(grid.values, given)
 
 
 REFUSED = {
@@ -89,15 +66,6 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
     assert make_grid(values, spacing=0.1, scale=0.1, origin=0).notes == ()
 
 
-def test_values_that_change_by_less_than_the_spacing_are_noted():
-    grid = make_grid(ball(24, 8.0).values, spacing=2.5, origin=0)
-    note, unit = grid.notes
-    assert unit.startswith("the values are distances in another unit: multiplied by ")
-    assert grid.spacing == (2.5,) * 3 and float(unit.split()[9]) == pytest.approx(2.5, rel=3e-3)
-    said = "spacing is 2.5: they are not exact distances, or the unit is wrong"
-    assert note.startswith("the values change by ") and note.endswith(said)
-
-
 @pytest.mark.parametrize(
     "spacing, said",
     [
@@ -127,18 +95,6 @@ def test_the_spacing_of_each_axis_is_estimated_if_they_differ():
     )
 
 
-@pytest.mark.parametrize("axis, ratio", [(0, 1.5), (1, 5.0), (2, 3.0)])
-def test_the_spacings_of_a_smooth_solid_are_estimated(axis, ratio):
-    spacing = np.where(np.arange(3) == axis, 0.02 * ratio, 0.02)
-    shape = np.rint(1 / spacing).astype(int)
-    x, y, z = (np.moveaxis(np.indices(shape), 0, -1) * spacing - 0.49).T
-    values = (np.hypot(np.hypot(x, y) - 0.28, z) - 0.15).T
-    estimated = make_grid(values).spacing
-    assert estimated == pytest.approx(tuple(spacing), rel=0.06)
-    others = [h for n, h in enumerate(estimated) if n != axis]
-    assert others[0] == others[1]  # not almost: they would be resampled
-
-
 def test_a_spacing_that_the_values_contradict_on_one_axis_is_refused():
     values = box_with_unequal_spacing()
     assert refusal(GridError, make_grid, values, spacing=1) == (
@@ -147,12 +103,3 @@ def test_a_spacing_that_the_values_contradict_on_one_axis_is_refused():
     )
     for each in (2, 1.995):
         assert make_grid(values, spacing=(1, 1, each), origin=0).notes == ()
-
-
-def test_axes_that_show_no_spacing_are_asked_for():
-    x, y = np.indices((30, 30, 30))[:2]
-    rod = np.maximum(np.abs(x - 14.6) - 8, 3 * np.abs(y - 14.6) - 24)
-    assert refusal(GridError, make_grid, rod) == (
-        "spacing not given: the values change by 1 along x, 3 along y from sample to sample, and "
-        "do not show it for all axes; give --spacing X,Y,Z"
-    )

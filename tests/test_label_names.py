@@ -69,19 +69,6 @@ def test_what_is_no_table(name, content, message):
     assert refusal(FileError, read_names, "none.txt") == "none.txt does not exist"
 
 
-def test_long_names_of_any_letters_fit_into_a_glb(command, image):
-    letters = "\U0001f600" * 80
-    Path("long.csv").write_text(f"1,{letters},1,2,3\n5,{letters}!,4,5,6\n", encoding="utf-8")
-    convert(command, image, "o.glb", "all", "--names", "long.csv")
-    parts = trimesh.load("o.glb").geometry
-    assert sorted(map(len, parts)) == [82, 82]  # " 1" and " 5"
-    convert(command, image, "o.stl", "all", "--names", "long.csv")
-    Path("empty.txt").write_text('1 255 0 0 1 1 1 "liver"\n5 0 255 0 1 1 1 ""\n')
-    assert read_names("empty.txt") == {1: LabelName("liver", (255, 0, 0))}
-    Path("empty.csv").write_text("1,liver\n5,,4,5,6\n")
-    assert read_names("empty.csv") == {1: LabelName("liver")}
-
-
 @pytest.fixture
 def image():
     """Two boxes that share a wall, and a small one apart, twice in label 5."""

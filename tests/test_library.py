@@ -62,34 +62,6 @@ def test_what_is_no_array_of_samples_is_refused(make, values, message):
     assert str(caught.value).removeprefix("values").strip().startswith(message)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.int32])
-def test_what_is_masked_is_unknown(dtype):
-    """So scikit-fmm writes a narrow band; the data below the mask may be anything."""
-    near = np.abs(VALUES) < 3
-    data = np.where(near, VALUES * 8, 77).astype(dtype)
-    known = np.where(near, data, np.nan)
-    grid, want = (
-        make_grid(values, spacing=1, scale=1 / 8)
-        for values in (np.ma.array(data, mask=~near), known)
-    )
-    np.testing.assert_array_equal(grid.values, want.values)
-    assert grid.notes == want.notes and grid.notes[0].startswith(f"{(~near).sum():,} samples are")
-
-
-@pytest.mark.parametrize(
-    "spacing, message",
-    [
-        ([1.0, None, 1.0], r"spacing is \[1.0, None, 1.0\]: give one number or three"),
-        (np.ones(2000), r"spacing is array\(\[1., 1., 1., ..., 1., 1., 1.\].*: give one number or"),
-        (1e300, r"spacing is 1e\+300, .*: give lengths in a unit in which it is between"),
-    ],
-)
-def test_a_spacing_is_one_number_or_three(spacing, message):
-    with pytest.raises(GridError, match=message) as caught:
-        make_grid(VALUES, spacing=spacing)
-    assert "\n" not in str(caught.value)
-
-
 GRID = ball(12, 3.0)
 BOOLEAN = "give True or False, in JSON true or false"
 MAKE_ONE = "make one with make_grid(values, spacing=...) or read_grid(path)"

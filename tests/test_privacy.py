@@ -10,7 +10,6 @@ import pytest
 from conftest import ball
 
 import super_sdf
-from super_sdf.network import onnx
 
 # The kernel ends the process at its first socket, whichever thread or library asks for it.
 NO_SOCKETS = """
@@ -67,32 +66,9 @@ def test_a_run_leaves_nothing_at_home_and_calls_nobody(tmp_path, monkeypatch, ho
     assert sorted(os.listdir()) == ["fresh", "in.npy", "out.ply", "unwritable"]
 
 
-def test_info_and_its_check_need_no_home(tmp_path):
-    (tmp_path / "unwritable").write_text("")
-    script = "import sys; from super_sdf.cli.main import main;"
-    script += "sys.argv = ['super-sdf', 'info', '--check', '--device', 'cpu']; main()"
-    run = run_at_home(tmp_path / "unwritable", NO_SOCKETS + script)
-    assert (run.returncode, run.stderr) == (0, "") and "base" in run.stdout
-    assert os.listdir(tmp_path) == ["unwritable"]
-
-
 def test_a_socket_would_have_been_seen(tmp_path):
     run = run_at_home(tmp_path, NO_SOCKETS + "import socket; socket.socket()")
     assert run.returncode == -31  # SIGSYS
-
-
-def test_telemetry_is_off_for_the_import_alone(monkeypatch):
-    monkeypatch.delenv(onnx.SWITCH, raising=False)
-    with onnx.without_telemetry():
-        assert os.environ[onnx.SWITCH] == "1"
-    assert onnx.SWITCH not in os.environ
-    with pytest.raises(KeyError), onnx.without_telemetry():
-        raise KeyError
-    assert onnx.SWITCH not in os.environ
-    monkeypatch.setenv(onnx.SWITCH, "0")  # what the user decided stays
-    with onnx.without_telemetry():
-        assert os.environ[onnx.SWITCH] == "0"
-    assert os.environ[onnx.SWITCH] == "0"
 
 
 def test_an_onnxruntime_that_does_not_load_is_one_line(tmp_path):

@@ -111,18 +111,6 @@ def test_many_meshes_are_beside_the_page(run_batch, grid_folder, monkeypatch):
     assert len(files_of("page.html")) == 4
 
 
-def test_a_resumed_batch_shows_files_of_all_runs(run_batch, grid_folder):
-    for names in ("in/a.npy", "in/deep"):
-        run_batch(names, "--report", "page.html")
-    entries = {entry["name"]: entry for entry in files_of("page.html")}
-    assert set(entries) == {"a.ply", "b.ply", "er/c.d.ply"}
-    said = "not drawn: run the command again for its meshes"
-    assert entries["a.ply"]["remarks"] == [said]
-    os.remove("out/a.ply")  # a mesh that is gone is not in the page
-    run_batch("in/deep", "--report", "page.html")
-    assert {entry["name"] for entry in files_of("page.html")} == {"b.ply", "er/c.d.ply"}
-
-
 def test_a_page_of_others_is_not_replaced_by_a_batch(run_batch, grid_folder):
     Path("page.html").write_text("mine")
     assert run_batch(*BATCH)[::2] == (1, "Error: page.html exists: remove it or use --force\n")

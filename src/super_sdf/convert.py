@@ -18,9 +18,8 @@ from .files.grids import read_grid
 from .files.meshes import check_target, write_mesh
 from .files.output import check_apart, check_free
 from .files.regular import files_of
-from .grid.cubic import cubic_grid
-from .grid.placement import as_triple
-from .grid.sdf_grid import SdfGrid, describe_place, mean_spacing, volume_of_samples
+from .grid.samples import as_triple
+from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP, Options
 from .pipeline import mesh_grid
@@ -89,31 +88,14 @@ def convert(
 ) -> Conversion:
     """Convert a grid file to a mesh file, in formats of ``read_grid`` and ``write_mesh``.
 
-    Parameters
-    ----------
-    source, target : path
-        The grid file and the mesh file.
-    network : Network
-        From ``load_network``.
-    options : Options
-        All that the mesh depends on.
-    force : bool
-        Replace the target, and the field's file, if they exist.
-    progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
-    save_field : path, optional
-        A file for the refined field, in a format of ``write_field``: it and the mesh file are both
-        complete at the end, or neither is written.
-    before_rename : callable, optional
-        Called with the path of the finished temporary file, before it gets the name ``target``.
-    how
-        Passed to ``mesh_grid``, such as ``map_tiles``.
+    ``force`` replaces the target, and the field's file, if they exist. ``progress`` is called with
+    (done, total), see ``progress.Progress``; an exception in it ends the work. ``save_field`` is a
+    file for the refined field, in a format of ``write_field``: it and the mesh file are both
+    complete at the end, or neither is written. ``before_rename`` is called with the path of the
+    finished temporary file, before it gets the name ``target``. ``how`` is passed to ``mesh_grid``.
 
-    Raises
-    ------
-    SuperSdfError
-        As in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``. Nothing is
-        written then.
+    SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
+    Nothing is written then.
     """
     watch, files = Stopwatch(), files_of(source)
     if options.goals():

@@ -22,17 +22,16 @@ from . import options
 from .arrays import CENTRE
 from .errors import OptionTypeError, OutOfMemoryError, seen
 from .functions.function import Function, as_function, sampled
-from .grid.cubic import cubic_grid
-from .grid.sdf_grid import SdfGrid, check_grid, crop
-from .network.decoder import Decoder, adapt, decode
+from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
+from .network.decoder import Adapter, Decoder, adapt
 from .network.network import given_or_loaded, network_for
-from .options import Options
+from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
+from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
-from .refine.spline import interpolate
 from .refine.survey import Band, BandSummary, BandTooLarge, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import choose_mesher, extract
@@ -60,29 +59,29 @@ def refine(
     if whole is None and not band.decoded.any():
         raise no_surface(grid, offset)
     steps.finish("band")
-    field = refine_band(band, network, factor, threads, steps)
+    field = refine_band(band, adapt(network), factor, threads, steps)
     return replace(field, grid=grid, offset=offset)
 
 
 def refine_band(
     band: Band,
-    network: Decoder,
+    network: Adapter,
     factor: int,
     threads: int = 1,
     steps: StepCounter | None = None,
 ) -> FineField:
     """Return the fine field of a band: the steps from the network to the final values."""
     steps = steps or StepCounter()
-    patches, table, voxels = inputs = band.network_inputs()
+    patches, table, voxels = band.network_inputs()
     own_ijk, exact = band.voxel_ijk[voxels], np.flatnonzero(band.exact)
     if band.field.smooth is None:
-        progress, offsets = steps.within("network"), nodes.block_offsets(factor)
-        blocks = decode(network, inputs, offsets, progress, threads)  # Eqs. 3, 5
+        blocks = predict(band, table, voxels, network, factor, threads, steps.within("network"))
     else:
-        blocks = interpolate(band, network, factor, own_ijk, inputs, threads)
+        blocks = interpolate(band, table, voxels, network, factor, threads)
     steps.finish("network")
 
     parts = nodes.share_parts(nodes.rows_among(voxels, len(table))[table[voxels]])
+    del table
     index = nodes.VoxelIndex(own_ijk, band.shape)
     nodes.average_shared(blocks, parts, factor, threads)  # Eq. 7
     spheres = spheres_of_band(band.voxel_ijk, patches, exact, band.shape, band.limits, threads)
@@ -310,7 +309,7 @@ class Task:
     shape: tuple[int, int, int]  # samples of the whole grid
     whole: BandSummary | None  # None of a tile that is the whole grid
     options: Options
-    mesher: options.MesherName
+    mesher: MesherName
     threads: int
 
 
@@ -342,11 +341,11 @@ def mesh_grid(
     mesher = choose_mesher(chosen.mesher, exact=lattice.field.has_exact)
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     threads, shape = useful_threads(decoder.threads), lattice.shape
-    room = Room.of(chosen.max_memory, factor, mesher, decoder.memory_bytes)
+    room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
     tiles, whole = [Tile((0, 0, 0), shape, (0, 0, 0), shape)], None
     try:
         is_one = map_tiles is None and least_tiles == 1
-        band = survey(lattice, offset, threads=threads, most=room.voxels if is_one else -1)
+        band = survey(lattice, offset, threads=threads, most=room.voxels() if is_one else -1)
     except BandTooLarge:
         band, whole = None, summarise(lattice, offset, threads)
         margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
@@ -363,30 +362,30 @@ def mesh_grid(
         return Task(tile, part, shape, whole, chosen, mesher, threads)
 
     if band:
-        parts = [make_tile(task_of(tiles[0]), decoder, band, steps, save_field)]
+        bands, band = [band], None  # so that it is freed when it has been used
+        parts = [make_tile(task_of(tiles[0]), decoder, bands.pop(), steps, save_field)]
     else:
         parts = []
         for part in (map_tiles or map)(partial(make_tile, network=decoder), map(task_of, tiles)):
             parts.append(part)
             steps.show(len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
-    del band
-    mesh, leaves = join(parts), any(part.leaves for part in parts)
-    if not len(mesh.faces):
-        raise no_surface(grid, offset)
-    is_cut = any(part.is_cut for part in parts)
-    ends = lattice.field.unseen is not None
-    count = check_closed(mesh, lattice, parts, cap=chosen.cap or not is_cut, ends=ends)
+    leaves, is_cut = (any(getattr(part, name) for part in parts) for name in ("leaves", "is_cut"))
     counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
     if whole:
         counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
+    mesh, names = join(parts)
+    if not len(mesh.faces):
+        raise no_surface(grid, offset)
+    ends = lattice.field.unseen is not None
+    count = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
     steps.finish("isosurface")
-    return Result(mesh, count, counts, leaves, is_cut, steps.take_seconds(), len(tiles))
+    return Result(mesh, count, counts, leaves, is_cut, steps.seconds, len(tiles))
 
 
 def make_tile(
     task: Task,
-    network: Decoder,
+    network: Adapter,
     band: Band | None = None,
     steps: StepCounter | None = None,
     save_field: Callable[[FineField], None] | None = None,

@@ -39,38 +39,32 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self.start()
-
-    def start(self) -> None:
-        """Start the clock for the next stage."""
         self.clock = time.perf_counter()
 
     def lap(self, stage: str) -> None:
         """Add the time since the last lap to a stage."""
         now = time.perf_counter()
         self.take({stage: now - self.clock})
-        self.clock = now
 
     def take(self, seconds: Mapping[str, float]) -> None:
         """Add times that were measured elsewhere, and restart the clock."""
         for stage, more in seconds.items():
             self.seconds[stage] = self.seconds.get(stage, 0.0) + more
-        self.start()
+        self.clock = time.perf_counter()
 
     def rounded(self) -> dict[str, float]:
         """Return the seconds of each stage as reports have them."""
         return {stage: round(spent, 4) for stage, spent in self.seconds.items()}
 
 
-class StepCounter:
+class StepCounter(Stopwatch):
     """Reports progress and measures time, step by step; ``finish`` ends each step."""
 
     def __init__(self, progress: Progress | None = None, names: Iterable[str] = STEPS) -> None:
+        super().__init__()
         whole = sum(STEPS[name] for name in names)
         self.lengths = {name: TOTAL * STEPS[name] / whole for name in names}
-        self.progress = progress
-        self.done = 0.0
-        self.watch = Stopwatch()
+        self.progress, self.done = progress, 0.0
 
     def show(self, share: float) -> None:
         """Report the share of all that comes after the first step."""
@@ -79,14 +73,9 @@ class StepCounter:
 
     def finish(self, name: str) -> None:
         """Report that a step is done, and record its time."""
-        self.watch.lap(name)
+        self.lap(name)
         self.done += self.lengths[name]
         self._show(TOTAL if name == "isosurface" else self.done)
-
-    def take_seconds(self) -> dict[str, float]:
-        """Return the seconds per step since the last call."""
-        seconds, self.watch.seconds = self.watch.seconds, {}
-        return seconds
 
     def within(self, name: str) -> ShareCallback | None:
         """Return a callback for the share of a step that starts now; None without ``progress``."""

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from .arrays import BoolArray
 from .errors import MeshError, OptionError, OutOfMemoryError
 from .grid.sdf_grid import SdfGrid
-from .options import SHARP, MesherName
-from .refine import bounds, spheres, spline
+from .options import MesherName
+from .refine import bounds, prediction, spheres
+from .refine.prediction import AT_ONCE
 from .refine.survey import BandSummary
 from .surface.extract import KEYS_PER_NODE, reach_in_voxels
 from .surface.mesh import Mesh
@@ -28,6 +29,7 @@ from .threads import check_count, held_memory, in_words, memory_bound
 Index = tuple[int, int, int]
 Box = tuple[Index, Index]
 """From the lowest index to before the highest."""
+FIXED = 50_000_000  # bytes of chunks, and what the network takes in any case
 LEAST_SIDE = 8  # samples of a tile without its margin: smaller ones are nearly all margin
 ON_BORDER = 1e-2  # voxels: open edges so near to the border of the grid end there
 
@@ -43,7 +45,7 @@ class Tile:
 
     def __str__(self) -> str:
         box = zip(self.inner_low, self.inner_high)
-        return "the tile of samples " + ", ".join(f"{low} to {high - 1}" for low, high in box)
+        return "samples " + ", ".join(f"{low} to {high - 1}" for low, high in box)
 
     def owns(self, voxel_ijk: NDArray[np.integer]) -> BoolArray:
         """Return which voxels (n, 3) belong to the tile, (n,)."""
@@ -76,47 +78,44 @@ class Part:
 
 @dataclass(frozen=True)
 class Room:
-    """How many voxels of the band fit in the memory that may be taken."""
+    """How many voxels of the band fit in the memory that may be taken; all figures are measured."""
 
     bound: float  # bytes that the process may hold
     held: int  # bytes that it holds
-    per_voxel: float  # bytes for each voxel of a tile's band, measured ...
-    per_mesh: float  # ... and of the mesh, while it is joined
+    factor: int
+    network: tuple[float, float]  # bytes of the network per voxel that it sees, and per value
 
     @classmethod
-    def of(
-        cls,
-        max_memory: int | None,
-        factor: int,
-        mesher: MesherName,
-        network_bytes: tuple[float, float],
-    ) -> Room:
-        """Return the room for a mesher and a network, with its bytes per voxel and per value."""
-        bound, values = memory_bound(max_memory), (factor + 1) ** 3
-        run = network_bytes[0] + network_bytes[1] * values
-        fit = 700 + 5.5 * values
-        mesh = 350 + 4.5 * values + factor**2 * (60 if mesher == SHARP else 25)
-        held = held_memory() or 0
-        return cls(bound or np.inf, held, max(run, fit, mesh), 30.0 * factor**2)
+    def of(cls, max_memory: int | None, factor: int, network: tuple[float, float]) -> Room:
+        """Return the room of this process."""
+        return cls(memory_bound(max_memory) or np.inf, held_memory() or 0, factor, network)
 
-    @property
-    def voxels(self) -> float:
-        """The voxels that can be refined in one piece."""
-        return (self.bound - self.held) / (self.per_voxel + self.per_mesh)
+    def voxels(self, meshes: float = 0.0) -> float:
+        """Return how many voxels can be refined at once, beside ``meshes`` bytes.
+
+        The network sees ``AT_ONCE`` of a large band at a time, and a fifth more beside them. Three
+        quarters of the voxels of a band are decoded.
+        """
+        left, values = self.bound - self.held - FIXED - meshes, (self.factor + 1) ** 3
+        run = 250 + self.network[0] + 0.75 * self.network[1] * values
+        small, large = left / (250 + run), (left - 1.2 * AT_ONCE * run) / (250 + 3 * values)
+        if large < AT_ONCE:
+            large = min(small, AT_ONCE)
+        fitted, meshed = 900 + 4 * values, 350 + 3 * values + 54 * self.factor**2
+        return min(large, left / fitted, left / meshed)
 
     def beside(self, whole: BandSummary) -> float:
-        """Return the voxels that a tile may have beside the mesh of the whole grid."""
-        left = self.bound - self.held - self.per_mesh * float(whole.cells.sum())
-        return left / self.per_voxel
+        """Return the voxels that a tile may have beside the meshes of the others."""
+        mesh = self.factor**2 * float(whole.cells.sum())  # bytes: 21 of its parts, 42 joined
+        return self.voxels(21 * mesh) if self.bound - self.held > 42 * mesh else -1.0
 
-    def refusal(self, voxels: int, whole: BandSummary) -> OutOfMemoryError:
-        """Return the error for tiles with so many voxels."""
+    def refusal(self, whole: BandSummary) -> OutOfMemoryError:
+        """Return the error for a grid of which not even the smallest tiles fit."""
         count = int(whole.cells.sum())
-        need = self.held + self.per_mesh * count + self.per_voxel * voxels
         return OutOfMemoryError(
-            f"{count:,} voxels near the surface need {in_words(1.03 * need)} of memory even in the "
-            f"smallest tiles, {in_words(self.bound)} may be used; use a smaller factor, or allow "
-            "more (--max-memory)"
+            f"factor {self.factor} on {count:,} voxels near the surface does not fit in the "
+            f"{in_words(self.bound)} of memory that may be used, not even in small tiles: use a "
+            "smaller factor, or allow more (--max-memory)"
         )
 
 
@@ -131,7 +130,7 @@ def margin_of(
         )
     seen = max(receptive_field, bounds.REACH_OF_SAMPLES)
     if grid.field.smooth is not None:
-        seen = max(seen, spline.BEYOND)
+        seen = max(seen, prediction.BEYOND)
     fitted = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS
     return seen + fitted + reach_in_voxels(mesher, factor) + 1
 
@@ -169,7 +168,7 @@ def plan(
         elif room is None or needed <= most:
             done.append(box)
         else:
-            raise room.refusal(needed, summary)
+            raise room.refusal(summary)
     tiles = []
     for low, high in sorted(done):
         inner_low, inner_high = np.array(low) * side, np.minimum(np.array(high) * side, shape)
@@ -232,42 +231,44 @@ def own_part(
     return Part(tile, part, keys[used], mine[used], **known)
 
 
-def join(parts: Sequence[Part]) -> Mesh:
-    """Return the mesh of all tiles; MeshError, which names tiles, if two do not meet.
+def join(parts: list[Part]) -> tuple[Mesh, list[tuple[str, int]]]:
+    """Return the mesh of all tiles, and their names with how many vertices each has; frees parts.
 
-    Vertices come tile by tile, and so do triangles.
+    Vertices come tile by tile, and so do triangles. MeshError if two tiles do not meet.
     """
+    names = [(str(part), int(np.count_nonzero(part.mine))) for part in parts]
     if len(parts) == 1:
-        return parts[0].mesh
-    counts = [int(np.count_nonzero(part.mine)) for part in parts]
-    starts = np.cumsum([0, *counts])
+        return parts[0].mesh, names
+    starts = np.cumsum([0, *(count for _, count in names)])
     check_count(int(starts[-1]), "vertices")
     foreign = np.unique(np.concatenate([part.keys[~part.mine] for part in parts]))
     place = np.full(len(foreign), -1, np.int32)  # of vertices that other tiles use
-    for part, start in zip(parts, starts.tolist()):
+    for part, start in zip(parts if len(foreign) else (), starts.tolist()):
         keys = part.keys[part.mine]
         at = np.minimum(np.searchsorted(foreign, keys), len(foreign) - 1)
-        known = np.flatnonzero(foreign[at] == keys) if len(foreign) else at[:0]
+        known = np.flatnonzero(foreign[at] == keys)
         place[at[known]] = start + known
     vertices, faces = [], []
-    for part, start, count in zip(parts, starts.tolist(), counts):
+    for (name, count), start in zip(names, starts.tolist()):
+        part = parts.pop(0)
         number = np.empty(len(part.keys), np.int32)
         number[part.mine] = np.arange(start, start + count)
         number[~part.mine] = place[np.searchsorted(foreign, part.keys[~part.mine])]
         if len(number) and number.min() < 0:
-            raise torn([part], f"{np.count_nonzero(number < 0):,} vertices", "lack in those beside")
+            raise torn(f"{np.count_nonzero(number < 0):,} vertices lack beside", [name])
         vertices.append(part.mesh.vertices[part.mine])
         faces.append(number[part.mesh.faces])
-    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+        del part
+    return Mesh(np.concatenate(vertices), np.concatenate(faces)), names
 
 
 def check_closed(
-    mesh: Mesh, lattice: SdfGrid, parts: Sequence[Part], *, cap: bool, ends: bool
+    mesh: Mesh, lattice: SdfGrid, names: Sequence[tuple[str, int]], *, cap: bool, ends: bool
 ) -> int:
     """Return how many edges of a mesh are open; MeshError if some are that should not be.
 
     Open are those on the border of the grid, if there is no ``cap``, and any others if the surface
-    ``ends`` at unknown samples. The mesh is that of the ``parts``, if there are some.
+    ``ends`` at unknown samples. ``names`` are those of ``join``.
     """
     edges = mesh.boundary()
     if ends or not len(edges):
@@ -278,16 +279,15 @@ def check_closed(
         border = (place < ON_BORDER - 0.5) | (place > np.array(lattice.shape) - 0.5 - ON_BORDER)
         bad = edges[~border.all(1).any(1)]
     if len(bad):
-        starts = np.cumsum([np.count_nonzero(part.mine) for part in parts])
-        some = np.unique(np.searchsorted(starts, bad.ravel(), "right")) if len(parts) else ()
-        raise torn([parts[n] for n in some], f"{len(bad):,} edges", "are open")
+        last = np.cumsum([count for _, count in names])
+        some = np.unique(np.searchsorted(last, bad.ravel(), "right"))
+        raise torn(f"{len(bad):,} edges are open", [names[n][0] for n in some])
     return len(edges)
 
 
-def torn(parts: Sequence[Part], what: str, fault: str) -> MeshError:
-    """Return the error for tiles that do not meet."""
-    where = " in " + " and ".join(map(str, parts[:4])) if parts else ""
+def torn(what: str, names: Sequence[str]) -> MeshError:
+    """Return the error for a mesh that has holes in the tiles of some names."""
     way = "run it again, and report it if that does not help"
-    if any(part.worker for part in parts):
+    if any(name.endswith(")") for name in names):  # a worker made it
         way = "use workers with the same processor, NumPy and onnxruntime"
-    return MeshError(f"the mesh is torn: {what}{where} {fault}; {way}")
+    return MeshError(f"the mesh is torn, {what} in {' and '.join(names[:4])}: {way}")

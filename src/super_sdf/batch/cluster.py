@@ -21,11 +21,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import dask
-from distributed import Client, KilledWorker, LocalCluster, get_worker, wait
+from distributed import Client, KilledWorker, LocalCluster, Security, get_worker, wait
+from distributed.comm import core as comm
 
 from .. import __version__
-from ..errors import EXTRAS, ClusterError, SuperSdfError, missing_modules
-from ..files.formats import find_format, split_member
+from ..errors import ClusterError, SuperSdfError
+from ..files.formats import split_member
 from ..network.network import find_model, shipped_models
 from ..threads import count_cores
 from .job import Job, Settings, convert_job
@@ -40,7 +41,6 @@ LOOK_SECONDS = 1.0  # between two looks at whether there are workers
 PATIENCE_SECONDS = 60.0  # without any worker
 MOST_FILES = 100  # whose presence each worker checks
 SHARE = 0.75  # of a worker's limit: Dask gives it no more work at 0.8, and kills it at 0.95
-LOGGERS = ("distributed", "tornado", "asyncio")
 CONFIG = {
     "distributed.nanny.pre-spawn-environ": {},  # it would stay in the environment of this process
     "distributed.scheduler.allowed-failures": 1,
@@ -60,9 +60,8 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
     worker of this version of super-sdf.
     """
     with ExitStack() as stack:
-        for logger in map(logging.getLogger, LOGGERS):
-            stack.callback(logger.setLevel, logger.level)
-            logger.setLevel(logging.CRITICAL + 1)
+        logging.disable(logging.CRITICAL)  # what Dask has to say comes as one line
+        stack.callback(logging.disable, logging.NOTSET)
         server: Any = {"address": address}
         if address != LOCAL and Path(address).is_file():
             server = {"scheduler_file": address}
@@ -80,6 +79,8 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
                     silence_logs=logging.CRITICAL,
                 )
                 server = {"address": stack.enter_context(cluster)}
+            elif "address" in server:
+                asyncio.run(_greet(address))
             client = Client(**server, timeout=CONNECT_SECONDS, set_as_default=False)
         except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
             is_silent = isinstance(error, (OSError, *TIMEOUTS)) or not str(error)
@@ -104,6 +105,13 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
                     "install the same version there and here"
                 )
         yield client
+
+
+async def _greet(address: str) -> None:
+    """Raise if a scheduler does not answer in time: a Client would wait for ever."""
+    arguments = Security().get_connection_args("client")
+    peer = await asyncio.wait_for(comm.connect(address, **arguments), CONNECT_SECONDS)
+    await peer.close()
 
 
 def completed(
@@ -167,6 +175,27 @@ def _result_of(future: Any) -> Any:
         return Death(f"ended with {type(error).__name__}: {error}".split("\n")[0])
 
 
+def tiles_on(client: Client) -> Callable[..., Iterator[Any]]:
+    """Return the ``map_tiles`` of ``mesh_grid`` that has tiles made on a cluster.
+
+    ClusterError if workers died of a tile.
+    """
+
+    def map_tiles(make: Callable[[Any], Any], tasks: Iterator[Any]) -> Iterator[Any]:
+        work = partial(_make_tile, make=make)
+        for task, part in completed(client, lambda: next(tasks, None), work):
+            if isinstance(part, Death):
+                raise ClusterError(f"a worker at {task.tile} {part.cause}: give it more memory")
+            yield part
+
+    return map_tiles
+
+
+def _make_tile(task: Any, memory: int | None, make: Callable[[Any], Any]) -> Any:
+    """Make a tile in a worker, and say which worker it was."""
+    return replace(make(replace(task, threads=1)), worker=get_worker().address)
+
+
 def convert_on_cluster(
     jobs: Sequence[Job],
     settings: Settings,
@@ -186,30 +215,24 @@ def convert_on_cluster(
     files = [split_member(job.source)[0].absolute() for job in jobs]
     some = [file for file in files[:: len(files) // MOST_FILES + 1] if file.exists()]
     some += [Path(model)] if model != settings.model else []
-    extras = {find_format(job.source).extra for job in jobs} - {None, ""}
-    extras |= {"report"} if settings.check or settings.items else set()
-    extras |= {"simplify"} if any(job.options.goals() for job in jobs) else set()
-    modules = {module for extra in extras for module in EXTRAS[str(extra)]}
-    here = tuple(modules.difference(missing_modules(tuple(modules))))  # without others, files fail
     work = partial(_convert, settings=there, stage=stage.absolute(), base=Path.cwd())
     memory = jobs[0].options.max_memory
     with connect(str(settings.cluster), workers, memory) as client:
-        for worker, lack in client.run(_lacking, some, stage.absolute(), here).items():
+        for worker, lack in client.run(_lacking, some, stage.absolute()).items():
             if lack:
                 raise ClusterError(f"worker {worker} {lack}")
         with closing(completed(client, take, work)) as results:
             yield from results
 
 
-def _lacking(files: Sequence[Path], folder: Path, modules: tuple[str, ...]) -> str:
+def _lacking(files: Sequence[Path], folder: Path) -> str:
     """Return what this process lacks, "" if nothing."""
     for path in files:
         if not path.exists():
             return f"does not see {path}: put it where all machines see it by this path"
     if not os.access(folder, os.W_OK):
         return f"cannot write to {folder.parents[1]}: give a folder that all machines share"
-    missing = missing_modules(modules)
-    return f"lacks {', '.join(missing)}: install there what is installed here" if missing else ""
+    return ""
 
 
 def _convert(job: Job, settings: Settings, stage: Path, base: Path, memory: int | None) -> Row:

@@ -19,15 +19,13 @@ from ..errors import OptionError, OutOfMemoryError
 from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
-from ..grid.cubic import cubic_grid
-from ..grid.sdf_grid import SdfGrid, volume_of_samples
+from ..grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from ..options import LENGTHS, MASK, Options, check_distance, check_max_memory
 from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh
 from ..threads import give_back, held_memory, in_words, memory_bound, useful_threads
 from ..truth.mesh_files import merged, read_mesh
-from .samples import NOTICEABLE, Strays, Touching, find_strays, touch, vertex_residuals
-from .surface import Surface
+from .evidence import NOTICEABLE, Strays, Surface, Touching, find_strays, touch, vertex_residuals
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
 BYTES_PER_TRIANGLE = 420

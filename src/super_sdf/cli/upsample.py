@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 from typing import Any
 
 import click
@@ -30,6 +31,7 @@ Examples:
   super-sdf upsample organs.nii.gz organs.glb --labels all
 """
 MANY = 50_000  # triangles of which simplifying is worth a hint
+TILES_PER_THREAD = 2  # of a cluster: one that dies costs little
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 # fmt: off
@@ -58,12 +60,21 @@ def command(source: str, target: str, **given: Any) -> None:
     watch.lap("load network")
     done: Any
     force = given["force"]
-    with common.progress_bar("upsampling", given["quiet"]) as progress:
+    with ExitStack() as stack:
+        progress = stack.enter_context(common.progress_bar("upsampling", given["quiet"]))
         where = source, target, network, options
         if options.labels is None:
             from ..convert import convert
 
-            done = convert(*where, progress=progress, save_field=given["save_field"], force=force)
+            how: dict[str, Any] = {"save_field": given["save_field"]}
+            if given["cluster"] is not None:
+                from ..batch.cluster import connect, tiles_on
+
+                to = connect(given["cluster"], given["jobs"], options.max_memory)
+                client: Any = stack.enter_context(to)
+                least = TILES_PER_THREAD * sum(client.nthreads().values())
+                how |= {"map_tiles": tiles_on(client), "least_tiles": least}
+            done = convert(*where, progress=progress, force=force, **how)
         else:
             from ..labels.files import convert_labels
             from ..labels.names import read_names
@@ -142,9 +153,9 @@ def check_outputs(source: str, target: str, options: Options, given: dict[str, A
     if given["report"]:
         outputs = (target, field) if field else (target,)
         common.check_page("--report", given["report"], [*files_of(source), *outputs], force=force)
-    if given["cluster"] is not None:
-        raise OptionError("--cluster is for batch: leave it out")
-    if given["jobs"]:
+    if given["cluster"] is not None and field is not None:
+        raise OptionError("--save-field needs the whole field in one place: leave out --cluster")
+    if given["jobs"] and given["cluster"] is None:
         raise OptionError(f"--jobs {given['jobs']} is for --cluster local: give that, or no --jobs")
 
 

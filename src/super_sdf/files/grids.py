@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
-from ..grid.placement import check_kind
+from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import AxisOrder, Options, Space, Values, check_path
 from ..threads import held_memory, memory_bound

@@ -19,7 +19,7 @@ from ..errors import FileError, check_modules, how_to_install
 from ..files.grids import grid_from_image
 from ..grid.sdf_grid import SdfGrid
 from ..network.decoder import Decoder
-from ..options import DEFAULT_MESHER, Options, MesherName, Quality, Values
+from ..options import DEFAULT_MESHER, MesherName, Options, Quality, Values
 from ..pipeline import reconstruct
 from ..progress import Progress
 

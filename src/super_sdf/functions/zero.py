@@ -68,7 +68,7 @@ def put_on_zero(
     start = (mesh.vertices - middle) / fine
     index, last = grid.to_index(mesh.vertices), np.array(grid.shape) - 0.5
     margin = REACH / factor  # from the border of the grid, in spacings
-    free = ((index > margin - 0.5) & (index < last - margin)).all(1)
+    free: BoolArray = np.all((index > margin - 0.5) & (index < last - margin), axis=1)
     with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
         points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.kind == EXACT)
         points = put_on_edges(value, points, mesh.faces, free)

@@ -15,9 +15,8 @@ from ..errors import GridError, OptionError, seen
 from ..files.grids import read_array
 from ..grid.derived import extremes_of_masks
 from ..grid.field import NONE_EXACT, Field
-from ..grid.interpret import as_sample, labelled
-from ..grid.placement import as_samples, check_kind, check_spacing, is_cubic, placed
-from ..grid.refusals import named
+from ..grid.interpret import as_sample, labelled, named
+from ..grid.samples import as_samples, check_kind, check_spacing, is_cubic, placed
 from ..grid.sdf_grid import SdfGrid, with_fields
 from ..options import MASK, AxisOrder, Space, check_label, check_labels
 
@@ -26,24 +25,12 @@ MOST_LABELS = 1000  # more values than these are densities
 
 @dataclass(frozen=True, eq=False)
 class LabelImage:
-    """Samples with labels, and those of the labels that are to be meshed.
+    """Samples with labels, and those of the labels that are to be meshed."""
 
-    Attributes
-    ----------
-    grid : SdfGrid
-        The labels as its samples, and where they lie.
-    labels : (L,) array
-        The labels to mesh, ascending, of the type of the samples.
-    boxes : (L, 2, 3) int array
-        The lowest and the highest indices of the samples of each label.
-    counts : (L,) int array
-        How many samples each label has.
-    """
-
-    grid: SdfGrid
-    labels: NDArray[Any]
-    boxes: IntArray
-    counts: NDArray[np.int64]
+    grid: SdfGrid  # the labels as its samples, and where they lie
+    labels: NDArray[Any]  # (L,), those to mesh, ascending, of the type of the samples
+    boxes: IntArray  # (L, 2, 3), the lowest and the highest indices of their samples
+    counts: NDArray[np.int64]  # (L,), how many samples each has
 
     def numbers(self, first: int, last: int) -> NDArray[np.int16]:
         """Return planes ``first`` to before ``last``: n for the label ``labels[n - 1]``, else 0."""
@@ -64,7 +51,8 @@ class LabelImage:
 
     def volumes(self) -> list[float]:
         """Return the volume of each label's samples, each of which counts as a box."""
-        return (self.counts * float(np.prod(self.grid.spacing))).tolist()
+        box = float(np.prod(self.grid.spacing))
+        return [count * box for count in self.counts.tolist()]
 
 
 def find_image(
@@ -152,14 +140,10 @@ def find_labels(
         row, low = np.divmod(at[some], plane.shape[1])
         for number, value in enumerate(kinds[: MOST_LABELS + 1].tolist()):
             mine = np.flatnonzero(kind == number)
-            ends = np.array(
-                [
-                    [nth, row[mine[0]], low[mine].min()],
-                    [nth, row[mine[-1]], (low + length)[mine].max() - 1],
-                ]
-            )
-            box = boxes.setdefault(value, ends)
-            box[0], box[1] = np.minimum(box[0], ends[0]), np.maximum(box[1], ends[1])
+            least = np.array([nth, row[mine[0]], low[mine].min()])
+            most = np.array([nth, row[mine[-1]], (low + length)[mine].max() - 1])
+            box = boxes.setdefault(value, np.stack([least, most]))
+            box[0], box[1] = np.minimum(box[0], least), np.maximum(box[1], most)
             counts[value] = counts.get(value, 0) + int(length[mine].sum())
         if len(boxes) > MOST_LABELS:
             raise GridError(
@@ -172,5 +156,5 @@ def find_labels(
         only = int(next(iter(boxes), 0))
         raise GridError(f"every sample has the label {only}: there is no surface")
     order = sorted(boxes)
-    ends = np.array([boxes[label] for label in order])
-    return np.array(order, samples.dtype), ends, np.array([counts[label] for label in order])
+    found = [np.array([each[label] for label in order]) for each in (boxes, counts)]
+    return np.array(order, samples.dtype), found[0], found[1]

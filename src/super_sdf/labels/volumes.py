@@ -33,16 +33,15 @@ Rows = NDArray[np.intp]
 
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
+    kind, said = grid.field.kind, ""
     if offset:
-        raise OptionError(
-            f"keep-volume is for the surface of the samples, offset is {offset:g}: give one only"
-        )
-    if grid.field.kind != MASK:
-        raise OptionError(
-            f"keep-volume is for masks and labels, the values are {grid.field.kind}: leave it out"
-        )
-    if not cap:
-        raise OptionError("keep-volume needs a closed mesh: leave out --open")
+        said = f" is for the surface of the samples, offset is {offset:g}: give one only"
+    elif kind != MASK:
+        said = f" is for masks and labels, the values are {kind}: leave it out"
+    elif not cap:
+        said = " needs a closed mesh: leave out --open"
+    if said:
+        raise OptionError(f"keep-volume{said}")
 
 
 def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:

@@ -24,7 +24,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,6 +126,12 @@ class Labelled:
     # NaN, or missing, where they are minus those of any other
     fields: dict[int, tuple[NDArray[np.int64], FloatArray]]
 
+    @property
+    def strides(self) -> Keys:
+        """The steps of names along the axes; the lattice goes a coarse voxel beyond the grid."""
+        _, ny, nz = (2 * self.factor * (n + 2) + 1 for n in self.shape)
+        return np.array([ny * nz, nz, 1], np.int64)
+
     def apart(self, low: Keys, node: Keys, between: Labels, holder: Labels) -> NDArray[np.float64]:
         """Return by how much the field of a node's holder is lower than that of another, (n,).
 
@@ -146,11 +152,10 @@ class Labelled:
         return least  # the other may be lower where it cannot hold the node
 
 
-@dataclass(frozen=True, eq=False)
-class Walls:
+class Walls(NamedTuple):
     """Walls in a part of a grid: points in the order of their names, and triangles of names."""
 
-    keys: Keys  # (n,), names, see ``Halves``
+    keys: Keys  # (n,), names: numbers on the lattice of half the fine spacing, see ``Labelled``
     places: NDArray[np.float64]  # (n, 3), in fine spacings from node (0, 0, 0)
     faces: Keys  # (m, 3), counter-clockwise seen from the second label beside it
     sides: Labels  # (m, 2), the labels beside it, the higher one first
@@ -164,25 +169,10 @@ def join_walls(parts: Sequence[Walls]) -> tuple[NDArray[np.float64], IntArray, L
     return places, faces.astype(np.int32), np.concatenate([part.sides for part in parts])
 
 
-class Halves:
-    """The lattice of half the fine spacing, one coarse voxel larger than the grid on all sides."""
-
-    def __init__(self, shape: tuple[int, int, int], factor: int) -> None:
-        self.beyond = 2 * factor
-        _, ny, nz = (2 * factor * (n + 2) + 1 for n in shape)
-        self.strides = np.array([ny * nz, nz, 1], np.int64)
-
-    def keys(self, place: NDArray[Any]) -> Keys:
-        """Return the name of each place (..., 3): its number in C order."""
-        keys: Keys = (place.astype(np.int64) + self.beyond) @ self.strides
-        return keys
-
-
 def extract_walls(field: Labelled) -> Walls:
     """Return the walls in the planes of fields."""
     low, label = _cells(field)
-    lattice = Halves(field.shape, field.factor)
-    base, steps = lattice.keys(2 * low), PLACES.astype(np.int64) @ lattice.strides
+    base, steps = 2 * (low + field.factor) @ field.strides, PLACES @ field.strides
 
     # the triangles of each cell's case
     case, of_cell = np.unique(_cases(field, low, label), return_inverse=True)
@@ -202,7 +192,7 @@ def extract_walls(field: Labelled) -> Walls:
     edge = np.repeat(np.arange(12), [len(some) for some in edges])[one]
     places = _on_edges(field, low, label, np.concatenate(edges)[one], edge)
     inner = np.unique(faces[table[:, :3] >= FACE_POINTS])
-    return Walls(*_with_inner_points(keys, places, inner, lattice), faces, sides)
+    return Walls(*_with_inner_points(keys, places, inner, field.strides), faces, sides)
 
 
 def _cells(field: Labelled) -> tuple[Keys, Labels]:
@@ -286,20 +276,21 @@ def _on_edges(
     share[within] = np.where(none, 0.5, one / np.where(none, 1, one + other))
     share = np.clip(share, CLEARANCE, 1 - CLEARANCE)
     begin, stop = (np.clip(end.astype(float), -CAP_HEIGHT, last + CAP_HEIGHT) for end in ends)
-    return begin + share[:, None] * (stop - begin)
+    places: NDArray[np.float64] = begin + share[:, None] * (stop - begin)
+    return places
 
 
 def _with_inner_points(
-    keys: Keys, places: NDArray[np.float64], used: Keys, lattice: Halves
+    keys: Keys, places: NDArray[np.float64], used: Keys, strides: Keys
 ) -> tuple[Keys, NDArray[np.float64]]:
     """Return points with those on faces, and then those in cells: means of the ones beside them."""
-    i, rest = np.divmod(used, lattice.strides[0])
-    odd = np.stack([i, *np.divmod(rest, lattice.strides[1])], 1) % 2 == 1  # between nodes
+    i, rest = np.divmod(used, strides[0])
+    odd = np.stack([i, *np.divmod(rest, strides[1])], 1) % 2 == 1  # between nodes
     for axes in (2, 3):
         some = odd.sum(1) == axes
         total, times = np.zeros((np.count_nonzero(some), 3)), np.zeros(np.count_nonzero(some))
         for axis, step in product(range(3), (-1, 1)):
-            near = used[some] + step * lattice.strides[axis]
+            near = used[some] + step * strides[axis]
             at = np.searchsorted(keys, near).clip(max=len(keys) - 1)
             there = np.flatnonzero(odd[some, axis] & (keys[at] == near))
             total[there] += places[at[there]]

@@ -23,12 +23,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
-from ..threads import map_chunks
+from ..threads import chunks_of, map_chunks
 from .band import MAX_DISTANCE, MIN_SLOPE
 from .nodes import SharedParts, VoxelIndex, nodes_of_part, number_parts
 
@@ -316,67 +317,51 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     """Return the correction on the lattice of 2 cells per block, (27, D), in half voxels.
 
     It is the mean error at the corners of voxels, interpolated to the finer lattice, plus the means
-    there of the errors that are left each time.
+    there of the errors that are left each time. Errors are summed in the order of the samples, some
+    at a time, to save memory.
     """
     numbers, count = number_parts(parts, np.ones(27, np.int64))
-    left, correction = feet.values, np.zeros(numbers.shape, np.float32)
-    for cells, turns in MEANS.items():
-        at, upper = _nodes_round(feet, numbers, cells)
-        own = numbers[CORNER_PARTS] if cells == 1 else numbers
-        for _ in range(turns):
-            mean = _mean_at_nodes(left, feet.weights, at, upper, count)
-            correction += prolong(mean.take(own), cells, 2)
-            there = np.zeros_like(left)
-            for corner, nodes in zip(CELL, at):  # one by one, to save memory
-                there += mean.take(nodes) * _share(upper, corner)
-            left = left - there
+    left, correction = feet.values.copy(), np.zeros(numbers.shape, np.float32)
+    before: tuple[int, FloatArray] | None = None  # the cells and means of the turn before
+    for cells in [cells for cells, turns in MEANS.items() for _ in range(turns)]:
+        sums = np.zeros((3, count))  # of weights, values and squares
+        for rows in chunks_of(len(left), TEMPORARIES):
+            if before:
+                at, shares = _nodes_round(feet, rows, numbers, before[0])
+                left[rows] -= (before[1].take(at) * shares).sum(0)
+            at, shares = _nodes_round(feet, rows, numbers, cells)
+            weight = (shares * feet.weights[rows]).astype(np.float64)
+            for total in sums:
+                np.add.at(total, at.T.ravel(), weight.T.ravel())
+                weight *= left[rows]
+        means = map_chunks(partial(_shrunk_mean, sums), count, 8)
+        before = cells, np.concatenate(means) if means else left[:0]
+        del sums
+        own = CORNER_PARTS if cells == 1 else slice(None)
+        for rows in chunks_of(correction.shape[1], 4 * len(correction)):
+            correction[:, rows] += prolong(before[1].take(numbers[own, rows]), cells, 2)
     return correction
 
 
-def _nodes_round(feet: FootPoints, numbers: IntArray, cells: int) -> tuple[IntArray, FloatArray]:
-    """Return the 8 nodes round each foot point, (8, n), and what ``_share`` takes, (2, 3, n).
+def _nodes_round(
+    feet: FootPoints, rows: slice, numbers: IntArray, cells: int
+) -> tuple[NDArray[np.intp], FloatArray]:
+    """Return the 8 nodes round foot points, (8, n), and their trilinear weights there, (8, n).
 
     The nodes have ``numbers`` (27, D) by the part of each block; with 1 cell along a block they are
     the corners of blocks, with 2 all parts.
     """
-    low, within = _find_cell(feet.place, cells)
+    low, within = _find_cell(feet.place[:, rows], cells)
     step = STRIDES * (2 // cells)
-    first = (step @ low) * numbers.shape[1] + feet.rows
-    at = np.empty((len(CELL), len(first)), np.int32)
-    for corner, nodes in zip(CELL, at):
-        np.take(numbers.ravel(), first + (corner @ step) * numbers.shape[1], out=nodes)
-    return at, np.stack([1 - within, within])
+    at = (step @ low + (CELL @ step)[:, None]) * numbers.shape[1] + feet.rows[rows]
+    upper = np.stack([1 - within, within])  # (2, 3, n)
+    shares: FloatArray = upper[CELL[:, 0], 0] * upper[CELL[:, 1], 1] * upper[CELL[:, 2], 2]
+    return numbers.ravel().take(at).astype(np.intp), shares
 
 
-def _share(upper: FloatArray, corner: IntArray) -> FloatArray:
-    """Return the trilinear weights of one corner of the cells round n places, (n,)."""
-    x, y, z = corner
-    share: FloatArray = upper[x, 0] * upper[y, 1] * upper[z, 2]
-    return share
-
-
-def _mean_at_nodes(
-    values: FloatArray, weights: FloatArray, at: IntArray, upper: FloatArray, count: int
-) -> FloatArray:
-    """Return the mean at each of ``count`` nodes, (count,), of values (n,) with weights (n,).
-
-    The values count for the 8 nodes ``at``, (8, n), with trilinear shares.
-    """
-    sums = np.zeros((3, count))  # of weights, values and squares
-    for corner, nodes in zip(CELL, at):
-        weight = (_share(upper, corner) * weights).astype(np.float64)
-        index = nodes.astype(np.intp)
-        for total in sums:
-            np.add.at(total, index, weight)
-            weight *= values
-    means = map_chunks(lambda some: _shrunk_mean(*sums[:, some]), count, 8)
-    return np.concatenate(means)
-
-
-def _shrunk_mean(
-    weight: NDArray[np.float64], total: NDArray[np.float64], squares: NDArray[np.float64]
-) -> FloatArray:
-    """Return the means, (n,), by sums of weights, values and squares, shrunk if these disagree."""
+def _shrunk_mean(sums: NDArray[np.float64], some: slice) -> FloatArray:
+    """Return means, (n,), by sums of weights, values and squares, shrunk if these disagree."""
+    weight, total, squares = sums[:, some]
     mean = total / np.maximum(weight, 1e-9)
     variance = np.maximum(squares / np.maximum(weight, 1e-9) - mean**2, 0)
     agreement = mean**2 / np.maximum(mean**2 + VARIANCE_PENALTY * variance, 1e-12)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -12,10 +11,9 @@ from numpy.typing import NDArray
 
 from ..arrays import CENTRE, BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError
-from ..grid.cubic import on_samples, sampled_places
 from ..grid.field import Field
-from ..grid.planes import planes_at_once
-from ..grid.sdf_grid import SdfGrid
+from ..grid.samples import let_go, planes_at_once
+from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
 from ..options import MASK
 from ..threads import over_threads
 from .band import (
@@ -89,14 +87,10 @@ class Band:
         noisy = ~self.lipschitz if self.sampled is None else ~self.lipschitz & self.sampled
         return int(np.count_nonzero(noisy))
 
-    @cached_property
-    def table(self) -> IntArray:
-        """The neighbour table of the voxels, (V, 27)."""
-        return neighbour_table(self.voxel_ijk, self.shape)
-
     def network_inputs(self) -> tuple[FloatArray, IntArray, IntArray]:
         """Return the network's inputs: patches, neighbour table, and rows of decoded voxels."""
-        return self.patches, self.table, np.flatnonzero(self.decoded).astype(np.int32)
+        table = neighbour_table(self.voxel_ijk, self.shape)
+        return self.patches, table, np.flatnonzero(self.decoded).astype(np.int32)
 
 
 class _Block(NamedTuple):
@@ -231,6 +225,7 @@ def _blocks(
         if is_checked:
             check_not_cut_off(patches, offset, grid.voxel_size)
         voxel_ijk[:, 0] += low
+        let_go(grid.samples)
         leaves = any(bool((side <= 0).any()) for side in sides)
         return _Block(voxel_ijk, patches, *beyond, leaves, jumps)
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import FileError, GridError
-from ...grid.placement import UNNAMED, even_steps
+from ...grid.samples import UNNAMED, even_steps
 from ..volume import axes_direction, kept_axes, triple
 
 SPACE = "xyz"

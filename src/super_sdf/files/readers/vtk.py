@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError, GridError, OptionTypeError, seen
-from ...grid.placement import even_steps
+from ...grid.samples import even_steps
 from ..volume import XYZ, Request, Volume, of_array, triple
 
 NAME = "the image"  # in memory, in error messages

@@ -1,28 +1,31 @@
-"""The cubic spline through the samples, at the nodes of blocks, for fields that are smooth.
+"""The first values at the nodes of blocks: the network's, or the spline through the samples.
 
 Where a field is smooth, its cubic B-spline is nearer to it than any network that was trained on
 distances, whatever its slope. Fourth differences of the samples tell where it is smooth.
 
 Reference: Unser, Aldroubi and Eden, "B-spline signal processing", 1993. The prefilter is the
 symmetric exponential of the pole sqrt(3) - 2, cut off at ``TAIL`` samples. All sums are written
-out, so that the bits of a result do not depend on the slabs.
+out, so that the bits of a result do not depend on how the grid was cut.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
 from ..grid.derived import local_slopes
-from ..grid.planes import SampleArray, in_spacings
-from ..network.decoder import Decoder, decode
+from ..grid.samples import SampleArray, in_spacings
+from ..network.decoder import Adapter, decode
+from ..progress import ShareCallback
 from .band import plane_blocks
 from .nodes import block_offsets
 from .survey import Band
 
+AT_ONCE = 500_000  # voxels that the network sees at a time, about: they take 1.7 kB each
 POLE = 3**0.5 - 2
 TAIL = 12  # samples after which the prefilter has fallen to 1e-7
 BEYOND = TAIL + 2  # samples to either side on which the spline in a voxel depends
@@ -34,28 +37,61 @@ JUMPING, JUMPED = 5.0, 9.0  # the same for a field of uneven slope, which is lin
 WRONG_SLOPE = 0.05  # from 1: local slopes so far off are not those of distances
 
 
+def predict(
+    band: Band,
+    table: IntArray,
+    voxels: IntArray,
+    network: Adapter,
+    factor: int,
+    threads: int = 1,
+    progress: ShareCallback | None = None,
+) -> FloatArray:
+    """Return the network's values in some voxels (D,), rows of a band, as blocks (Q, D + 1).
+
+    A large band is worked on in runs of planes, with the planes beside them that values depend on.
+    """
+    plane, offsets = band.voxel_ijk[:, 0], block_offsets(factor)
+    count = len(plane)
+    parts = -(-count // AT_ONCE)
+    if parts == 1 or network.receptive_field is None:
+        return decode(network, (band.patches, table, voxels), offsets, progress, threads)  # Eqs. 3 and 5
+    blocks = np.zeros((len(offsets), len(voxels) + 1), np.float32)
+    ends = [-1, *plane[np.arange(1, parts) * count // parts].tolist(), band.shape[0]]
+    for first, last in pairwise(sorted(set(ends))):  # the planes after the first, to the last
+        reach = network.receptive_field
+        start, stop = np.searchsorted(plane, [first + 1 - reach, last + 1 + reach])
+        own = np.flatnonzero((plane[voxels] > first) & (plane[voxels] <= last))
+        if not len(own):
+            continue
+        near = table[start:stop] - np.int32(start)
+        near[(near < 0) | (near >= stop - start)] = -1
+        inputs = band.patches[start:stop], near, voxels[own] - np.int32(start)
+        blocks[:, own] = decode(network, inputs, offsets, None, threads)[:, :-1]
+        if progress:
+            progress(last / band.shape[0])
+    return blocks
+
+
 def interpolate(
     band: Band,
-    network: Decoder,
+    table: IntArray,
+    voxels: IntArray,
+    network: Adapter,
     factor: int,
-    own_ijk: IntArray,
-    inputs: tuple[FloatArray, IntArray, IntArray],
     threads: int = 1,
 ) -> FloatArray:
     """Return the blocks of a field that is no distance: its spline, and the network at kinks.
 
-    Of a field that is far from a distance, or was cut off, the network adds nothing. ``inputs`` are
-    those of ``decode``, for the voxels (D, 3).
+    Of a field that is far from a distance, or was cut off, the network adds nothing.
     """
     smooth, uneven = band.field.smooth, band.field.is_uneven
     assert smooth is not None
-    patches, table, voxels = inputs
+    own_ijk = band.voxel_ijk[voxels]
     blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel, uneven=uneven)
     blocks[:, :-1] -= np.float32(band.level)
     some = np.flatnonzero(share)
     if band.field.has_kinks and len(some):
-        kinked = patches, table, voxels[some]
-        added = decode(network, kinked, block_offsets(factor), None, threads)[:, :-1]
+        added = predict(band, table, voxels[some], network, factor, threads)[:, :-1]
         blocks[:, some] += share[some] * (added - blocks[:, some])
     return blocks
 
