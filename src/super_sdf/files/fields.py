@@ -111,7 +111,11 @@ def write_vti(field: FineField, path: Path) -> None:
     for first, planes in lattice_planes(field):
         values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
     extent = " ".join(f"0 {nodes - 1}" for nodes in grid.shape)
-    place = {"Origin": grid.origin, "Spacing": grid.spacing, "Direction": np.ravel(grid.direction)}
+    place: dict[str, Any] = {
+        "Origin": grid.origin,
+        "Spacing": grid.spacing,
+        "Direction": np.ravel(grid.direction),
+    }
     placed = " ".join(f'{n}="{" ".join(f"{x:.17g}" for x in at)}"' for n, at in place.items())
     head = (
         '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'

@@ -101,11 +101,12 @@ class Volume:
 
     def read(self) -> NDArray[Any]:
         """Return the samples along the axes that are kept."""
-        samples = np.asanyarray(self.load())
+        samples: NDArray[Any] = np.asanyarray(self.load())
         if samples.shape != tuple(self.stored):
             raise FileError(f"its header promises {self.stored} samples, it holds {samples.shape}")
         where = [slice(None) if axis in self.kept else 0 for axis in range(samples.ndim)]
-        return samples[tuple(where)]
+        kept: NDArray[Any] = samples[tuple(where)]
+        return kept
 
     def in_space(self, space: str | None, name: str) -> Volume:
         """Return it in an anatomical space, its own if None; OptionError if it states none."""

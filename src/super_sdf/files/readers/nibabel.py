@@ -6,6 +6,7 @@ NIfTI states all.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import product
 from typing import Any
@@ -73,7 +74,7 @@ def read_analyze(request: Request) -> Volume:
     return Volume(*image, triple(header.get_zooms()[:3]), None, XYZ, notes=(NO_PLACE,))
 
 
-def _load(request: Request) -> tuple[tuple[Any, ...], Any]:
+def _load(request: Request) -> tuple[tuple[Callable[[], Any], tuple[int, ...], Any], Any]:
     """Return how an image is loaded, its shape and type; and its header."""
     import nibabel
 

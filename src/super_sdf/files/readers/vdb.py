@@ -26,7 +26,10 @@ Ints = NDArray[np.int64]
 
 OLDEST = 222  # version of the file format, of OpenVDB 3
 MARGIN = 2  # voxels of background around the others, so that the border is outside
-TYPES = {"Tree_float_5_4_3": np.dtype("<f4"), "Tree_double_5_4_3": np.dtype("<f8")}
+TYPES: dict[str, np.dtype[Any]] = {
+    "Tree_float_5_4_3": np.dtype("<f4"),
+    "Tree_double_5_4_3": np.dtype("<f8"),
+}
 HALF = "_HalfFloat"  # ends the type of a grid whose values are stored in 16 bits
 NUMBERS = {"float": "f", "double": "d", "int32": "i", "int64": "q", "bool": "?"}  # of metadata
 # How many vectors a map has, and which are the translation and the scale.
