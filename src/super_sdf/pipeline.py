@@ -33,7 +33,7 @@ from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
-from .refine.survey import Band, BandSummary, BandTooLarge, no_surface, summarise, survey
+from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import choose_mesher, extract
 from .surface.mesh import Mesh, vertex_type
@@ -43,7 +43,7 @@ from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, pl
 
 def refine(
     grid: SdfGrid,
-    network: Decoder,
+    network: Decoder | Adapter,
     factor: int = 4,
     offset: float = 0.0,
     *,
@@ -351,7 +351,7 @@ def mesh_grid(
     try:
         is_one = map_tiles is None and least_tiles == 1
         band = survey(lattice, offset, threads=threads, most=room.voxels() if is_one else -1)
-    except BandTooLarge:
+    except BandTooLargeError:
         band, whole = None, summarise(lattice, offset, threads)
         margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
         tiles = plan(shape, whole, margin, room, least_tiles)
