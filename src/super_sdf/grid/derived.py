@@ -144,26 +144,21 @@ def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> Derived
     Those are too far from the surface to matter, however near it they were cut off.
     """
 
-    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
+    def make(planes: NDArray[Any]) -> Floats:
         raised = planes.astype(np.float64)
         for limit in limits:
             amid = planes == limit
             for _ in range(RINGS):
-                amid = _all_around(amid)
+                for axis in range(3):
+                    lines = np.moveaxis(amid, axis, 0)
+                    all_along = lines.copy()
+                    all_along[1:] &= lines[:-1]
+                    all_along[:-1] &= lines[1:]
+                    amid = np.moveaxis(all_along, 0, axis)
                 raised[amid] += np.sign(limit) * h
         return raised
 
     return DerivedPlanes(values, make, RINGS)
-
-
-def _all_around(marked: BoolArray) -> BoolArray:
-    for axis in range(3):
-        lines = np.moveaxis(marked, axis, 0)
-        among = lines.copy()
-        among[1:] &= lines[:-1]
-        among[:-1] &= lines[1:]
-        marked = np.moveaxis(among, 0, axis)
-    return marked
 
 
 def fill_in(values: FloatArray, low: float, high: float, steps: Triple = CUBES) -> FloatArray:
@@ -188,12 +183,14 @@ def _distance_to_feet(
     """Return the distance of each sample to the nearest foot point of the ``known``, (n, 3).
 
     It is ``FAR`` voxels at most. At a foot point the surface is taken as a disc: it goes on
-    between them.
+    between them. Of foot points equally near, the lower disc counts, so that the order is no matter.
     """
     far, reach = np.float32(FAR * max(steps)), _reach(steps)
     margin = [(n, n) for n in reach]
     nearest = np.pad(np.where(cut, far, np.float32(0)), margin)
     discs = np.pad(np.full(cut.shape, far, np.float32), margin)
+    flat, flat_discs = nearest.reshape(-1), discs.reshape(-1)
+    strides = np.array([nearest.shape[1] * nearest.shape[2], nearest.shape[2], 1])
     box = np.indices([2 * n + 1 for n in reach]).reshape(3, -1).T - np.array(reach)
     apart = np.sqrt(((box * np.array(steps)) ** 2).sum(1)) / max(steps)
     offsets = box[(apart > 0) & (apart**2 <= (FEET_REACH + 0.3) ** 2)].astype(np.int32)
@@ -205,39 +202,20 @@ def _distance_to_feet(
         foot = np.ascontiguousarray((-values[tuple(known[rows].T)][:, None] * normal).T)
         at = np.ravel_multi_index(tuple((known[rows] + np.array(reach, np.int32)).T), nearest.shape)
         for offset in offsets:
-            step = (offset * np.array(steps)).astype(np.float32)
-            _approach(nearest, discs, at, offset, step[:, None] - foot, normal.T)
+            step, place = (offset * np.array(steps)).astype(np.float32), at + int(offset @ strides)
+            x, y, z = step[:, None] - foot
+            apart = np.sqrt(x * x + y * y + z * z)
+            closer = np.flatnonzero(apart <= flat[place])
+            x, y, z, apart, where = x[closer], y[closer], z[closer], apart[closer], place[closer]
+            a, b, c = normal.T[:, closer]
+            height = x * a + y * b + z * c
+            aside = np.sqrt(np.maximum(apart**2 - height**2, 0))
+            disc = np.hypot(height, np.maximum(aside - DISC, 0))
+            lower = np.minimum(disc, flat_discs[where])
+            flat_discs[where] = np.where(apart == flat[where], lower, disc)
+            flat[where] = apart
     inner = tuple(slice(n, n + size) for n, size in zip(reach, cut.shape))
     return discs[inner]
-
-
-def _approach(
-    nearest: FloatArray,
-    discs: FloatArray,
-    at: NDArray[np.intp],
-    offset: IntArray,
-    way: FloatArray,
-    normal: FloatArray,
-) -> None:
-    """Bring samples at an ``offset`` from some ``at`` places nearer by the foot points of these.
-
-    Changes ``nearest`` and ``discs``, the distances to the nearest foot point so far and to its
-    disc. ``way`` (3, n) is from the foot points to the samples, ``normal`` their direction.
-    """
-    flat, flat_discs = nearest.reshape(-1), discs.reshape(-1)
-    strides = np.array([nearest.shape[1] * nearest.shape[2], nearest.shape[2], 1])
-    place = at + int(offset @ strides)
-    x, y, z = way
-    apart = np.sqrt(x * x + y * y + z * z)
-    closer = np.flatnonzero(apart <= flat[place])
-    x, y, z, apart = x[closer], y[closer], z[closer], apart[closer]
-    a, b, c = normal[:, closer]
-    height = x * a + y * b + z * c
-    aside = np.sqrt(np.maximum(apart**2 - height**2, 0))
-    disc, where = np.hypot(height, np.maximum(aside - DISC, 0)), place[closer]
-    alike = apart == flat[where]  # the lower disc, so that the order is no matter
-    flat_discs[where] = np.where(alike, np.minimum(disc, flat_discs[where]), disc)
-    flat[where] = apart
 
 
 def _gradient(
@@ -332,7 +310,12 @@ class Resampled(SamplePlanes):
     ) -> None:
         self.source, self.spacing, self.axis = source, spacing, axis
         self.step, self.level = step, level
-        self.places = new_places(source.shape[axis], spacing[axis], step)
+        # The last one lies as near to the last sample as it can, and takes its value beyond.
+        count, each = source.shape[axis], spacing[axis]
+        places = np.arange(round((count - 1) * each / step) + 1) * (step / each)
+        nearest = np.rint(places)
+        places = np.where(np.abs(places - nearest) <= ON_SAMPLE, nearest, places)
+        self.places: Floats = np.minimum(places, count - 1)
         self.on_sample: BoolArray = np.rint(self.places) == self.places
         self.shape = tuple(
             len(self.places) if other == axis else count for other, count in enumerate(source.shape)
@@ -343,13 +326,13 @@ class Resampled(SamplePlanes):
         out = np.empty((max(last - first, 0), *self.shape[1:]))
         if not len(out):
             return out
-        low, high, places, start = max(first - ACROSS, 0), last + ACROSS, self.places, first
+        low, high, places = max(first - ACROSS, 0), last + ACROSS, self.places
         if self.axis == 0:
-            places, start = places[first:last], 0
+            places = places[first:last]
             low, high = max(int(places[0]) - EXTRA, 0), int(places[-1]) + 2 + EXTRA
             places = places - low
         block = np.moveaxis(np.asarray(self.source[low:high]), self.axis, 0)
-        lines, start = np.moveaxis(out, self.axis, 0), start - low if self.axis else 0
+        lines, start = np.moveaxis(out, self.axis, 0), first - low if self.axis else 0
         h, across = self.spacing[self.axis], np.delete(self.spacing, self.axis)
         for rows in chunks_of(lines.shape[1], 2 * (len(lines) + len(block)) * lines.shape[2]):
             asked = slice(rows.start + start, rows.stop + start)
@@ -470,18 +453,6 @@ class Lines:
         return kept
 
 
-def new_places(count: int, h: float, step: float) -> Floats:
-    """Return where new samples lie along an axis, in old spacings.
-
-    The last one lies as near to the last sample as it can, and takes its value if it is beyond.
-    """
-    places = np.arange(round((count - 1) * h / step) + 1) * (step / h)
-    nearest = np.rint(places)
-    places = np.where(np.abs(places - nearest) <= ON_SAMPLE, nearest, places)
-    reached: Floats = np.minimum(places, count - 1)
-    return reached
-
-
 def sample_near(
     at: At, shape: tuple[int, ...], step: NDArray[Any], reach: float
 ) -> tuple[FloatArray, float]:
@@ -514,7 +485,10 @@ def sample_near(
         steepest = max(steepest, _steepest(values, sizes * step))
         least = STEEPER * steepest * (reach + stride / 2 * float(np.linalg.norm(step)))
         far = np.abs(values).min(1) > least  # not where a value is unknown
-        _leave_out(samples, cells[far], stride, values[far, 0])
+        for offset in np.ndindex((stride + 1,) * 3):  # what is far from the surface gets its side
+            places = np.minimum(cells[far] + np.array(offset, np.int32), last)
+            new = np.isnan(samples[tuple(places.T)])
+            samples[tuple(places[new].T)] = np.copysign(np.inf, values[far, 0])[new]
         stride //= 2
         cells = (cells[~far, None] + stride * CORNERS).reshape(-1, 3)
         cells = cells[(cells < last).all(1)]
@@ -557,12 +531,3 @@ def _steepest(values: NDArray[Any], sizes: NDArray[Any]) -> float:
             slopes = np.abs(values[:, one] - values[:, other]) / length
         steepest = max(steepest, float(slopes[np.isfinite(slopes)].max(initial=0)))
     return steepest
-
-
-def _leave_out(samples: FloatArray, cells: Cells, stride: int, values: NDArray[Any]) -> None:
-    """Give the other samples of cells that lie far on one side of the surface that side."""
-    last, sides = np.array(samples.shape, np.int32) - 1, np.copysign(np.inf, values)
-    for offset in np.ndindex((stride + 1,) * 3):
-        places = np.minimum(cells + np.array(offset, np.int32), last)
-        new = np.isnan(samples[tuple(places.T)])
-        samples[tuple(places[new].T)] = sides[new]

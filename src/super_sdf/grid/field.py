@@ -24,10 +24,10 @@ steps: they are one sample high wherever it is not along the axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import permutations, product
+from itertools import chain, permutations, product
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -181,6 +181,11 @@ class Evidence(NamedTuple):
     def is_cut(self) -> bool:
         """Whether values are cut off."""
         return self.cut_low or self.cut_high
+
+    def uncut(self, extremes: Extremes) -> Extremes:
+        """Return between which values none is cut off."""
+        low, high = extremes
+        return (low if self.cut_low else -np.inf), (high if self.cut_high else np.inf)
 
     @property
     def is_scaled(self) -> bool:
@@ -394,10 +399,10 @@ def _of_both_sides(
 ) -> Transform | None:
     """Return the transform if values jump from one side to the other, by two voxels or by one."""
     sides = np.sign(patches)
-    for measure, step in (*_euclidean(steps, unit), *_others(steps, unit, weighted=True)):
+    for measure, step in chain.from_iterable(_measures(steps, unit)):
         if _follow(patches, sides, measure, (0, 0), clipped):
             return Transform(step, 0)
-    for measure, step in _euclidean(steps, 2 * unit):
+    for measure, step in _measures(steps, 2 * unit)[0]:
         seen = _follow(patches / 2, sides, measure, (0.5, 0.5), clipped / 2)
         if seen and seen.apart:
             return Transform(step, 0)
@@ -414,13 +419,13 @@ def _with_zeros(
     """
     signs = np.sign(patches)
     one_sided = clipped.min() == 0
-    euclidean = list(_euclidean(steps, unit))
-    for measure, step in (*euclidean, *_others(steps, unit, weighted=one_sided)):
+    euclidean, squares, others = _measures(steps, unit)
+    for measure, step in (*euclidean, *squares, *(others if one_sided else [])):
         seen = _follow(patches, signs, measure, (0, 0), clipped)
         if seen and one_sided and is_flat and not seen.apart:
             return None
         if seen and (seen.beyond or (measure, step) in euclidean):
-            is_mask = _count_lone(signs == 0) >= LEAST or _is_stepped(signs)
+            is_mask = _are_lone(signs == 0).sum() >= LEAST or _is_stepped(signs)
             zeros = side if one_sided else _side_of_zeros(signs)
             return Transform(step, zeros) if is_mask else None
     joined = np.where(signs == 0, side, signs)
@@ -431,24 +436,24 @@ def _with_zeros(
     return None
 
 
-def _euclidean(steps: Floats, unit: float) -> Iterator[tuple[Measure, float]]:
-    """Yield Euclidean measures, in the world and on the lattice, and the spacings they show."""
-    yield partial(_length, steps), unit
-    if steps.max() > 1 + ZERO:
-        yield partial(_length, np.ones(3)), unit
+def _measures(steps: Floats, unit: float) -> list[list[tuple[Measure, float]]]:
+    """Return measures and the spacings that they show: Euclidean ones, their squares, others.
+
+    Those are Euclidean in the world and on the lattice; the others chessboard, city-block, 3-4-5.
+    """
+    euclidean = [partial(_length, steps)]
+    euclidean += [partial(_length, np.ones(3))] if steps.max() > 1 + ZERO else []
+    squares = [partial(_length, each.args[0], power=2) for each in euclidean]
+    others = [(partial(_weighted, weight), unit) for weight in (0.0, 1.0)]
+    return [
+        [(measure, unit) for measure in euclidean],
+        [(measure, unit**0.5) for measure in squares],
+        [*others, (partial(_weighted, 1 / 3), unit / 3)],
+    ]
 
 
-def _others(steps: Floats, unit: float, *, weighted: bool) -> Iterator[tuple[Measure, float]]:
-    """Yield the squares of these, and ``weighted`` measures: chessboard, city-block and 3-4-5."""
-    for length, _ in _euclidean(steps, unit):
-        yield lambda offsets, length=length: length(offsets) ** 2, unit**0.5  # type: ignore[misc]
-    if weighted:
-        yield from ((partial(_weighted, weight), unit) for weight in (0.0, 1.0))
-        yield partial(_weighted, 1 / 3), unit / 3
-
-
-def _length(steps: Floats, offsets: NDArray[np.int64]) -> Floats:
-    lengths: Floats = np.linalg.norm(offsets * steps, axis=1)
+def _length(steps: Floats, offsets: NDArray[np.int64], power: int = 1) -> Floats:
+    lengths: Floats = np.linalg.norm(offsets * steps, axis=1) ** power
     return lengths
 
 
@@ -498,11 +503,10 @@ def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
     return nearest, straight != 0
 
 
-def _count_lone(marked: BoolArray, centre: BoolArray | None = None) -> int:
-    """Count inner samples, those of ``centre`` if given, round which all are marked."""
+def _are_lone(marked: BoolArray) -> BoolArray:
+    """Return round which inner samples all are marked."""
     windows = np.lib.stride_tricks.sliding_window_view(marked, (3, 3, 3), axis=(1, 2, 3))
-    alone = windows.all((-3, -2, -1))
-    return int((alone if centre is None else alone & centre).sum())
+    return np.asarray(windows.all((-3, -2, -1)))
 
 
 def _is_stepped(sides: Floats) -> bool:
@@ -515,11 +519,12 @@ def _is_stepped(sides: Floats) -> bool:
     near = (sides == 0)[:, INNER, INNER, INNER]
     zero = np.concatenate([near[centre > 0], near[centre < 0][:, ::-1, ::-1, ::-1]])
     ways = [*np.eye(3, dtype=int), *-np.eye(3, dtype=int)]
-    next_to = [_at(zero, way) for way in ways]
+    next_to = [zero[(..., *(1 + way))] for way in ways]
     stepped, counts = np.zeros(len(zero), bool), np.zeros((6, 6), int)
     for i, j in permutations(range(6), 2):
         if i % 3 != j % 3:
-            goes_on = _at(zero, ways[i] - ways[j]) & _at(zero, ways[j] - ways[i])
+            one, other = ((..., *(1 + way)) for way in (ways[i] - ways[j], ways[j] - ways[i]))
+            goes_on = zero[one] & zero[other]
             steps = next_to[i] & next_to[j] & ~goes_on
             stepped |= steps
             counts[i, j] = steps.sum()
@@ -528,12 +533,8 @@ def _is_stepped(sides: Floats) -> bool:
     return bool(share > STEPPED and both_ways.any())
 
 
-def _at(patches: BoolArray, offset: NDArray[np.int64]) -> BoolArray:
-    return np.asarray(patches[(..., *(1 + offset))])
-
-
 def _side_of_zeros(sides: Floats) -> int:
     """Return the sign of the side that zeros border, with no neighbour there; 0 if unclear."""
     zero = sides[:, INNER, INNER, INNER] == 0
-    lone = [_count_lone(sides != sign, zero) for sign in (-1, 1)]
+    lone = [int((_are_lone(sides != sign) & zero).sum()) for sign in (-1, 1)]
     return int(np.sign(lone[1] - lone[0]))
