@@ -198,18 +198,14 @@ class Evidence(NamedTuple):
         allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
         uneven = abs(self.uneven) > max(UNEVEN, self.roughness, self.digit)
         is_wrong = self.wrong > allowed or uneven
-        return self.is_enough and (is_wrong or self.is_too_steep or self.is_contradictory)
+        return self.is_enough and (is_wrong or self.is_contradictory)
 
     @property
     def is_contradictory(self) -> bool:
-        """Whether samples contradict each other's distances, and noise does not explain it."""
-        return self.contradicting > CONTRADICTING and self.noisy <= NOISY_SHARE
-
-    @property
-    def is_too_steep(self) -> bool:
-        """Whether values change by more than distances can at more samples than noise explains."""
+        """Whether samples differ by more than distances can, at more than noise explains."""
         steep = self.noisy > max(NOISY_SHARE, MOST_BY_NOISE * self.roughness)
-        return steep and self.wrong > WRONG_SLOPES
+        contradicting = self.contradicting > CONTRADICTING and self.noisy <= NOISY_SHARE
+        return (steep and self.wrong > WRONG_SLOPES) or contradicting
 
     @property
     def is_noisy(self) -> bool:

@@ -27,14 +27,8 @@ from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, Triple
 from ..errors import GridError
 from ..options import AUTO, EXACT, MASK, NOISY, SCALED, TRUNCATED, Options
 from ..threads import chunks_of
+from . import derived
 from .census import CUT_OFF, ENOUGH, Census, Floats, Gradients, Looked, not_finite
-from .derived import (
-    extremes_of_masks,
-    filled_planes,
-    mask_planes,
-    normalised_planes,
-    without_plateaus,
-)
 from .field import (
     NONE_EXACT,
     SLOPE_OFF,
@@ -301,7 +295,9 @@ def _of_mask(case: Case, mask: SampleArray, lower: float) -> Interpreted:
     )
     h = min(steps_of(spacing))
     field = Field(MASK, exact=NONE_EXACT, on_lattice=not is_cubic(spacing))
-    return Interpreted(mask_planes(mask, h), extremes_of_masks(h), spacing, False, field)
+    return Interpreted(
+        derived.mask_planes(mask, h), derived.extremes_of_masks(h), spacing, False, field
+    )
 
 
 def check_negative_inside(census: Census) -> None:
@@ -533,7 +529,7 @@ def _truncated(taken: Interpreted, evidence: Evidence, case: Case) -> Interprete
     if at >= FILLED:
         return taken
     steps = steps_of(taken.spacing)
-    return replace(taken, samples=filled_planes(taken.samples, steps, taken.extremes))
+    return replace(taken, samples=derived.filled_planes(taken.samples, steps, taken.extremes))
 
 
 def _projective(taken: Interpreted, evidence: Evidence, case: Case) -> Interpreted:
@@ -550,7 +546,7 @@ def _as_spline(taken: Interpreted) -> Interpreted:
     """Return distances that were cut off too near the surface, to be meshed by their spline."""
     sign = -1.0 if taken.positive_inside else 1.0
     smooth = changed(taken.samples, lambda values: values * sign)
-    samples = without_plateaus(taken.samples, taken.extremes, min(steps_of(taken.spacing)))
+    samples = derived.without_plateaus(taken.samples, taken.extremes, min(steps_of(taken.spacing)))
     taken = replace(taken, samples=samples).with_field(smooth=smooth)
     if is_cubic(taken.spacing):
         return taken
@@ -577,18 +573,17 @@ def _scaled(taken: Interpreted, evidence: Evidence, case: Case) -> Interpreted:
     sign = (-1 if taken.positive_inside else 1) / slope
     steps, cubic = steps_of(taken.spacing), is_cubic(taken.spacing)
     step = steps[0] if cubic else float(np.exp(np.log(steps).mean()))
-    contradictory = evidence.is_too_steep or evidence.is_contradictory
     has_distances = evidence.is_enough and not evidence.is_cut and evidence.wrong < TOO_BENT
     field = Field(
         SCALED,
         exact=NONE_EXACT,
         smooth=changed(taken.samples, lambda values: values * sign),
-        has_kinks=has_distances and not contradictory and cubic,
+        has_kinks=has_distances and not evidence.is_contradictory and cubic,
         on_lattice=not cubic,
         evidence=evidence.report(),
     )
     low, high = (x / slope for x in taken.extremes)
-    samples = normalised_planes(taken.samples, min(steps), step * slope)
+    samples = derived.normalised_planes(taken.samples, min(steps), step * slope)
     return replace(taken, samples=samples, extremes=(low, high), field=field)
 
 
