@@ -8,18 +8,17 @@ noisy      distances with noise
 
 A distance field has slope 1 wherever it is smooth, in units of the spacing. It is bent only where
 its third and fourth differences show it: at a kink between samples, or where it is curved. So a
-slope that is off by more than these differences can explain belongs to a field that is no distance.
-So do samples that differ by more than they are apart, along diagonals too, and by more than noise
-of the size that fourth differences show: fast marching and other schemes make such fields. A
-truncated field is constant away from the surface. A noisy one changes by more than the samples are
-apart, and is bent there.
+slope that is off by more than these can explain belongs to a field that is no distance. So do
+samples that differ by more than they are apart, along diagonals too, and by more than noise of the
+size that fourth differences show: fast marching and other schemes make such fields. A truncated
+field is constant away from the surface. A noisy one changes by more than the samples are apart.
 
 The values of a distance transform of a mask follow from the sides of the samples: each is the
 distance to the nearest sample of another side, in the world or on the lattice, by whatever measure,
-perhaps squared, less half a voxel or a whole one, or clipped. Exact distances know where between
-two samples the surface is, so they are others. Only those to a solid with all its faces on samples
-are the same, in which the samples on the surface are 0. Then the surface of a mask shows by its
-steps: they are one sample high wherever it is not along the axes.
+perhaps squared, less half a voxel or a whole one, or clipped. Exact distances do not, as they know
+where between two samples the surface is, unless all faces of the solid are on samples, which are 0
+there. Then the surface of a mask shows by its steps: one sample high wherever it is not along the
+axes.
 """
 
 from __future__ import annotations

@@ -1,17 +1,13 @@
 """From values of any kind to distances near the surface: what they are, and the best way there.
 
 The evidence is gathered once (``census``, ``field``); the user may overrule it. The zero level
-never moves. Values that change from sample to sample are exact, noisy, truncated or scaled: their
-sign and spacing are as given, or as the values show them. A scaled or closely truncated field is
-meshed by its cubic spline, which is the same whatever the spacings. So it becomes distances on its
-lattice, and unequal spacings are no matter.
+never moves. A scaled or closely truncated field is meshed by its cubic spline, which is the same
+whatever the spacings: it becomes distances on its lattice.
 
-Values that are refused may be labels, densities, unsigned distances, distances in another unit, or
-a field of another slope: the message names the one option to try next. Values without a sample
-inside are the hardest: thin solids, and what only looks like one. A wall thinner than the spacing
-may pass between the samples, which are then all outside. Their distances still show it: the sphere
-of each sample touches the wall and contains none of it. Other fields have no inside either:
-unsigned distances to a thick solid, and values that stay above 0.
+Of values that are refused, the message names the one option to try next. Those without a sample
+inside are the hardest. A wall thinner than the spacing may pass between the samples, which are then
+all outside, but the sphere of each touches the wall and contains none of it. Other fields have no
+inside either: unsigned distances to a thick solid, and values that stay above 0.
 """
 
 from __future__ import annotations
@@ -827,12 +823,10 @@ def _between(samples: SampleArray) -> float:
     return float(f"{level:.3g}")
 
 
-def _steps(census: Census) -> NDArray[np.float64] | None:
+def _steps(census: Census) -> Floats | None:
     """Return the spacing of each axis with which values are distances; None if with none."""
     gradients = census.everywhere
-    if not len(gradients.bend):
-        return None
-    if gradients.spacing is not None:
-        return gradients.spacing
+    if not len(gradients.bend) or gradients.spacing is not None:
+        return gradients.spacing if len(gradients.bend) else None
     step = gradients.typical_length
     return np.full(3, step) if gradients.agree_with(step) else None

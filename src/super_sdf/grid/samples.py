@@ -418,7 +418,7 @@ def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
     if hasattr(values, "chunks") and isinstance(getattr(values, "dtype", None), np.dtype):
         return LazyPlanes(values)  # of h5py, Zarr or Dask
     try:
-        samples = np.asanyarray(without_device(values))
+        samples: NDArray[Any] = np.asanyarray(without_device(values))
     except (TypeError, ValueError, RuntimeError):  # ragged lists
         raise GridError(f"values are {seen(values)}: give an array of three axes") from None
     if not hasattr(samples, "mask"):

@@ -203,10 +203,12 @@ def without_unseen(census: Census, notes: list[str]) -> Census:
 
 def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
     """Return values that may stand for unseen samples, and the steepest change of the others."""
-    values, counts = np.unique(pairs[0][pairs[0] == pairs[1]], return_counts=True)
+    has_equal = np.count_nonzero(pairs[0] == pairs[1]) >= ENOUGH
+    values, counts = np.unique(pairs[0] if has_equal else (), return_counts=True)
     often = values[counts >= ENOUGH][np.argsort(counts[counts >= ENOUGH])[-FREQUENT:]]
     changes = np.abs(pairs[1] - pairs[0])
-    changes[np.isin(pairs, extremes).all(0)] = 0  # values that are cut off near the surface
+    is_extreme = np.isin(pairs, extremes)
+    changes[is_extreme.all(0)] = 0  # values that are cut off near the surface
     crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
     suspects = []
     for value in sorted({0.0, *extremes, *often.tolist()}):
@@ -220,7 +222,7 @@ def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
             continue
         if is_often and alike < ALIKE * (alike + len(beside)):
             continue
-        steepest = _steepest(pairs, value, extremes)
+        steepest = _steepest(pairs, has, is_extreme)
         if value in extremes and _is_cut_near(pairs, value, steepest, extremes):
             continue
         if is_plateau or largest > JUMP * steepest:
@@ -236,15 +238,14 @@ def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extreme
     return bool(near and np.isin(crossing, extremes).all(0).mean() > FILLED_IN)
 
 
-def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
+def _steepest(pairs: Floats, has: BoolArray, is_extreme: BoolArray) -> float:
     """Return the steepest change of samples without a value, or all that they span, if few tell."""
-    is_inner = ~np.isin(pairs, (value, *extremes))
-    rest, inner = pairs[pairs != value], pairs[is_inner]
-    change = np.abs(pairs[1] - pairs[0])
-    changes = change[(pairs != value).all(0)]
+    is_inner, change = ~(has | is_extreme), np.abs(pairs[1] - pairs[0])
+    inner, changes = pairs[is_inner], change[~has.any(0)]
     span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
     changes = changes[(changes > 0) & (changes <= span)]
     if len(changes) < ENOUGH or len(np.unique(inner[:MANY])) < LEAST_VALUES:
+        rest = pairs[~has]
         low, high = rest.min(initial=0), rest.max(initial=0)
         return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
     # A field that levels off, or with far spacings along one axis, is steepest at the surface.
