@@ -15,6 +15,7 @@ import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from export.dataset import draw_mesh, mesh_order
 from export.shapes.solid import random_solid
 from super_sdf import Mesh, load_network, upsample
 from super_sdf.errors import SuperSdfError
-from super_sdf.network.decoder import Decoder
 from super_sdf.surface import cap, extract, marching
 from super_sdf.surface.sharp import features, patches, planes
 from super_sdf.truth import sampling, solid
@@ -48,7 +48,7 @@ The loss is how far the surface there is from the true one, and turned from it, 
 """
 
 
-def rows_of(mesh: Mesh, size: int, network: Decoder) -> tuple[np.ndarray, np.ndarray]:
+def rows_of(mesh: Mesh, size: int, network: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence (f, e) and the losses (f, s) of all candidates of a shape."""
     truth = solid.Solid(mesh)
     grid = sampling.sample_solid(truth, sampling.unit_layout(size))

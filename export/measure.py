@@ -25,7 +25,7 @@ from export.to_onnx import load_run, read_network
 from super_sdf.network import contract
 
 SIZE = 68  # samples along each axis round a body
-PLACES = 3  # on the lattice
+PLACES = 2  # on the lattice
 BODIES: dict[str, Field] = {
     **{f"ball {radius}": ellipsoid(np.full(3, radius)) for radius in (8.0, 16.0, 28.0)},
     "ellipsoid 10, 16, 28": ellipsoid(np.array([10.0, 16.0, 28.0])),

@@ -55,7 +55,8 @@ LENGTHS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3
 QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
 """The file of each shipped network, and over how many turns of the grid it is averaged."""
 GOALS = ("simplify", "tolerance", "triangles")
-"""Of these at most one may be given."""
+EXCLUSIVE = (GOALS, ("label", "level"), ("model", "quality"))
+"""Of each of these at most one may be given."""
 
 
 class Kind(NamedTuple):
@@ -90,7 +91,8 @@ def number(
             found = make(value)
             if isfinite(found) and above < found <= most and not (step and found % step):
                 return found
-        raise OptionError(f"{name} is {seen(int(value) if step else value)}: give {give}")
+        shown = f"{value:g}" if isinstance(value, float) else seen(int(value) if step else value)
+        raise OptionError(f"{name} is {shown}: give {give}")
 
     def parse(given: str) -> Any:
         with suppress(ValueError):
@@ -324,7 +326,7 @@ class Options:
         """Check the values; OptionError names the first that is wrong, or contradicts another."""
         for name, row in OPTIONS.items():
             object.__setattr__(self, name, row.check(getattr(self, name)))
-        for names in (GOALS, ("label", "level"), ("model", "quality")):
+        for names in EXCLUSIVE:
             check_one({name: getattr(self, name) for name in names})
         if self.label is not None and self.field not in (AUTO, MASK):
             said = f"label {self.label} and field {self.field}"

@@ -57,10 +57,8 @@ class Worker:
         code = self.process.exitcode or 0
         if code >= 0:
             return Death(f"ended with exit code {code}")
-        names = {number.value: number.name for number in signal.Signals}
-        name = names.get(-code, f"signal {-code}")
-        hint = " (most likely out of memory)" if name == "SIGKILL" else ""
-        return Death(f"was killed by {name}{hint}")
+        hint = " (most likely out of memory)" * (code == -9)
+        return Death(f"was killed by {signal.Signals(-code).name}{hint}")
 
 
 def work_in_processes(

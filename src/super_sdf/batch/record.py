@@ -55,19 +55,17 @@ class RecordFile:
 
         After an OSError, of a full disk, say, the file holds the lines that it held before.
         """
+        left = memoryview(f"{json.dumps(record)}\n".encode())
         with self.path.open("a+b", buffering=0) as file:
             end = file.seek(0, os.SEEK_END)
             while end and (file.seek(end - 1), file.read(1))[1] != b"\n":
                 end -= 1
             file.truncate(end)
-            line = f"{json.dumps(record)}\n".encode()
-            written = 0
             try:
-                while written < len(line):  # a file system may take a part of it
-                    written += file.write(line[written:])
+                while left:  # a full disk may take a part of it
+                    left = left[file.write(left) :]
             except OSError:
-                with suppress(OSError):
-                    file.truncate(end)
+                file.truncate(end)
                 raise
 
 
@@ -170,7 +168,7 @@ def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = Tru
     with suppress(OSError):
         if same_path and file_state(path) == (known.get("size"), known.get("mtime_ns")):
             return True
-    return (fingerprint(path) or {}).get("sha256") == known["sha256"]
+    return bool((fingerprint(path) or {}).get("sha256") == known["sha256"])
 
 
 @contextmanager

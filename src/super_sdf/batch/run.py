@@ -16,9 +16,8 @@ import json
 import os
 import secrets
 import shutil
-import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +27,7 @@ from .. import __version__
 from ..files.output import naming
 from ..network.device import available_devices
 from ..network.network import find_model
-from ..threads import Resources, allot_each, count_cores, free_memory
+from ..threads import allot_each, count_cores, free_memory
 from .job import Job, Result, Settings, convert_job
 from .pool import Death, work_in_processes
 from .record import STAGE_NAME, Record, Row, file_state, fingerprint, is_unchanged, outputs_of
@@ -52,12 +51,10 @@ class Batch:
         self.jobs, self.settings, self.unread = jobs, settings, list(unread)
         self.waiting: list[Job] = []  # not started yet; the largest first
         self.changed: dict[str, list[str]] = {}  # options of meshes that are made again
-        self.done_before: list[Result] = []
-        self.failed_before: list[Result] = []
-        self.done: list[Result] = []
-        self.failed: list[Result] = []
+        self.done_before, self.failed_before = list[Result](), list[Result]()
+        self.done, self.failed = list[Result](), list[Result]()
         self.notes: list[str] = []  # for the user, on how the batch is run
-        self.seconds = 0.0  # since the start of the run
+        self.seconds = 0.0  # of the run, for those who measure it
         self.record = Record(settings.folder)
         self.written: dict[str, str] = {}  # in this run: the output of each file
         path, symmetries = find_model(settings.model, settings.precision)
@@ -66,7 +63,7 @@ class Batch:
         for job in jobs:
             self._plan(job)
         self.waiting.sort(key=lambda job: -expected_work(job))
-        self.work, self.work_done = sum(map(expected_work, self.waiting)), 0.0
+        self.work = sum(map(expected_work, self.waiting))
 
     def failures(self) -> list[Result]:
         """Return the failures of this run and of earlier ones."""
@@ -83,14 +80,18 @@ class Batch:
 
     def run(self, on_file: Callable[[Batch], None] | None = None) -> None:
         """Convert what is to be converted; call ``on_file`` after each file is in the report."""
-        start = time.perf_counter()
         for job, row in self.failed_before:  # refused outputs that the report does not have
             if row["reason"] != self.record.rows.get(job.target, {}).get("reason"):
                 self.record.add(row)
         if not self.waiting or (self.settings.fail_fast and self.failures()):
             return
-        died: set[str] = set()  # outputs whose worker died once
-        with self._stage() as stage:
+        died = set[str]()  # outputs whose worker died once
+        parts = self.settings.folder / STAGE_NAME
+        stage = parts / secrets.token_hex(4)  # orphans on a cluster write into another one
+        shutil.rmtree(parts, ignore_errors=True)
+        with naming(parts):
+            stage.mkdir(parents=True)
+        try:
             for job, row in self._results(stage):
                 if isinstance(row, Death) and job.target not in died:
                     died.add(job.target)
@@ -100,49 +101,35 @@ class Batch:
                     row = job.failed(f"the process that converted it {row.cause}, twice")
                 result = Result(job, self._keep(job, row, stage))
                 (self.done if result.row["status"] == "ok" else self.failed).append(result)
-                self.work_done += expected_work(job)
-                self.seconds = time.perf_counter() - start
                 if on_file:
                     on_file(self)
-
-    @contextmanager
-    def _stage(self) -> Iterator[Path]:
-        """Make a folder for unfinished meshes, and remove it, and those of killed batches."""
-        whole = self.settings.folder / STAGE_NAME
-        stage = whole / secrets.token_hex(4)  # orphans on a cluster write into another one
-        shutil.rmtree(whole, ignore_errors=True)
-        with naming(whole):
-            stage.mkdir(parents=True)
-        try:
-            yield stage
         finally:
-            shutil.rmtree(whole, ignore_errors=True)
+            shutil.rmtree(parts, ignore_errors=True)
 
     def _results(self, stage: Path) -> Generator[tuple[Job, Any], None, None]:
         """Convert in this process, in processes or on a cluster; yield jobs with their rows."""
-        settings, threads = self.settings, self.settings.threads
+        settings, threads, count = self.settings, self.settings.threads, len(self.waiting)
         memory = self.waiting[0].options.max_memory
-        is_large = settings.workers or settings.cluster is not None or self.work > SMALL_BATCH
-        jobs = len(self.waiting) if is_large else 1
-        workers = count_workers(settings.workers, settings.device, jobs, memory)
-        share = Resources(threads, memory)
-        if workers > 1 and settings.cluster is None:  # before the workers fill the memory
-            share = allot_each(workers, threads, memory)
-        work = partial(convert_job, settings=settings, stage=stage, threads=share.threads)
+        if not (settings.workers or settings.cluster) and self.work < SMALL_BATCH:
+            count = 1
+        count = count_workers(settings.workers, settings.device, count, memory)
+        if count > 1 and not settings.cluster:  # before the workers fill the memory
+            share = allot_each(count, threads, memory)
+            threads, memory = share.threads, share.memory
+        work = partial(convert_job, settings=settings, stage=stage, threads=threads)
 
         def take() -> Job | None:
             if not self.waiting or (settings.fail_fast and self.failed):
                 return None
             job = self.waiting.pop(0)
-            options = replace(job.options, max_memory=share.memory)
-            return replace(job, options=options) if share.memory else job
+            return replace(job, options=replace(job.options, max_memory=memory))
 
-        if settings.cluster is not None:
+        if settings.cluster:
             from .cluster import convert_on_cluster
 
-            yield from convert_on_cluster(self.jobs, settings, stage, take, workers)
-        elif workers > 1:
-            with closing(work_in_processes(take, work, workers)) as results:
+            yield from convert_on_cluster(self.jobs, settings, stage, take, count)
+        elif count > 1:
+            with closing(work_in_processes(take, work, count)) as results:
                 yield from results
         else:
             while (job := take()) is not None:
@@ -202,10 +189,9 @@ class Batch:
             return
         self.waiting.append(job)
         if row and row["status"] == "ok" and row["options"] != how["options"]:
-            asked, before = how["asked"], row.get("asked") or {}
-            changed = [name for name in {**asked, **before} if asked.get(name) != before.get(name)]
             others = ("version", "model", "precision", "network")
-            changed += [key for key in others if how[key] != row.get(key)]
+            now, old = ({**r["asked"], **{key: r.get(key) for key in others}} for r in (how, row))
+            changed = [name for name in {**now, **old} if now.get(name) != old.get(name)]
             self.changed[job.target] = changed or ["version"]
 
     def _holds(self, job: Job, row: Row, digest: str) -> bool:

@@ -146,17 +146,10 @@ def check_batch_page(page: Path, jobs: list[Job], folder: Path, *, force: bool) 
 
 def write_page(batch: Batch, path: Path | None, interrupted: str = "") -> None:
     """Write the page, if one was asked for; after an interrupt, at once and without drawing."""
-    if path is None:
-        return
-    from ..batch.page import BatchPage
-    from ..pages.html import is_page
+    if path is not None:
+        from ..batch.page import write_batch_page
 
-    page, alert = BatchPage(path, batch), ""
-    if page.unfinished or interrupted:
-        why = f", {interrupted}" if interrupted else ""
-        alert = f"Incomplete{why}: {len(page.unfinished)} not finished; run it again to go on"
-    title, force = f"Batch: {batch.settings.folder}", batch.settings.force or is_page(path)
-    page.write(title, sentence(batch), alert, force=force, draw=not interrupted)
+        write_batch_page(path, batch, sentence(batch), interrupted)
 
 
 def print_plan(plan: Batch, as_json: bool) -> None:

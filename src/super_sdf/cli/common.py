@@ -12,7 +12,7 @@ from typing import Any
 import click
 
 from ..errors import OptionError, SuperSdfError, check_modules
-from ..options import GRID, MESH, OPTIONS, VALUES, WORK, Option, Options
+from ..options import EXCLUSIVE, GRID, MESH, OPTIONS, VALUES, WORK, Option, Options, check_one
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 PIPE_CLOSED = 141  # exit code of programs whose reader has ended: 128 and SIGPIPE
@@ -41,6 +41,8 @@ class Command(click.Command):
         """Run the command; turn errors into click's, one line each."""
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise click.ClickException("interrupted") from error
         except OptionError as error:
             raise click.UsageError(str(error)) from error
         except SuperSdfError as error:
@@ -156,6 +158,8 @@ def shared(*names: str) -> Decorator:
 
 def chosen_options(given: dict[str, Any]) -> Options:
     """Return the options of a conversion, from all options of a command that may go with them."""
+    for names in EXCLUSIVE:
+        check_one({f"--{name}": given.get(name) for name in names})
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
         check_modules(f"--{name}", "simplify")

@@ -71,7 +71,7 @@ def command(source: str, target: str, **given: Any) -> None:
                 from ..batch.cluster import connect, tiles_on
 
                 to = connect(given["cluster"], given["jobs"], options.max_memory)
-                client = stack.enter_context(to)
+                client: Any = stack.enter_context(to)
                 least = TILES_PER_THREAD * sum(client.nthreads().values())
                 how |= {"map_tiles": tiles_on(client), "least_tiles": least}
             done = convert(*where, progress=progress, force=force, **how)
