@@ -73,7 +73,7 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     from ..batch.record import folder_lock
     from ..batch.run import Batch
     from ..labels.files import check_options
-    from ..labels.names import read_names
+    from ..labels.files import read_names
     from ..network.network import find_model
 
     names = read_names(given["names"]) if given["names"] else None

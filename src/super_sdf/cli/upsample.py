@@ -77,7 +77,7 @@ def command(source: str, target: str, **given: Any) -> None:
             done = convert(*where, progress=progress, force=force, **how)
         else:
             from ..labels.files import convert_labels
-            from ..labels.names import read_names
+            from ..labels.files import read_names
 
             names = read_names(given["names"]) if given["names"] else None
             done = convert_labels(*where, progress=progress, names=names, force=force)
