@@ -14,18 +14,18 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import OptionTypeError, OutOfMemoryError, seen
+from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .functions.function import Function, as_function, sampled
-from .grid.cubic import cubic_grid
-from .grid.sdf_grid import SdfGrid, check_grid, crop
+from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
-from .network.network import given_or_loaded, network_for
+from .network.network import load_network, network_for
 from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
@@ -33,7 +33,7 @@ from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
-from .refine.survey import Band, BandSummary, BandTooLarge, no_surface, summarise, survey
+from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import choose_mesher, extract
 from .surface.mesh import Mesh, vertex_type
@@ -43,7 +43,7 @@ from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, pl
 
 def refine(
     grid: SdfGrid,
-    network: Decoder,
+    network: Decoder | Adapter,
     factor: int = 4,
     offset: float = 0.0,
     *,
@@ -276,10 +276,14 @@ def reconstruct(
     """
     exact = None if function is None else as_function(function)
     grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
-    network = given_or_loaded(network, quality, device=device, precision=precision, threads=threads)
-    chosen = Options(
-        factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory
-    )
+    where = {"model": quality, "device": device, "precision": precision, "threads": threads}
+    asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
+    if network is None:
+        network = load_network(**asked)
+    elif asked:
+        name = next(iter(asked)).replace("model", "quality")
+        raise OptionError(f"a network and {name} are given: give only one of them")
+    chosen = Options(factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh
@@ -347,7 +351,7 @@ def mesh_grid(
     try:
         is_one = map_tiles is None and least_tiles == 1
         band = survey(lattice, offset, threads=threads, most=room.voxels() if is_one else -1)
-    except BandTooLarge:
+    except BandTooLargeError:
         band, whole = None, summarise(lattice, offset, threads)
         margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
         tiles = plan(shape, whole, margin, room, least_tiles)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from contextlib import ExitStack
 from typing import Any
@@ -54,7 +55,7 @@ def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
     options, watch = common.chosen_options(given), Stopwatch()
     check_outputs(source, target, options, given)
-    from ..network.network import digest_of_model, load_network
+    from ..network.network import load_network
 
     network = load_network(**options.network())
     watch.lap("load network")
@@ -89,7 +90,7 @@ def command(source: str, target: str, **given: Any) -> None:
         "version": __version__,
         "asked": options.digest(),
         "model": model,
-        "network": digest_of_model(model, network.precision),
+        "network": hashlib.sha256(network.path.read_bytes()).hexdigest(),
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),
