@@ -14,9 +14,9 @@ import pytest
 from super_sdf import load_network
 from super_sdf.errors import DeviceError, ModelError
 from super_sdf.network import device
-from super_sdf.network.contract import INPUTS, one_voxel
+from super_sdf.network.contract import INPUTS
 from super_sdf.network.device import CPU, CUDA, CUDA_OPTIONS
-from super_sdf.network.network import shipped_models
+from super_sdf.network.network import one_voxel, shipped_models
 from super_sdf.network.onnx import CHUNK_INPUT, CUDA_CHUNK, ort
 
 pytestmark = pytest.mark.usefixtures("cpu_build")

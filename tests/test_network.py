@@ -1,7 +1,6 @@
 """The contract of the ONNX file, the values of a network, and the errors of bad files."""
 
 import os
-import pickle
 import shutil
 
 import numpy as np
@@ -12,9 +11,8 @@ from onnx_files import DOUBLE, FLOAT, metadata, write_network
 from super_sdf import load_network, reconstruct, upsample
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
 from super_sdf.network.neighbourhood import NEIGHBOURHOOD, cube_symmetries, turn
-from super_sdf.network.decoder import check_output, to_blocks
-from super_sdf.network.network import KIND_MODELS, Network, shipped_models, small_ball
-from super_sdf.network.onnx import CORE_CHUNK, CPU_CHUNK, cpu_chunk
+from super_sdf.network.decoder import to_blocks
+from super_sdf.network.network import KIND_MODELS, Network, shipped_models
 from super_sdf.options import QUALITIES
 from super_sdf.refine.band import find_band, gather_patches, neighbour_table, rescale
 from super_sdf.refine.nodes import block_offsets
@@ -181,18 +179,17 @@ def test_one_bad_value_among_many_is_found(value):
 
 
 @pytest.mark.parametrize(
-    ("given", "what"),
+    ("make", "what"),
     [
-        (np.zeros((3, 4), np.float32), r"float32 of shape \(3, 4\)"),
-        (np.zeros((4, 3), np.int64), r"int64 of shape \(4, 3\)"),
-        ([[1.0] * 3] * 4, r"list of shape \(4, 3\)"),
-        (None, r"NoneType of shape \(\)"),
+        (lambda shape: np.zeros(shape[::-1]), "float64 of shape"),
+        (lambda shape: np.zeros(shape, int), "int64 of shape"),
+        (lambda shape: None, r"NoneType of shape \(\)"),
     ],
 )
-def test_the_values_of_a_function_as_network_are_checked_too(given, what):
-    wanted = r" instead of float32 of shape \(4, 3\), \(voxels, offsets\)$"
-    with pytest.raises(ModelError, match=f"^the network gave {what}{wanted}"):
-        check_output(given, (4, 3))
+def test_the_values_of_a_function_as_network_are_checked_too(make, what):
+    wanted = r" instead of float32 of shape \(\d+, 27\), \(voxels, offsets\)$"
+    with pytest.raises(ModelError, match=f"^the network gave {what}.*{wanted}"):
+        upsample(ball(), lambda p, t, voxels, offsets: make((len(voxels), len(offsets))), 2)
 
 
 DEEP, LONG = "[" * 100_000, "7" * 5000
@@ -250,15 +247,6 @@ def test_a_path_that_is_no_model_file_is_an_error_of_one_line(tmp_path, monkeypa
     assert (code, out, err.count("\n")) == (1, "", 1) and err.startswith("Error: ")
     assert f"{kind}.onnx" in err or kind == "a\0b"
     assert not os.path.exists("out.ply")
-
-
-@pytest.mark.parametrize("threads", [1, 2, 64])
-def test_chunks_on_the_cpu_are_equal_and_leave_a_row_free(threads):
-    for voxels in (1, 511, 512, 1023, 1024, 50_000):
-        rows = cpu_chunk(voxels, threads)
-        chunks = -(-(voxels + 1) // rows)
-        assert rows <= min(CORE_CHUNK * threads, CPU_CHUNK)
-        assert chunks * rows - (voxels + 1) < chunks  # less than a row of each is padding
 
 
 def test_the_symmetries_are_a_group_of_48_with_half_turns_first_then_reflections():

@@ -7,16 +7,18 @@ import pytest
 from conftest import ball, trilinear
 from hypothesis import given
 from hypothesis import strategies as st
+from test_tiles import Close
 
 from super_sdf import load_network, reconstruct, upsample
-from super_sdf.network import network, onnx
+from super_sdf.network import onnx
+from super_sdf.options import Options
+from super_sdf.pipeline import mesh_grid
 from super_sdf.network.onnx import LINEAR_UP_TO, share_of_time
 
 
 @pytest.fixture
 def polled(monkeypatch):
     """Poll during every run, however short, and often."""
-    monkeypatch.setattr(network, "LONG_RUN", 0)
     monkeypatch.setattr(onnx, "POLL_INTERVAL", 1e-4)
 
 
@@ -31,6 +33,12 @@ def reported(work, *arguments):
 def test_steps_are_reported_in_thousandths_of_their_usual_time():
     assert reported(reconstruct, ball(), trilinear) == [30, 480, 630, 1000]
     assert reported(upsample, ball(), trilinear) == [48, 762, 1000]
+
+
+def test_tiles_are_reported_as_they_are_made():
+    done = []
+    mesh_grid(ball(), Close(), Options(2), progress=lambda n, _: done.append(n), least_tiles=3)
+    assert done == sorted(done) and (done[0], done[-1]) == (30, 1000) and len(set(done)) == 4
 
 
 def test_the_network_reports_progress_during_a_run(polled):

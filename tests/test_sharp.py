@@ -11,7 +11,7 @@ from test_isosurface import dense_field
 
 from lab.methods import sharp_isosurface
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
-from super_sdf.check.samples import self_intersections
+from super_sdf.check.evidence import self_intersections
 from super_sdf.surface.sharp import features
 from super_sdf.surface.sharp.folds import intersecting, without_folds
 from super_sdf.truth.mesh_files import read_mesh

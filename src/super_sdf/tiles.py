@@ -29,6 +29,7 @@ from .threads import check_count, held_memory, in_words, memory_bound
 Index = tuple[int, int, int]
 Box = tuple[Index, Index]
 """From the lowest index to before the highest."""
+FIXED = 50_000_000  # bytes of chunks, and what the network takes in any case
 LEAST_SIDE = 8  # samples of a tile without its margin: smaller ones are nearly all margin
 ON_BORDER = 1e-2  # voxels: open edges so near to the border of the grid end there
 
@@ -95,7 +96,7 @@ class Room:
         The network sees ``AT_ONCE`` of a large band at a time, and a fifth more beside them. Three
         quarters of the voxels of a band are decoded.
         """
-        left, values = self.bound - self.held - meshes, (self.factor + 1) ** 3
+        left, values = self.bound - self.held - FIXED - meshes, (self.factor + 1) ** 3
         run = 250 + self.network[0] + 0.75 * self.network[1] * values
         small, large = left / (250 + run), (left - 1.2 * AT_ONCE * run) / (250 + 3 * values)
         if large < AT_ONCE:

@@ -66,9 +66,9 @@ class Job:
 
     def failed(self, reason: str, *, retry: bool = True, content: Any = None) -> Row:
         """Return the row of the job if it failed."""
-        row = {"in": os.path.abspath(self.source), "out": self.target, "status": "failed"}
+        row: Row = {"in": os.path.abspath(self.source), "out": self.target, "status": "failed"}
         row |= {"reason": reason, "retry": retry, "content": content}
-        return {**row, "output": None, "seconds": 0.0}
+        return row | {"output": None, "seconds": 0.0}
 
 
 class Result(NamedTuple):

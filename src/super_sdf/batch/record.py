@@ -168,7 +168,7 @@ def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = Tru
     with suppress(OSError):
         if same_path and file_state(path) == (known.get("size"), known.get("mtime_ns")):
             return True
-    return (fingerprint(path) or {}).get("sha256") == known["sha256"]
+    return bool((fingerprint(path) or {}).get("sha256") == known["sha256"])
 
 
 @contextmanager

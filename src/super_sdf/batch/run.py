@@ -188,10 +188,9 @@ class Batch:
             return
         self.waiting.append(job)
         if row and row["status"] == "ok" and row["options"] != how["options"]:
-            asked, before = how["asked"], row.get("asked") or {}
-            changed = [name for name in {**asked, **before} if asked.get(name) != before.get(name)]
             others = ("version", "model", "precision", "network")
-            changed += [key for key in others if how[key] != row.get(key)]
+            now, old = ({**r["asked"], **{key: r.get(key) for key in others}} for r in (how, row))
+            changed = [name for name in {**now, **old} if now.get(name) != old.get(name)]
             self.changed[job.target] = changed or ["version"]
 
     def _holds(self, job: Job, row: Row, digest: str) -> bool:

@@ -26,8 +26,7 @@ from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh
 from ..threads import give_back, held_memory, in_words, memory_bound, useful_threads
 from ..truth.mesh_files import merged, read_mesh
-from .samples import NOTICEABLE, Strays, Touching, find_strays, touch, vertex_residuals
-from .surface import Surface
+from .evidence import NOTICEABLE, Strays, Surface, Touching, find_strays, touch, vertex_residuals
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
 BYTES_PER_TRIANGLE = 420

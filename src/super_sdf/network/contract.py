@@ -10,11 +10,8 @@ entry, distances of which some were noisy.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from ..errors import ModelError
 from .onnx import ort
@@ -28,24 +25,14 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT = {"values": "tensor(float)"}
-# The whole numbers of a card: name, unit and largest value. A receptive field is to each side; a
-# patch alone reaches one voxel. The card of a network that sees farther, up to the whole grid,
-# leaves it out. The width decides how much memory a run takes.
+# The whole numbers of a card: name, unit and largest value. A receptive field is to each side; the
+# card of a network that sees the whole grid leaves it out. The width decides how much memory a run
+# takes.
 WHOLE = {
     "receptive_field": ("receptive field", "voxels", 1000),
     "channels": ("width", "channels", 10_000),
 }
 MAX_SHOWN = 60  # characters of metadata in messages
-
-
-def one_voxel() -> dict[str, Any]:
-    """Return the inputs of a trial run; two offsets, to notice an output with its axes swapped."""
-    return {
-        "patches": np.zeros((1, 27), np.float32),
-        "neighbours": np.full((1, 27), -1, np.int32),
-        "voxels": np.zeros(1, np.int32),
-        "offsets": np.zeros((2, 3), np.float32),
-    }
 
 
 def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
@@ -58,10 +45,13 @@ def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
         raise ModelError(f"{path} is damaged: it has names that are not UTF-8 text") from error
     version = metadata.get("format_version", "none")
     if inputs != INPUTS or outputs != OUTPUT or version != str(FORMAT_VERSION):
+        given, made = (
+            _shorten(", ".join(f"{name} {kind}" for name, kind in values.items()))
+            for values in (inputs, outputs)
+        )
         raise ModelError(
             f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {_shorten(version)}"
-            f", inputs {_describe(inputs)}, outputs {_describe(outputs)}); export one with "
-            "export/to_onnx.py"
+            f", inputs {given}, outputs {made}); export one with export/to_onnx.py"
         )
     card = {key: _parse(key, text, path) for key, text in metadata.items()}
     for key, (name, unit, most) in WHOLE.items():
@@ -78,11 +68,6 @@ def _shorten(text: str) -> str:
     """Return text from a file as part of one line, cut to ``MAX_SHOWN`` characters."""
     line = " ".join(text.split())
     return line if len(line) <= MAX_SHOWN else f"{line[:MAX_SHOWN]}..."
-
-
-def _describe(values: Mapping[str, str]) -> str:
-    """Return the names of inputs or outputs with their types, in one line."""
-    return _shorten(", ".join(f"{name} {kind}" for name, kind in values.items()))
 
 
 def _parse(key: str, text: str, path: Path) -> Any:

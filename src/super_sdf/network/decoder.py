@@ -36,20 +36,14 @@ class Decoder(Protocol):
 class Adapter:
     """A network, or any function, with all that the pipeline asks of it."""
 
-    run: Decoder
+    run: Any  # a ``Decoder``
     receptive_field: int | None = None  # voxels to each side; None: it must see the whole band
     reports_progress: bool = False  # whether a call takes ``progress``, a ``ShareCallback``
     memory_bytes: tuple[float, float] = NETWORK_BYTES
     threads: int = 0  # of the CPU, also for the other steps; 0 for one per core
 
-    def __call__(
-        self, patches: FloatArray, table: IntArray, voxels: IntArray, offsets: FloatArray
-    ) -> FloatArray:
-        """Return what the network does."""
-        return self.run(patches, table, voxels, offsets)
 
-
-def adapt(network: Decoder) -> Adapter:
+def adapt(network: Decoder | Adapter) -> Adapter:
     """Return a network with the attributes that it has, and defaults for the others."""
     if isinstance(network, Adapter):
         return network
@@ -58,7 +52,7 @@ def adapt(network: Decoder) -> Adapter:
 
 
 def decode(
-    network: Decoder,
+    network: Adapter,
     inputs: tuple[FloatArray, IntArray, IntArray],
     offsets: FloatArray,
     progress: ShareCallback | None = None,
@@ -68,26 +62,19 @@ def decode(
 
     ``inputs`` are patches (V, 27), neighbour table (V, 27) and voxels (D,); ``offsets``, (Q, 3),
     are in half voxels, and so are the values: a row per offset, a column per voxel, and a last
-    column of zeros, see ``steps.nodes``. ModelError if they have another shape or type, or are not
+    column of zeros, see ``refine.nodes``. ModelError if they have another shape or type, or are not
     finite: later steps do not check.
     """
-    chosen = adapt(network)
-    reports = progress is not None and chosen.reports_progress
-    options: dict[str, Any] = {"progress": progress} if reports else {}
-    values = chosen.run(*inputs, offsets, **options)
-    check_output(values, (len(inputs[2]), len(offsets)))
+    reports = progress is not None and network.reports_progress
+    values = network.run(*inputs, offsets, **({"progress": progress} if reports else {}))
+    shape, is_array = (len(inputs[2]), len(offsets)), isinstance(values, np.ndarray)
+    if not (is_array and values.shape == shape and values.dtype.kind == "f"):
+        kind = values.dtype if is_array else type(values).__name__
+        raise ModelError(
+            f"the network gave {kind} of shape {np.shape(values)} instead of float32 of shape "
+            f"{shape}, (voxels, offsets)"
+        )
     return to_blocks(values, threads)
-
-
-def check_output(values: Any, shape: tuple[int, int]) -> None:
-    """Raise ModelError if a network's values are not floating-point numbers of this shape."""
-    if isinstance(values, np.ndarray) and values.shape == shape and values.dtype.kind == "f":
-        return
-    kind = values.dtype if isinstance(values, np.ndarray) else type(values).__name__
-    raise ModelError(
-        f"the network gave {kind} of shape {np.shape(values)} instead of float32 of shape "
-        f"{shape}, (voxels, offsets)"
-    )
 
 
 def to_blocks(values: FloatArray, threads: int = 1) -> FloatArray:

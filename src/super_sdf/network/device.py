@@ -19,14 +19,15 @@ from typing import Any
 
 from ..errors import DeviceError, ModelError
 from ..options import DEVICES, Device
-from .onnx import first_line, ort, run_bound, run_on_cpu
+from .onnx import first_line, ort, run
 
-CPU = "CPUExecutionProvider"
-OPTIMISED = "optimised_by"  # the entry of a file's metadata; other files are optimised when opened
+CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
+OPTIMISED = b"optimised_by"  # in a file's metadata, at its end; others are optimised when opened
 METADATA_BYTES = 8192
 CUDA_OPTIONS = {
     # No device_id: 0 is the default, and onnxruntime 1.26 and later print a warning if it is given.
-    # Take only the memory that a run needs; with SHRINK the next run finds it unfragmented.
+    # Take only the memory that a run needs: the next run finds it unfragmented.
     "arena_extend_strategy": "kSameAsRequested",
     "cudnn_conv_algo_search": "HEURISTIC",  # no timed trials, for networks with convolutions
     "use_tf32": "0",  # its 10-bit mantissa is too short for 1e-4 of a voxel
@@ -70,15 +71,17 @@ def open_session(
 def _open_on_cpu(path: Path, threads: int, trial: Mapping[str, Any]) -> OpenedSession:
     """Open a file on the CPU and run it once; ModelError if it cannot be opened."""
     try:
-        options = session_options(threads)
-        if is_optimised(path):
-            options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
+        options = _session_options(threads)
+        with path.open("rb") as file:
+            file.seek(-min(path.stat().st_size, METADATA_BYTES), io.SEEK_END)
+            if OPTIMISED in file.read():  # to try it again would take as long as the rest
+                options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
         session = ort.InferenceSession(str(path), options, providers=[CPU])
     except Exception as error:  # onnxruntime's errors have no other common base class
         reason = first_line(error)
         raise ModelError(f"{path} is no ONNX file that onnxruntime can run: {reason}") from error
     try:
-        run_on_cpu(session, trial)  # small: the arena never gives back its first allocation
+        run(session, trial)  # small: the arena never gives back its first allocation
     except DeviceError as error:  # the check of its card may explain why
         return OpenedSession(session, "cpu", failure=str(error))
     return OpenedSession(session, "cpu")
@@ -87,30 +90,18 @@ def _open_on_cpu(path: Path, threads: int, trial: Mapping[str, Any]) -> OpenedSe
 def _open_on_cuda(path: Path, threads: int, trial: Mapping[str, Any]) -> ort.InferenceSession:
     """Open a file on CUDA and run it once; DeviceError, with what is missing, if it cannot run."""
     check_cuda()
-    providers = [(CUDA, CUDA_OPTIONS), CPU]
+    options, providers = _session_options(threads), [(CUDA, CUDA_OPTIONS), CPU]
     try:
-        session = ort.InferenceSession(
-            str(path), session_options(threads), providers=providers, enable_fallback=0
-        )
+        session = ort.InferenceSession(str(path), options, providers=providers, enable_fallback=0)
         if CUDA in session.get_providers():
-            run_bound(session, trial)
+            run(session, trial, "cuda")
             return session
     except Exception as error:  # onnxruntime's errors have no other common base class
         raise DeviceError(f"CUDA does not run here: {first_line(error)}") from error
     raise DeviceError(f"{onnxruntime_version()} could not start its CUDA provider")
 
 
-def is_optimised(path: Path) -> bool:
-    """Return whether the graph of a file was optimised when it was made, as its metadata says.
-
-    Such a file opens in half the time if that is not tried again. Metadata end a file.
-    """
-    with path.open("rb") as file:
-        file.seek(-min(path.stat().st_size, METADATA_BYTES), io.SEEK_END)
-        return OPTIMISED.encode() in file.read()
-
-
-def session_options(threads: int) -> ort.SessionOptions:
+def _session_options(threads: int) -> ort.SessionOptions:
     """Return the options of sessions, the same on every device."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
@@ -120,10 +111,6 @@ def session_options(threads: int) -> ort.SessionOptions:
     # a machine with other work to do that takes ten times as long.
     options.add_session_config_entry("session.intra_op.spin_duration_us", "100")
     return options
-
-
-CUDA = "CUDAExecutionProvider"
-DRIVER = "nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1"
 
 
 def available_devices() -> list[str]:
@@ -146,29 +133,18 @@ def check_cuda() -> None:
         )
     if not has_driver():
         raise DeviceError(f"there is no {DRIVER}: install the NVIDIA driver")
-    library = _missing_library()
-    if library:
-        raise DeviceError(
-            f"{onnxruntime_version()} does not find {library}: pip install "
-            "'onnxruntime-gpu[cuda,cudnn]' brings CUDA's libraries"
-        )
-
-
-def _missing_library() -> str | None:
-    """Return the first library that onnxruntime's CUDA provider lacks, by trying to load it.
-
-    None if nothing is missing, or on systems whose loader does not name files (Windows).
-    """
     if hasattr(ort, "preload_dlls"):  # since 1.21; finds libraries that pip installed
         with redirect_stdout(io.StringIO()):  # it prints
             ort.preload_dlls()
-    provider = Path(ort.__file__).parent / "capi" / "libonnxruntime_providers_cuda.so"
     try:
-        ctypes.CDLL(str(provider))
+        ctypes.CDLL(str(Path(ort.__file__).parent / "capi" / "libonnxruntime_providers_cuda.so"))
     except OSError as error:
         library, _, reason = str(error).partition(": ")
-        return library if "cannot open shared object file" in reason else None
-    return None
+        if "cannot open shared object file" in reason:  # Windows does not name the file
+            raise DeviceError(
+                f"{onnxruntime_version()} does not find {library}: pip install "
+                "'onnxruntime-gpu[cuda,cudnn]' brings CUDA's libraries"
+            ) from None
 
 
 def has_gpu() -> bool:
@@ -197,10 +173,8 @@ def describe_gpu() -> str | None:
 def query_gpu(*fields: str) -> list[str] | None:
     """Return fields of the first GPU from nvidia-smi, memory in MiB; None if it fails."""
     words = ["nvidia-smi", "-i", "0", f"--query-gpu={','.join(fields)}"]
-    try:
-        run = subprocess.run(
-            [*words, "--format=csv,noheader,nounits"], capture_output=True, text=True, check=True
-        )
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return run.stdout.strip().split(", ")
+    words.append("--format=csv,noheader,nounits")
+    with suppress(OSError, subprocess.CalledProcessError):
+        done = subprocess.run(words, capture_output=True, text=True, check=True)
+        return done.stdout.strip().split(", ")
+    return None

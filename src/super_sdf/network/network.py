@@ -6,8 +6,6 @@ Masks and noisy distances have networks of their own, see ``network_for``.
 from __future__ import annotations
 
 import hashlib
-import os
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -36,23 +34,20 @@ from ..options import (
 )
 from ..progress import ShareCallback
 from ..threads import cores_of_system, described_processor, useful_threads
-from .contract import EXACT_DISTANCES, INPUTS, MASKS, one_voxel, read_card
+from .contract import EXACT_DISTANCES, INPUTS, MASKS, read_card
 from .decoder import Decoder
 from .device import open_session
 from .neighbourhood import cube_symmetries, turn
-from .onnx import CUDA_CHUNK, LONG_RUN, Pace, Poll, ort, run_bound, run_on_cpu, work_of
+from .onnx import VALUES_PER_VOXEL, Pace, ort, run
 
 MODELS = Path(__file__).parent.parent / "models"
 # Memory of a run, measured: of each voxel that it sees, its patch and its row of the neighbour
 # table and, by precision, what each channel takes; and of each value. Averaging over symmetries
 # takes more: for the transformed inputs, and for the mean.
-INPUT_BYTES = 216.0
+INPUT_BYTES, VALUE_BYTES, SYMMETRY_BYTES = 216.0, 8.0, (600.0, 4.0)
 CHANNEL_BYTES = {FLOAT32: 7.25, INT8: 9.25}
-VALUE_BYTES = 8.0
 USUAL_CHANNELS = 64  # of a network whose card does not say
-SYMMETRY_BYTES = (600.0, 4.0)
 NO_NETWORKS = "super-sdf was installed without its networks: install it again"
-TRIAL_ROWS = 1024  # voxels of a run on the CPU that measures the pace
 MASK_MODEL, NOISY_MODEL = "mask", "noisy"
 KIND_MODELS = (MASK_MODEL, NOISY_MODEL)
 """The shipped networks that replace others for a kind of field."""
@@ -74,15 +69,14 @@ class Network:
     reports_progress: ClassVar[bool] = True  # a call takes ``progress``, see ``decoder.Decoder``
 
     def __repr__(self) -> str:
-        threads = self.threads or "all"
         return (
             f"Network({self.card.get('name', 'unnamed')}, receptive field {self.receptive_field}, "
-            f"symmetries {self.symmetries}, device {self.device}, threads {threads})"
+            f"symmetries {self.symmetries}, device {self.device}, threads {self.threads or 'all'})"
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return how another process, which unpickles it, loads the same file."""
-        return _load_again, (self.path, self.device, self.threads, self.symmetries)
+        """Return how another process, which unpickles it, loads the same file, once."""
+        return _load_once, (self.path, self.device, self.threads, self.symmetries)
 
     def averaged(self, symmetries: int) -> Network:
         """Return the same network averaged over a number of symmetries."""
@@ -102,10 +96,8 @@ class Network:
     def memory_bytes(self) -> tuple[float, float]:
         """Peak memory of a run: bytes per voxel that it sees, and bytes per value."""
         each = CHANNEL_BYTES[self.precision] * self.card.get("channels", USUAL_CHANNELS)
-        voxel = INPUT_BYTES + each
-        if self.symmetries == 1:
-            return voxel, VALUE_BYTES
-        return voxel + SYMMETRY_BYTES[0], VALUE_BYTES + SYMMETRY_BYTES[1]
+        more = SYMMETRY_BYTES if self.symmetries > 1 else (0.0, 0.0)
+        return INPUT_BYTES + each + more[0], VALUE_BYTES + more[1]
 
     def __call__(
         self,
@@ -143,37 +135,16 @@ class Network:
         offsets: FloatArray,
         progress: ShareCallback | None,
     ) -> FloatArray:
-        """Run the session once; only a long run is timed, and reports its progress."""
-        count = len(voxels)
-        # With fewer voxels than offsets, the order of onnxruntime's sums would depend on the number
-        # of threads.
-        voxels = np.resize(voxels, max(count, len(offsets)))
-        feeds = dict(zip(INPUTS, (patches, table, voxels, offsets)))
-        work = work_of(len(patches), len(voxels), len(offsets))
-        if work < LONG_RUN:
-            return self._run_session(feeds)[:count]
-        if progress and self.pace.seconds is None:
-            self._time_part(feeds)
-        watch = self.pace.watch(work, progress or (lambda share: None))
-        begun = time.perf_counter()
-        values = self._run_session(feeds, watch)
-        self.pace.learn(work, time.perf_counter() - begun)
-        return values[:count]
+        """Run the session once.
 
-    def _run_session(self, feeds: Mapping[str, Any], poll: Poll = lambda: None) -> FloatArray:
-        """Run the session on its device."""
-        run = run_bound if self.device == "cuda" else run_on_cpu
-        return run(self.session, feeds, poll=poll)
-
-    def _time_part(self, feeds: Mapping[str, Any]) -> None:
-        """Measure the pace in a small part of a run: the first chunks."""
-        rows = CUDA_CHUNK if self.device == "cuda" else TRIAL_ROWS
-        part = crop_inputs(feeds, rows - 1)  # the graph pads to whole chunks, by at least one row
-        begun = time.perf_counter()
-        self._run_session(part)
-        offsets = len(part["offsets"])  # at least this many voxels are decoded, see _run
-        work = work_of(rows, max(len(part["voxels"]), offsets), offsets)
-        self.pace.learn(work, time.perf_counter() - begun)
+        With fewer voxels than offsets, the order of onnxruntime's sums would depend on the number
+        of threads.
+        """
+        some = np.resize(voxels, max(len(voxels), len(offsets)))
+        feeds = dict(zip(INPUTS, (patches, table, some, offsets)))
+        work = len(patches) + len(some) * len(offsets) / VALUES_PER_VOXEL
+        with self.pace.watch(work, progress) as poll:
+            return run(self.session, feeds, self.device, poll)[: len(voxels)]
 
 
 def _within(progress: ShareCallback, number: int, count: int, share: float) -> None:
@@ -181,26 +152,9 @@ def _within(progress: ShareCallback, number: int, count: int, share: float) -> N
     progress((number + share) / count)
 
 
-def crop_inputs(feeds: Mapping[str, Any], rows: int) -> dict[str, Any]:
-    """Return inputs with only the first rows of the band, without neighbours in the others."""
-    table, voxels = feeds["neighbours"][:rows], feeds["voxels"]
-    decoded = voxels[voxels < rows]
-    return {
-        "patches": feeds["patches"][:rows],
-        "neighbours": np.where(table < rows, table, np.int32(-1)),
-        "voxels": decoded if len(decoded) else np.zeros(1, np.int32),
-        "offsets": feeds["offsets"],
-    }
-
-
 def shipped_models() -> dict[str, Path]:
     """Return the files of the networks that come with the package, by name; empty without them."""
     return {path.stem: path for path in sorted(MODELS.glob("*.onnx"))}
-
-
-def int8_name(name: str) -> str:
-    """Return the name of a network's int8 variant."""
-    return f"{name}-{INT8}"
 
 
 def float32_name(name: str) -> str:
@@ -222,22 +176,25 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
     """
     OPTIONS["precision"].check(precision)
     name, symmetries = QUALITIES.get(str(model), (str(model), 1))
-    if str(model) in QUALITIES and name not in shipped_models():
+    shipped = shipped_models()
+    if str(model) in QUALITIES and name not in shipped:
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
-    path = shipped_models().get(name, Path(model))
+    path = shipped.get(name, Path(model))
     flags = described_processor().get("flags", "").split()
     if precision == AUTO_PRECISION and not ("avx" in flags and "avx2" not in flags):
-        path = shipped_models().get(int8_name(name), path)
+        path = shipped.get(f"{name}-{INT8}", path)
     if precision == INT8:
-        path = path.with_name(f"{int8_name(path.stem)}.onnx")  # beside the float32 file
-        if not os.path.lexists(path):
+        path = path.with_name(f"{path.stem}-{INT8}.onnx")  # beside the float32 file
+        if not path.is_file():
             lacks = f"{model} has no int8 variant, {path}"
             raise OptionError(f"{lacks}: write one with export.quantize")
-    if not os.path.lexists(path):
+    try:
+        is_file = path.is_file()
+    except ValueError:  # a null byte
+        is_file = False
+    if not is_file:
         names = ", ".join(QUALITIES)
         raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
-    if not path.is_file():
-        raise FileError(f"{path} is no file: give an ONNX file or one of: {', '.join(QUALITIES)}")
     return path, symmetries
 
 
@@ -297,6 +254,13 @@ def load_network(
     return Network(*loaded, shipped=shipped, path=path)
 
 
+def one_voxel() -> dict[str, Any]:
+    """Return the inputs of a trial run; two offsets, to notice an output with its axes swapped."""
+    arrays = np.zeros((1, 27)), np.full((1, 27), -1), np.zeros(1), np.zeros((2, 3))
+    kinds = np.float32, np.int32, np.int32, np.float32
+    return {name: array.astype(kind) for name, array, kind in zip(INPUTS, arrays, kinds)}
+
+
 def given_or_loaded(
     network: Decoder | None, quality: Quality | str | Path | None, **where: Any
 ) -> Decoder:
@@ -312,10 +276,6 @@ def given_or_loaded(
     return network
 
 
-def _load_again(path: Path, device: Device, threads: int, symmetries: int) -> Network:
-    return load_network(path, device=device, threads=threads).averaged(symmetries)
-
-
 def network_for(network: Decoder, kind: str) -> Decoder:
     """Return the network for a kind of field: one for that kind in place of a shipped one.
 
@@ -325,19 +285,22 @@ def network_for(network: Decoder, kind: str) -> Decoder:
     """
     if not isinstance(network, Network) or not network.shipped:
         return network
-    chosen = network.device, network.threads, network.symmetries, network.precision
-    if kind == MASK:
-        return _load_once(MASK_MODEL, *chosen)
-    if kind == NOISY and network.card.get("inputs") == EXACT_DISTANCES:
-        return _load_once(NOISY_MODEL, *chosen)
-    return network
+    name = MASK_MODEL if kind == MASK else NOISY_MODEL if kind == NOISY else None
+    if name is None or (kind == NOISY and network.card.get("inputs") != EXACT_DISTANCES):
+        return network
+    if name not in shipped_models():
+        raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
+    given = network.device, network.threads, network.symmetries, network.precision
+    return _load_once(name, *given)
 
 
 @lru_cache(maxsize=4)
 def _load_once(
-    name: str, device: Device, threads: int, symmetries: int, precision: Precision
+    model: str | Path,
+    device: Device,
+    threads: int,
+    symmetries: int,
+    precision: Precision = AUTO_PRECISION,
 ) -> Network:
-    if name not in shipped_models():
-        raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
-    loaded = load_network(name, device=device, threads=threads, precision=precision)
+    loaded = load_network(model, device=device, threads=threads, precision=precision)
     return loaded.averaged(symmetries)

@@ -3,15 +3,10 @@
 Since 2026 the wheels for Linux and macOS send usage data by default: the import writes files under
 the user's cache folder, and a process that runs for a minute sends data about its machine. A tool
 for people's own shapes must not do that without their consent.
-
-Inputs and output are bound, and a long run can be interrupted. onnxruntime does not report
-progress: the time of a run is nearly proportional to its number of voxels and values, and the
-factor is measured in the run before, or in a small part of this one.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import re
 import time
@@ -37,14 +32,13 @@ def without_telemetry() -> Iterator[None]:
 
     It is removed afterwards, so that child processes see the user's own environment.
     """
-    if SWITCH in os.environ:
-        yield
-        return
-    os.environ[SWITCH] = "1"
+    given = os.environ.get(SWITCH)
+    os.environ[SWITCH] = given or "1"
     try:
         yield
     finally:
-        os.environ.pop(SWITCH, None)
+        if given is None:
+            os.environ.pop(SWITCH, None)
 
 
 def first_line(error: Exception) -> str:
@@ -66,7 +60,6 @@ except Exception as error:  # a broken installation fails in other ways than Imp
 
 __all__ = ["ort"]
 
-
 # onnxruntime allocates from an arena, so that layers reuse the memory of earlier ones: the system
 # has to zero fresh memory, which takes a third of the time of the network itself. After a large run
 # the arena is shrunk, since the next grid has another size; after a small one there is no need.
@@ -78,39 +71,53 @@ SMALL_OUTPUT = 5_000_000  # ... and values of a run after which the arena is not
 # between chunks, so it gets large ones: with 27 * 64 gathered floats a row, 113 MB.
 CHUNK_INPUT, CORE_CHUNK, CPU_CHUNK, CUDA_CHUNK = "chunk", 512, 4096, 16384
 POLL_INTERVAL = 0.1  # seconds
-
 VALUES_PER_VOXEL = 300  # decoding this many values takes as long as encoding a voxel
-LONG_RUN = 20_000  # in the unit of ``work_of``: a few tenths of a second on one core
+USUAL_PACE = 2e-5  # seconds per voxel, before a run has been measured
 LINEAR_UP_TO = 0.8  # above this share progress slows down: a run may take longer than expected
 
-Poll = Callable[[], None]
-"""Called at the start of a run and every ``POLL_INTERVAL`` seconds; what it raises stops it."""
 
-
-def run_on_cpu(
-    session: ort.InferenceSession, feeds: Mapping[str, Any], poll: Poll = lambda: None
+def run(
+    session: ort.InferenceSession,
+    feeds: Mapping[str, Any],
+    device: str = "cpu",
+    poll: Callable[[], None] = lambda: None,
 ) -> FloatArray:
-    """Run a session on the CPU, given its inputs by name, and return its output, (D, Q) float32.
+    """Run a session, given its inputs by name, and return its output, (D, Q) float32.
 
-    An interrupt, or an exception in ``poll``, stops the run. DeviceError if onnxruntime fails. The
-    output is allocated here: in onnxruntime's arena it would prevent the arena from shrinking.
+    An interrupt, or an exception in ``poll``, which is called every ``POLL_INTERVAL`` seconds,
+    stops the run. DeviceError if onnxruntime fails. On CUDA each input is copied there once and the
+    output back once, nothing more. On the CPU the output is allocated here: in onnxruntime's arena
+    it would prevent the arena from shrinking.
     """
-    values = np.empty((len(feeds["voxels"]), len(feeds["offsets"])), np.float32)
-    options = ort.RunOptions()
-    if len(feeds["patches"]) > SMALL or values.size > SMALL_OUTPUT:
-        options.add_run_config_entry(SHRINK, "cpu:0")
-    with failures_on("cpu"):
+    voxels, count = len(feeds["patches"]), len(feeds["voxels"])
+    values = np.empty((count, len(feeds["offsets"])) if device == "cpu" else 0, np.float32)
+    options, output = ort.RunOptions(), session.get_outputs()[0].name
+    if device != "cpu" or voxels > SMALL or values.size > SMALL_OUTPUT:
+        options.add_run_config_entry(SHRINK, "cpu:0" if device == "cpu" else "gpu:0")
+    with failures_on(device):
         binding = session.io_binding()
+        bound = {}
         for name, array in feeds.items():
-            binding.bind_cpu_input(name, array)
-        rows = cpu_chunk(len(feeds["patches"]), session.get_session_options().intra_op_num_threads)
-        chunk = ort.OrtValue.ortvalue_from_numpy(np.array([rows]))
-        if takes_chunk(session):
-            binding.bind_ortvalue_input(CHUNK_INPUT, chunk)
-        output = session.get_outputs()[0].name
-        binding.bind_output(output, "cpu", 0, np.float32, values.shape, values.ctypes.data)
-    _run(session, binding, options, "cpu", poll, keep=(feeds, chunk, values))
-    return values
+            if device == "cpu":
+                binding.bind_cpu_input(name, array)
+            else:
+                bound[name] = ort.OrtValue.ortvalue_from_numpy(array, device, 0)
+        if any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers()):
+            threads = session.get_session_options().intra_op_num_threads if device == "cpu" else 0
+            rows = cpu_chunk(voxels, threads) if device == "cpu" else CUDA_CHUNK
+            bound[CHUNK_INPUT] = ort.OrtValue.ortvalue_from_numpy(np.array([rows]), "cpu", 0)
+        for name, value in bound.items():
+            binding.bind_ortvalue_input(name, value)
+        if device == "cpu":
+            binding.bind_output(output, "cpu", 0, np.float32, values.shape, values.ctypes.data)
+        else:
+            binding.bind_output(output, device, 0)
+    _run_in_thread(session, binding, options, device, poll, keep=(feeds, bound, values))
+    if device == "cpu":
+        return values
+    with failures_on(device):
+        copied: FloatArray = binding.copy_outputs_to_cpu()[0]
+    return copied
 
 
 def cpu_chunk(voxels: int, threads: int) -> int:
@@ -122,40 +129,6 @@ def cpu_chunk(voxels: int, threads: int) -> int:
     return ceil((voxels + 1) / ceil((voxels + 1) / most))
 
 
-def run_bound(
-    session: ort.InferenceSession,
-    feeds: Mapping[str, Any],
-    place: str = "cuda",
-    chunk: int = CUDA_CHUNK,
-    poll: Poll = lambda: None,
-) -> FloatArray:
-    """Run a session as ``run_on_cpu`` does, with its inputs and its output on a device.
-
-    Each input is copied to the device once and the output back once, nothing more. ``chunk`` is the
-    number of rows of the neighbour table per chunk, for networks that have this input.
-    """
-    options = ort.RunOptions()
-    if place == "cuda":
-        options.add_run_config_entry(SHRINK, "gpu:0")
-    with failures_on(place):
-        binding = session.io_binding()
-        bound = {name: ort.OrtValue.ortvalue_from_numpy(feeds[name], place, 0) for name in feeds}
-        if takes_chunk(session):  # on the CPU, which launches the kernels
-            bound[CHUNK_INPUT] = ort.OrtValue.ortvalue_from_numpy(np.array([chunk]), "cpu", 0)
-        for name, value in bound.items():
-            binding.bind_ortvalue_input(name, value)
-        binding.bind_output(session.get_outputs()[0].name, place, 0)
-    _run(session, binding, options, place, poll, keep=bound)
-    with failures_on(place):
-        values: FloatArray = binding.copy_outputs_to_cpu()[0]
-    return values
-
-
-def takes_chunk(session: ort.InferenceSession) -> bool:
-    """Return whether a network lets the rows per chunk be chosen."""
-    return any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers())
-
-
 @contextmanager
 def failures_on(device: str) -> Iterator[None]:
     """Turn exceptions of onnxruntime into DeviceError."""
@@ -165,8 +138,13 @@ def failures_on(device: str) -> Iterator[None]:
         raise DeviceError(f"the network failed on {device}: {first_line(error)}") from error
 
 
-def _run(
-    session: ort.InferenceSession, binding: Any, options: Any, device: str, poll: Poll, keep: Any
+def _run_in_thread(
+    session: ort.InferenceSession,
+    binding: Any,
+    options: Any,
+    device: str,
+    poll: Callable[[], None],
+    keep: Any,
 ) -> None:
     """Run a session in a thread and poll; ``keep`` holds the bound arrays alive.
 
@@ -201,26 +179,19 @@ def _run(
         raise failures[0]
 
 
-def work_of(voxels: int, decoded: int, offsets: int) -> float:
-    """Return the work of a run, in voxels to encode; values to decode are converted."""
-    return voxels + decoded * offsets / VALUES_PER_VOXEL
-
-
 class Pace:
-    """The seconds that a network takes per voxel of work, from its last long run."""
+    """The seconds that a network takes per voxel, from its last run: its progress is estimated."""
 
     def __init__(self) -> None:
-        self.seconds: float | None = None
+        self.seconds = USUAL_PACE
 
-    def learn(self, work: float, seconds: float) -> None:
-        """Record a run."""
-        self.seconds = seconds / work
-
-    def watch(self, work: float, progress: ShareCallback) -> Callable[[], None]:
-        """Return a function that reports the progress of a run that starts now, when called."""
-        began = time.perf_counter()
-        expected = work * (self.seconds or math.inf)
-        return lambda: progress(share_of_time(time.perf_counter() - began, expected))
+    @contextmanager
+    def watch(self, work: float, progress: ShareCallback | None) -> Iterator[Callable[[], None]]:
+        """Yield what reports the progress of a run when it is called, and measure the run."""
+        began, expected = time.perf_counter(), work * self.seconds
+        show = progress or (lambda share: None)
+        yield lambda: show(share_of_time(time.perf_counter() - began, expected))
+        self.seconds = (time.perf_counter() - began) / work
 
 
 def share_of_time(seconds: float, expected: float) -> float:

@@ -25,43 +25,23 @@ LEFT = 0.85  # share of the work that is left after a round: a guess
 
 @dataclass(frozen=True)
 class Deviation:
-    """Distances between a mesh and a simplified one, in world units or in voxels.
+    """Distances between a mesh and a simplified one, in world units or in voxels."""
 
-    Attributes
-    ----------
-    largest, mean : float
-        From the vertices of the mesh, and middles of its triangles, to the simplified one, or a
-        bound of that; the mean is over the area.
-    largest_back, mean_back : float
-        From the vertices of the simplified mesh, and points on it, to the mesh.
-    """
-
+    # from the vertices of the mesh, and middles of its triangles, to the simplified one, or a bound
     largest: float
-    mean: float
-    largest_back: float
+    mean: float  # over the area
+    largest_back: float  # from the vertices of the simplified mesh, and points on it, to the mesh
     mean_back: float
 
 
 @dataclass(frozen=True, eq=False)
 class Simplified:
-    """A simplified mesh and its distance from the unsimplified one.
+    """A simplified mesh and its distance from the unsimplified one."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        Closed, oriented and manifold if the unsimplified mesh was; its open edges are the same.
-    triangles_before : int
-        Triangles of the unsimplified mesh.
-    deviation : Deviation
-        In world units.
-    warnings : tuple of str
-        What was asked for and not reached.
-    """
-
-    mesh: Mesh
-    triangles_before: int
-    deviation: Deviation
-    warnings: tuple[str, ...] = ()
+    mesh: Mesh  # closed, oriented, manifold if the unsimplified one was; open edges are the same
+    triangles_before: int  # of the unsimplified mesh
+    deviation: Deviation  # in world units
+    warnings: tuple[str, ...] = ()  # what was asked for and not reached
 
     def report(self, voxel_size: float) -> dict[str, Any]:
         """Return the figures as they stand in JSON; distances are in voxels.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import IntArray
+from ..arrays import IntArray, Vectors
 from ..grid.sdf_grid import SdfGrid
 from ..options import AUTO, MARCHING, SHARP, MesherName, check_mesher
 from ..refine.field import FineField
@@ -76,6 +76,16 @@ def extract(
         order on the fine lattice of the whole grid with a voxel more to every side, plus the axis
         of the lattice edge that begins there, or 3 and more for the features of its cell.
     """
+    kind = vertex_type(lattice, field.factor)
+
+    def written(points: Vectors) -> NDArray[Any]:
+        """Return points (n, 3), in fine spacings from node (0, 0, 0), as vertices in the world."""
+        return lattice.to_world(points / field.factor - 0.5).astype(kind)  # K i + K/2 is sample i
+
+    def rounded(points: Vectors) -> Vectors:
+        """Return points as they will be written, in fine spacings again."""
+        return field.factor * (lattice.to_index(written(points)) + 0.5)
+
     whole = np.array(field.shape if shape is None else shape)
     border = np.array([(0, 0, 0), whole]) - np.array(first)
     field = close(field, cap=cap, border=border)
@@ -84,16 +94,16 @@ def extract(
     if mesher == SHARP and field.spheres is not None and len(field.spheres.distance):
         from .sharp.features import find_features
 
-        features = find_features(field, crossings, border, threads)
+        features = find_features(field, crossings, border, rounded, threads)
     count = len(crossings.own_row)
     total = check_count(count + (len(features.peak) if features else 0), "vertices")
-    vertices = np.empty((total, 3), vertex_type(lattice, field.factor))
+    vertices = np.empty((total, 3), kind)
     keys, nodes = np.empty(total, np.int64), block_ijk(field.factor)
 
     def place(some: slice) -> None:
         row, edge = crossings.own_row[some], crossings.own_edge[some]
         positions = marching.lattice_positions(field, row, edge, border)
-        vertices[some] = to_world(positions, field.factor, lattice)
+        vertices[some] = written(positions.T)
         axis, node = np.divmod(edge, np.int16(len(field.blocks)))
         node_ijk = field.factor * (field.voxel_ijk[row] - border[0]) + nodes[node]
         keys[some] = keys_of(node_ijk, whole, field.factor) + axis
@@ -102,8 +112,8 @@ def extract(
     if features is None:
         faces = marching.connect(field, crossings, threads)
     else:
-        vertices[features.used] = to_world(features.position.T, field.factor, lattice)
-        vertices[count:] = to_world(features.peak.T, field.factor, lattice)
+        vertices[features.used] = written(features.position)
+        vertices[count:] = written(features.peak)
         cell = features.cell_ijk - field.factor * border[0]
         keys[count:] = keys_of(cell, whole, field.factor) + FIRST_FEATURE + features.nth
         plain = marching.connect(field, features.plain, threads)
@@ -118,14 +128,3 @@ def keys_of(node_ijk: IntArray, shape: NDArray[Any], factor: int) -> NDArray[np.
     _, ny, nz = (factor * (shape + 2) + 1).tolist()
     i, j, k = node_ijk.T.astype(np.int64) + factor
     return np.asarray(KEYS_PER_NODE * ((i * ny + j) * nz + k))
-
-
-def to_world(positions: NDArray[np.float64], factor: int, lattice: SdfGrid) -> NDArray[np.float64]:
-    """Return positions (3, n) in fine spacings from node (0, 0, 0) in world units, (n, 3)."""
-    samples = positions / factor - 0.5  # the fine index K i + K/2 is sample i
-    if not lattice.is_straight:
-        return lattice.to_world(samples.T)
-    world = np.empty(positions.shape[::-1])
-    for axis, sample in enumerate(samples):
-        world[:, axis] = sample * lattice.spacing[axis] + lattice.origin[axis]
-    return world

@@ -39,7 +39,7 @@ from ...threads import map_chunks
 from ..cell_cases import tables
 from ..marching import CAP_HEIGHT, Crossings
 from ..mesh import CLEARANCE
-from .folds import REACH, without_folds
+from .folds import REACH, Rounding, without_folds
 from .patches import (
     Patches,
     Placed,
@@ -144,7 +144,7 @@ class Features:
 
 
 def find_features(
-    field: FineField, crossings: Crossings, border: IntArray, threads: int = 1
+    field: FineField, crossings: Crossings, border: IntArray, rounded: Rounding, threads: int = 1
 ) -> Features | None:
     """Look for edges and corners in voxels where the field has kinks, and beside them."""
     kinked = voxels_near_kinks(field, threads)
@@ -159,7 +159,7 @@ def find_features(
     position = _kept_in_grid(placed.position, own.point, box)
     peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, box)
     placed = replace(placed, position=position, peak=peak)
-    placed = without_folds(patches, placed, own.point)
+    placed = without_folds(patches, placed, own.point, rounded)
     plain = np.ones(len(crossings.cell_row), bool)
     plain[patches.cell[placed.feature]] = False
     _, corners = triangles_of(patches, placed, ~plain[patches.cell])

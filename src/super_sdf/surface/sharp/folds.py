@@ -16,8 +16,9 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,15 +38,19 @@ ONE_WAY = 0.1  # least cosine between normals and their mean where a surface fac
 LEAST_MOVE = 0.1  # of the way to the nearest node, from which a crossing may fold the surface
 INSIDE_CELL = 0.02  # fine spacings from its faces that a vertex is pulled into a cell
 FARTHEST = 1 << 20  # more cells than along any axis
-TOUCHING = 1e-5  # fine spacings at which triangles intersect: vertices are rounded in the end ...
+TOUCHING = 1e-5  # fine spacings at which triangles intersect ...
 STEEP = 1e-2  # ... if a side rises by this over the other triangle ...
 FLAT = 1e-9  # ... and by which it has to pass through if not: triangles of a plane do not
 
+Rounding: TypeAlias = Callable[[Vectors], Vectors]
 
-def without_folds(patches: Patches, placed: Placed, lattice: Vectors) -> Placed:
+
+def without_folds(patches: Patches, placed: Placed, lattice: Vectors, rounded: Rounding) -> Placed:
     """Return the vertices with fewer features and moves, so that no triangles intersect.
 
-    ``lattice``, (n, 3), are the crossings where they were on their lattice edges.
+    ``lattice``, (n, 3), are the crossings where they were on their lattice edges. ``rounded``
+    returns points as they are written: far from the origin, those may intersect where others do
+    not.
     """
     suspect = find_suspects(patches, placed, lattice)
     keys = keys_of(np.floor(patches.low / APART))
@@ -57,7 +62,16 @@ def without_folds(patches: Patches, placed: Placed, lattice: Vectors) -> Placed:
         around = np.unique(cells[:, None] + keys_of(NEIGHBOURHOOD))
         start, stop = np.searchsorted(keys, around), np.searchsorted(keys, around, "right")
         close[order[np.repeat(start, stop - start) + nth_of_run(stop - start)]] = True
-        folded = find_folded(patches, placed, close, suspect, least)
+        _, triangles = triangles_of(patches, placed, close)
+        points, step = rounded(placed.points), np.zeros(len(suspect))
+        one, other = overlapping_boxes(points, triangles, suspect)
+        pairs = np.concatenate(intersecting(points, triangles[one], triangles[other]), 1)
+        if least:  # of each pair only the vertex that is least outside its cell
+            low = patches.low[placed.feature]
+            beyond = np.maximum(low - placed.peak, placed.peak - low - 1).max(1)
+            step[: len(lattice)], step[len(lattice) :] = 1, np.where(beyond > 0, beyond, 1)
+        folded = np.zeros(len(suspect), bool)
+        folded[pairs[step[pairs] == step[pairs].min(1, initial=1, keepdims=True)]] = True
         if not folded.any():
             break
         crossings = folded[: len(lattice)]
@@ -106,28 +120,6 @@ def _having(patches: Patches, placed: Placed, chosen: BoolArray) -> BoolArray:
     found = patches.having(crossings)
     found[placed.feature[peaks]] = True
     return found
-
-
-def find_folded(
-    patches: Patches, placed: Placed, close: BoolArray, suspect: BoolArray, least: bool
-) -> BoolArray:
-    """Return the vertices, (n + f,), of pairs of triangles that intersect, one at a suspect.
-
-    With ``least``, of each pair only the vertex that is least outside its cell. Only triangles of
-    ``close`` patches, (P,), are compared.
-    """
-    _, triangles = triangles_of(patches, placed, close)
-    one, other = overlapping_boxes(placed.points, triangles, suspect)
-    pairs = np.concatenate(intersecting(placed.points, triangles[one], triangles[other]), 1)
-    step = np.zeros(len(suspect))
-    if least:
-        low = patches.low[placed.feature]
-        beyond = np.maximum(low - placed.peak, placed.peak - low - 1).max(1)
-        step = np.where(beyond > 0, beyond, 1)
-        step = np.concatenate([np.ones(len(placed.position)), step])
-    folded = np.zeros(len(suspect), bool)
-    folded[pairs[step[pairs] == step[pairs].min(1, initial=1, keepdims=True)]] = True
-    return folded
 
 
 def put_back(patches: Patches, placed: Placed, lattice: Vectors, chosen: BoolArray) -> Placed:

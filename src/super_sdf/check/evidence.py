@@ -1,4 +1,4 @@
-"""How far the spheres of samples are from touching the mesh, and which vertices they contradict.
+"""What a mesh is as a surface, and how far the spheres of samples are from touching it.
 
 An exact sample is the radius of an empty ball that touches the surface. Its residual is its
 distance to the mesh minus that radius: positive if the mesh does not reach the ball, negative if it
@@ -8,15 +8,14 @@ pierces it. All lengths are in voxels unless they are named otherwise.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..grid.sdf_grid import SdfGrid
-from ..network.neighbourhood import CENTRE, NEIGHBOURHOOD
 from ..refine.band import plane_blocks, rescale
 from ..refine.nodes import VoxelIndex
 from ..refine.survey import Band
@@ -24,7 +23,6 @@ from ..surface.mesh import Mesh
 from ..threads import chunks_of
 from ..truth.mesh_files import without_unused
 from ..truth.solid import Distances, Points, Solid
-from .surface import Surface, examine_surface
 
 FACES_IN_SLAB = 1 << 19  # search trees of small meshes are quicker and take less memory
 REACH = 2.0  # how far slabs look: the samples near the surface are within 1.4 of it
@@ -35,6 +33,59 @@ STRAY = 0.5  # within a ball, from which on a vertex is counted
 NEAREST_FEET = 8  # foot points that a vertex looks at
 SMOOTHING = 0.02  # distance of a foot point that halves its weight
 FARTHEST = 1.5  # foot points farther away say nothing of a vertex
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a mesh is as a surface; triangles that have the same vertex twice are left out."""
+
+    open_edges: int  # of an odd number of triangles
+    crowded_edges: int  # of more than two triangles: not manifold
+    flipped_edges: int  # of two triangles that pass them in the same direction
+    vertices: int
+    triangles: int
+    pinched_vertices: int  # at which several fans of triangles meet: not manifold
+    components: int  # that share no vertex
+    self_intersections: int | None  # pairs that meet off a common vertex or edge; None: not counted
+    volume: float  # in cubic world units, negative if the triangles face inward
+    area: float
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether the mesh is one closed sheet with an inside, known not to meet itself."""
+        return not self.faults() and self.components == 1 and self.self_intersections == 0
+
+    def faults(self) -> list[str]:
+        """Return what keeps the mesh from being the boundary of a solid, in words."""
+        counts = {
+            "open edges": self.open_edges,
+            "edges of more than two triangles": self.crowded_edges,
+            "edges between triangles of opposite orientation": self.flipped_edges,
+            "vertices where several fans of triangles meet": self.pinched_vertices,
+            "pairs of triangles that intersect": self.self_intersections or 0,
+        }
+        found = [f"{count:,} {what}" for what, count in counts.items() if count]
+        return found + ["triangles that face inward"] * (self.volume <= 0)
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures as they stand in JSON."""
+        return {
+            "closed": self.open_edges == 0,
+            "oriented": self.flipped_edges == 0 and self.volume > 0,
+            "manifold": self.crowded_edges == 0 and self.pinched_vertices == 0,
+            **asdict(self),
+        }
+
+
+def examine_surface(mesh: Mesh, self_intersections: int | None = None) -> Surface:
+    """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
+    a, b, c = mesh.faces.T
+    whole = Mesh(mesh.vertices, mesh.faces[(a != b) & (b != c) & (c != a)])
+    opposite, uses, flipped = whole.pair_edges()
+    pinched = int(np.count_nonzero(whole.count_fans(opposite) > 1))
+    edges = int((uses % 2).sum()), int((uses > 2).sum()), flipped
+    counts = len(whole.vertices), len(whole.faces), pinched, whole.components()[0]
+    return Surface(*edges, *counts, self_intersections, whole.volume(), whole.area())
 
 
 @dataclass(frozen=True, eq=False)
