@@ -19,7 +19,7 @@ from scipy.sparse.csgraph import connected_components
 
 from super_sdf import Mesh, SdfGrid, load_network, reconstruct
 from super_sdf.network.decoder import Decoder
-from super_sdf.options import DEFAULT_MESHER, MARCHING, SHARP
+from super_sdf.options import AUTO, MARCHING, SHARP
 from super_sdf.surface.marching import CAP_HEIGHT
 
 from . import parser_of
@@ -90,7 +90,7 @@ KINDS = {
 }
 
 
-def mesh_of_field(field: RandomField, network: Decoder, mesher: str = DEFAULT_MESHER) -> Mesh:
+def mesh_of_field(field: RandomField, network: Decoder, mesher: str = AUTO) -> Mesh:
     """Return a field's mesh."""
     grid = SdfGrid.trusted(field.values, 1.0)  # they are no distances, and need not be
     return reconstruct(grid, network, field.factor, cap=field.cap, mesher=mesher)

@@ -20,7 +20,7 @@ from super_sdf.arrays import BoolArray, FloatArray, IntArray
 from super_sdf.errors import FileError, OptionError, seen
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
-from super_sdf.options import check_factor
+from super_sdf.options import OPTIONS
 from super_sdf.refine.band import find_band, rescale
 from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import sample_grid, unit_layout
@@ -48,7 +48,7 @@ class Setting:
 
     def check(self) -> None:
         """Raise OptionError if a number is out of range."""
-        check_factor(self.factor)
+        OPTIONS["factor"].check(self.factor)
         if self.size < 4:
             raise OptionError(f"size is {self.size}: give at least 4 samples along an axis")
         if self.size > LARGEST_SIZE:

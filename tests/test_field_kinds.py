@@ -17,7 +17,6 @@ from super_sdf.grid import planes
 from super_sdf.grid.census import Census
 from super_sdf.grid.derived import mask_distances, mask_planes
 from super_sdf.grid.field import weigh
-from super_sdf.threads import Resources
 from super_sdf.network.network import network_for, shipped_models
 from super_sdf.options import FIELDS
 from super_sdf.refine import spline

@@ -20,7 +20,7 @@ from ..errors import FileError, GridError, OptionError, SuperSdfError
 from ..grid.field import Field
 from ..grid.planes import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..options import check_factor, check_path
+from ..options import OPTIONS, check_path
 from ..refine.band import neighbour_table
 from ..refine.field import FineField, SampleSpheres
 from ..refine.nodes import copies_agree, share_parts
@@ -149,7 +149,7 @@ def read_field(path: str | Path) -> FineField:
                 raise damaged(key, "its voxels are not in order in the grid")
             arrays[key] = np.ascontiguousarray(array, np.int32)
     try:
-        factor = check_factor(int(arrays["factor"]))
+        factor = OPTIONS["factor"].check(int(arrays["factor"]))
         grid = SdfGrid.trusted(
             NoSamples(shape, str(path)),
             *(arrays["spacing"], arrays["origin"]),

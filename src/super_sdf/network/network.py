@@ -18,7 +18,6 @@ from ..arrays import FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..options import (
     AUTO,
-    AUTO_PRECISION,
     DEFAULT_QUALITY,
     FLOAT32,
     INT8,
@@ -30,7 +29,6 @@ from ..options import (
     Precision,
     Quality,
     check_path,
-    check_threads,
 )
 from ..progress import ShareCallback
 from ..threads import cores_of_system, described_processor, useful_threads
@@ -162,12 +160,12 @@ def float32_name(name: str) -> str:
     return name.removesuffix(f"-{INT8}")
 
 
-def digest_of_model(model: str | Path, precision: str = AUTO_PRECISION) -> str:
+def digest_of_model(model: str | Path, precision: str = AUTO) -> str:
     """Return the SHA-256 of a network's file, which is found as by ``find_model``."""
     return hashlib.sha256(find_model(model, precision)[0].read_bytes()).hexdigest()
 
 
-def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path, int]:
+def find_model(model: str | Path, precision: str = AUTO) -> tuple[Path, int]:
     """Return the file for the CPU, and the number of symmetries to average over.
 
     ``model`` is a quality, the name of a shipped network, or a file, and "auto" leaves a file as it
@@ -181,7 +179,7 @@ def find_model(model: str | Path, precision: str = AUTO_PRECISION) -> tuple[Path
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped.get(name, Path(model))
     flags = described_processor().get("flags", "").split()
-    if precision == AUTO_PRECISION and not ("avx" in flags and "avx2" not in flags):
+    if precision == AUTO and not ("avx" in flags and "avx2" not in flags):
         path = shipped.get(f"{name}-{INT8}", path)
     if precision == INT8:
         path = path.with_name(f"{path.stem}-{INT8}.onnx")  # beside the float32 file
@@ -203,7 +201,7 @@ def load_network(
     *,
     device: Device = AUTO,
     threads: int = 0,
-    precision: Precision = AUTO_PRECISION,
+    precision: Precision = AUTO,
 ) -> Network:
     """Load a network.
 
@@ -231,14 +229,14 @@ def load_network(
     DeviceError
         If the device is "cuda" and CUDA cannot run.
     """
-    threads = check_threads(threads)
+    threads = OPTIONS["threads"].check(threads)
     check_path(model, "model")
     path, symmetries = find_model(model, precision)
     if precision == INT8 and device == "cuda":
         raise DeviceError("int8 is for the CPU: use --precision float32 with --device cuda")
     if precision == INT8 and device == "auto":
         device = "cpu"
-    on_cuda, _ = find_model(model, FLOAT32 if precision == AUTO_PRECISION else precision)
+    on_cuda, _ = find_model(model, FLOAT32 if precision == AUTO else precision)
     useful = useful_threads(threads)
     if not threads and useful == cores_of_system():
         useful = 0  # onnxruntime's default, one thread per physical core
@@ -300,7 +298,7 @@ def _load_once(
     device: Device,
     threads: int,
     symmetries: int,
-    precision: Precision = AUTO_PRECISION,
+    precision: Precision = AUTO,
 ) -> Network:
     loaded = load_network(model, device=device, threads=threads, precision=precision)
     return loaded.averaged(symmetries)
