@@ -19,7 +19,6 @@ from super_sdf.network.decoder import Decoder
 from super_sdf.network.network import (
     KIND_MODELS,
     find_model,
-    float32_name,
     load_network,
     shipped_models,
 )
@@ -173,7 +172,7 @@ def digest_of_ours(model: str, precision: str = AUTO) -> str:
     network, symmetries = find_model(model, precision)
     digest = hashlib.sha256(str(symmetries).encode())
     shipped = shipped_models().items()
-    for_kinds = [path for name, path in shipped if float32_name(name) in KIND_MODELS]
+    for_kinds = [path for name, path in shipped if name.removesuffix("-int8") in KIND_MODELS]
     package = Path(super_sdf.__file__).parent
     files = sorted(package.rglob("*.py"))
     code = [p for p in files if p.relative_to(package).parts[0] not in NOT_THE_METHOD]

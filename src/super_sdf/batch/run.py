@@ -25,8 +25,8 @@ from typing import Any
 
 from .. import __version__
 from ..files.output import naming
-from ..network.device import available_devices
 from ..network.network import find_model
+from ..network.onnx import available_devices
 from ..threads import allot_each, count_cores, free_memory
 from .job import Job, Result, Settings, convert_job
 from .pool import Death, work_in_processes

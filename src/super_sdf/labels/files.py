@@ -11,11 +11,9 @@ from typing import Any
 from ..errors import MeshError, OptionError, seen
 from ..files.mesh_writers import World
 from ..files.meshes import (
-    check_format_holds,
     check_mesh_suffix,
     check_target,
     format_of,
-    local_origin_note,
     write_meshes,
 )
 from ..files.output import check_apart
@@ -102,7 +100,6 @@ def convert_labels(
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
-    check_format_holds(target, grid, options.factor)
     watch.lap("read")
     meshes = label_meshes(image, network, options.factor, bound, progress)
     torn = [label for label, mesh in zip(called, meshes) if mesh.open_edges()]
@@ -131,7 +128,7 @@ def convert_labels(
         grid,
         rows,
         [{"label": label, "name": entry.name} for label, entry in missing.items()],
-        (*grid.notes, *local_origin_note(target, meshes), *off),
+        (*grid.notes, *off),
         watch.seconds,
     )
 
