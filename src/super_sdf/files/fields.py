@@ -26,7 +26,7 @@ from ..errors import FileError, OptionError, OptionTypeError, SuperSdfError, see
 from ..grid.field import Field
 from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..options import check_factor, check_path
+from ..options import OPTIONS, check_path
 from ..refine.band import neighbour_table
 from ..refine.field import FineField, SampleSpheres, fine_grid, lattice_planes, lattice_shape
 from ..refine.nodes import copies_agree, share_parts
@@ -288,7 +288,7 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
     """Return the field of arrays, which are checked: a mesh of others would have holes."""
-    factor, shape = check_factor(int(arrays["factor"])), tuple(map(int, arrays["shape"]))
+    factor, shape = OPTIONS["factor"].check(int(arrays["factor"])), tuple(map(int, arrays["shape"]))
     if min(shape) < 2:
         raise FileError(f"{path} is no refined field: its grid has the shape {shape}")
     grid = SdfGrid.trusted(

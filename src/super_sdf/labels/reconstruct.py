@@ -27,16 +27,7 @@ from ..grid.interpret import labelled
 from ..grid.sdf_grid import SdfGrid, mean_spacing
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import network_for
-from ..options import (
-    ALL,
-    MASK,
-    OPTIONS,
-    AxisOrder,
-    check_factor,
-    check_max_memory,
-    check_network,
-    check_progress,
-)
+from ..options import ALL, MASK, OPTIONS, AxisOrder, check_network, check_progress
 from ..pipeline import refine_band
 from ..progress import Progress, StepCounter, part_of
 from ..refine import bounds, spheres
@@ -126,7 +117,8 @@ def label_meshes(
     """Return the meshes of an image's labels, the same for any memory bound."""
     check_network(network)
     check_progress(progress)
-    factor, grid, bound = check_factor(factor), image.grid, check_max_memory(max_memory)
+    factor, grid = OPTIONS["factor"].check(factor), image.grid
+    bound = OPTIONS["max_memory"].check(max_memory)
     chosen = adapt(network_for(network, MASK))
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
     ranges = plan_ranges(image, factor, chosen.receptive_field, memory_bound(bound))
