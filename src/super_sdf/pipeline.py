@@ -26,7 +26,7 @@ from .functions.function import Function, as_function, sampled
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
-from .options import MesherName, Options
+from .options import OPTIONS, MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
@@ -160,10 +160,8 @@ def upsample(
     check_grid(grid)
     options.check_network(network)
     options.check_progress(progress)
-    factor, offset = (
-        options.OPTIONS["factor"].check(factor),
-        options.OPTIONS["offset"].check(offset),
-    )
+    asked = Options(factor, offset=offset)  # checks them
+    factor, offset = asked.factor, asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
@@ -207,7 +205,7 @@ def extract_mesh(
     check_grid(grid)
     samples = field.spheres
     chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
-    cap = options.OPTIONS["cap"].check(cap) and field.grid is not None
+    cap = OPTIONS["cap"].check(cap) and field.grid is not None
     check_can_close(grid, cap=cap)
     mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
     if function is None:
@@ -278,7 +276,7 @@ def reconstruct(
         If not even small tiles of the grid fit in the memory.
     """
     exact = None if function is None else as_function(function)
-    grid = sampled(grid, exact, bounds, spacing, options.OPTIONS["offset"].check(offset))
+    grid = sampled(grid, exact, bounds, spacing, OPTIONS["offset"].check(offset))
     where = {"model": quality, "device": device, "precision": precision, "threads": threads}
     asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
     if network is None:
