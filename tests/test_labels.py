@@ -171,7 +171,7 @@ def test_the_command_writes_a_file_for_each_label(image, command):
         assert row["output"] == path and row["closed"] and mesh.is_watertight
         assert row["triangles"] == len(mesh.faces) and row["vertices"] == len(mesh.vertices)
         assert row["volume"] == pytest.approx(mesh.volume, rel=1e-5) and mesh.volume > 0
-        assert f"{path}: label {row['label']}, {len(mesh.vertices):,} vertices, " in err
+        assert f"{path}: label {row['label']}, {len(mesh.faces):,} triangles, " in err
     low, high = mesh.bounds  # of label 12, a ball in a turned grid
     np.testing.assert_allclose((low + high) / 2, (3, -9, 23), atol=0.5)
 

@@ -14,26 +14,26 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import OptionTypeError, OutOfMemoryError, seen
+from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .functions.function import Function, as_function, sampled
-from .grid.cubic import cubic_grid
-from .grid.sdf_grid import SdfGrid, check_grid, crop
+from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
-from .network.network import given_or_loaded, network_for
-from .options import MesherName, Options
+from .network.network import load_network, network_for
+from .options import OPTIONS, MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
-from .refine.survey import Band, BandSummary, BandTooLarge, no_surface, summarise, survey
+from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import choose_mesher, extract
 from .surface.mesh import Mesh, vertex_type
@@ -43,7 +43,7 @@ from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, pl
 
 def refine(
     grid: SdfGrid,
-    network: Decoder,
+    network: Decoder | Adapter,
     factor: int = 4,
     offset: float = 0.0,
     *,
@@ -160,7 +160,8 @@ def upsample(
     check_grid(grid)
     options.check_network(network)
     options.check_progress(progress)
-    factor, offset = options.check_factor(factor), options.check_distance(offset)
+    asked = Options(factor, offset=offset)  # checks them
+    factor, offset = asked.factor, asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
@@ -175,7 +176,7 @@ def extract_mesh(
     field: FineField,
     grid: SdfGrid | None = None,
     *,
-    mesher: options.MesherName = options.DEFAULT_MESHER,
+    mesher: options.MesherName = options.AUTO,
     cap: bool = True,
     function: Function | None = None,
 ) -> Mesh:
@@ -204,7 +205,7 @@ def extract_mesh(
     check_grid(grid)
     samples = field.spheres
     chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
-    cap = options.check_cap(cap) and field.grid is not None
+    cap = OPTIONS["cap"].check(cap) and field.grid is not None
     check_can_close(grid, cap=cap)
     mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
     if function is None:
@@ -225,7 +226,7 @@ def reconstruct(
     quality: options.Quality | str | Path | None = None,
     offset: float = 0.0,
     cap: bool = True,
-    mesher: options.MesherName = options.DEFAULT_MESHER,
+    mesher: options.MesherName = options.AUTO,
     max_memory: int | None = None,
     progress: Progress | None = None,
     device: options.Device | None = None,
@@ -275,11 +276,15 @@ def reconstruct(
         If not even small tiles of the grid fit in the memory.
     """
     exact = None if function is None else as_function(function)
-    grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
-    network = given_or_loaded(network, quality, device=device, precision=precision, threads=threads)
-    chosen = Options(
-        factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory
-    )
+    grid = sampled(grid, exact, bounds, spacing, OPTIONS["offset"].check(offset))
+    where = {"model": quality, "device": device, "precision": precision, "threads": threads}
+    asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
+    if network is None:
+        network = load_network(**asked)
+    elif asked:
+        name = next(iter(asked)).replace("model", "quality")
+        raise OptionError(f"a network and {name} are given: give only one of them")
+    chosen = Options(factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh
@@ -347,7 +352,7 @@ def mesh_grid(
     try:
         is_one = map_tiles is None and least_tiles == 1
         band = survey(lattice, offset, threads=threads, most=room.voxels() if is_one else -1)
-    except BandTooLarge:
+    except BandTooLargeError:
         band, whole = None, summarise(lattice, offset, threads)
         margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
         tiles = plan(shape, whole, margin, room, least_tiles)

@@ -1,9 +1,9 @@
 """A grid that is too large for the memory, or for one machine, as tiles: cut, and joined again.
 
-A tile is a box of samples with a margin as wide as all that a vertex depends on; it is refined as a
-grid of its own. The lattice of samples is parted by the tiles without their margins. A vertex
-belongs to the tile that has the node of its key (see ``surface.extract``), a triangle to that of its
-smallest key; the position of a vertex is that of its owner.
+A tile is a box of samples with a margin as wide as all that a vertex depends on, refined as a grid
+of its own. Without their margins the tiles part the grid. A vertex belongs to the tile that has the
+node of its key (see ``surface.extract``), a triangle to that of its smallest key; the position of a
+vertex is that of its owner.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from .threads import check_count, held_memory, in_words, memory_bound
 Index = tuple[int, int, int]
 Box = tuple[Index, Index]
 """From the lowest index to before the highest."""
+FIXED = 50_000_000  # bytes of chunks, and what the network takes in any case
 LEAST_SIDE = 8  # samples of a tile without its margin: smaller ones are nearly all margin
 ON_BORDER = 1e-2  # voxels: open edges so near to the border of the grid end there
 
@@ -48,8 +49,8 @@ class Tile:
 
     def owns(self, voxel_ijk: NDArray[np.integer]) -> BoolArray:
         """Return which voxels (n, 3) belong to the tile, (n,)."""
-        inside: BoolArray = ((voxel_ijk >= self.inner_low) & (voxel_ijk < self.inner_high)).all(1)
-        return inside
+        inside = (voxel_ijk >= self.inner_low) & (voxel_ijk < self.inner_high)
+        return np.asarray(inside.all(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +96,7 @@ class Room:
         The network sees ``AT_ONCE`` of a large band at a time, and a fifth more beside them. Three
         quarters of the voxels of a band are decoded.
         """
-        left, values = self.bound - self.held - meshes, (self.factor + 1) ** 3
+        left, values = self.bound - self.held - FIXED - meshes, (self.factor + 1) ** 3
         run = 250 + self.network[0] + 0.75 * self.network[1] * values
         small, large = left / (250 + run), (left - 1.2 * AT_ONCE * run) / (250 + 3 * values)
         if large < AT_ONCE:
@@ -118,9 +119,7 @@ class Room:
         )
 
 
-def margin_of(
-    grid: SdfGrid, receptive_field: int | None, mesher: MesherName, factor: int
-) -> int:
+def margin_of(grid: SdfGrid, receptive_field: int | None, mesher: MesherName, factor: int) -> int:
     """Return how many samples to every side a tile's vertices and triangles depend on."""
     if receptive_field is None:
         raise OptionError(
@@ -276,7 +275,7 @@ def check_closed(
     if not cap:
         place = lattice.to_index(mesh.vertices[edges].reshape(-1, 3)).reshape(-1, 2, 3)
         border = (place < ON_BORDER - 0.5) | (place > np.array(lattice.shape) - 0.5 - ON_BORDER)
-        bad = edges[~border.all(1).any(1)]
+        bad = edges[~np.any(border.all(1), axis=1)]
     if len(bad):
         last = np.cumsum([count for _, count in names])
         some = np.unique(np.searchsorted(last, bad.ravel(), "right"))

@@ -25,8 +25,8 @@ from typing import Any
 
 from .. import __version__
 from ..files.output import naming
-from ..network.device import available_devices
 from ..network.network import find_model
+from ..network.onnx import available_devices
 from ..threads import allot_each, count_cores, free_memory
 from .job import Job, Result, Settings, convert_job
 from .pool import Death, work_in_processes
@@ -114,8 +114,7 @@ class Batch:
             count = 1
         count = count_workers(settings.workers, settings.device, count, memory)
         if count > 1 and not settings.cluster:  # before the workers fill the memory
-            share = allot_each(count, threads, memory)
-            threads, memory = share.threads, share.memory
+            threads, memory = allot_each(count, threads, memory)
         work = partial(convert_job, settings=settings, stage=stage, threads=threads)
 
         def take() -> Job | None:

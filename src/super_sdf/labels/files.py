@@ -21,14 +21,7 @@ from typing import Any, NamedTuple
 
 from ..errors import FileError, MeshError, OptionError, seen
 from ..files.mesh_writers import World
-from ..files.meshes import (
-    check_format_holds,
-    check_mesh_suffix,
-    check_target,
-    format_of,
-    local_origin_note,
-    write_meshes,
-)
+from ..files.meshes import check_mesh_suffix, check_target, format_of, write_meshes
 from ..files.output import check_apart
 from ..files.regular import check_regular_file, files_of
 from ..files.volume import PLACE
@@ -114,7 +107,6 @@ def convert_labels(
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
-    check_format_holds(target, grid, options.factor)
     watch.lap("read")
     meshes = label_meshes(image, network, options.factor, options.max_memory, progress)
     for label, mesh in zip(called, meshes):
@@ -139,8 +131,7 @@ def convert_labels(
     watch.lap("write")
     lacking = names_of(image.missing, known)
     missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
-    notes = *grid.notes, *local_origin_note(target, meshes), *off
-    return LabelConversion(grid, rows, missing, notes, watch.seconds)
+    return LabelConversion(grid, rows, missing, (*grid.notes, *off), watch.seconds)
 
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:

@@ -21,12 +21,11 @@ from ..errors import GridError, OptionError, OutOfMemoryError, seen
 from ..files.grids import read_array
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
 from ..grid.field import NONE_EXACT, Field
-from ..grid.interpret import as_sample, labelled
-from ..grid.placement import as_samples, check_kind, check_spacing, is_cubic, placed
-from ..grid.refusals import named
+from ..grid.interpret import as_sample, labelled, named
+from ..grid.samples import as_samples, check_kind, check_spacing, is_cubic, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.decoder import Adapter, Decoder, adapt
-from ..network.network import given_or_loaded, network_for
+from ..network.network import load_network, network_for
 from ..pipeline import refine_band
 from ..progress import Progress, StepCounter, part_of
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
@@ -94,7 +93,8 @@ def reconstruct_labels(
     image = find_image(values, wanted, place, axes, max_memory)
     for label in image.missing:
         labelled(image.grid.samples, label)  # raises
-    meshes = label_meshes(image, given_or_loaded(network, None), factor, max_memory, progress)
+    chosen = load_network() if network is None else network
+    meshes = label_meshes(image, chosen, factor, max_memory, progress)
     if options.OPTIONS["keep_volume"].check(keep_volume):
         meshes = keep_volumes(meshes, image.volumes, mean_spacing(image.grid))
     return dict(zip(image.labels, meshes))
@@ -205,8 +205,8 @@ def label_meshes(
     """Return the meshes of an image's labels; OutOfMemoryError if they do not fit in memory."""
     options.check_network(network)
     options.check_progress(progress)
-    factor, grid = options.check_factor(factor), image.grid
-    bound = memory_bound(options.check_max_memory(bound))
+    factor, grid = options.OPTIONS["factor"].check(factor), image.grid
+    bound = memory_bound(options.OPTIONS["max_memory"].check(bound))
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
     chosen = adapt(network_for(network, options.MASK))
     places, faces, sides = extract_walls(label_fields(image, chosen, factor, bound, progress))
