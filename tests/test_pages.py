@@ -20,7 +20,6 @@ from super_sdf.pages.html import is_page, make_page, write_page
 from super_sdf.pages.items import (
     Item,
     certificate_facts,
-    coarse_surface,
     entry_of,
     find_item,
     item_of_files,
@@ -29,6 +28,7 @@ from super_sdf.pages.items import (
     packed_mesh,
     read_meshes,
 )
+from super_sdf.surface.extract import coarse_surface
 
 NASTY = '</script><img src=x onerror=alert(1)> & "quoted" \u2028\udcff'
 EMPTY = {"title": "", "lead": "", "alert": "", "summary": [], "notes": [], "files": []}

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .errors import check_modules
 from .files.grids import read_grid
 from .files.meshes import check_target, write_mesh
 from .files.output import check_apart, check_free
@@ -94,8 +93,6 @@ def convert(
     Nothing is written then.
     """
     watch, files = Stopwatch(), files_of(source)
-    if options.goals():
-        check_modules("simplifying", "simplify")
     check_target(target, force=force, unit=options.unit)
     check_apart(target, files)
     saving: Any = nullcontext()

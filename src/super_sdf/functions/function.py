@@ -20,7 +20,6 @@ from ..errors import GridError, OptionError, OptionTypeError, seen
 from ..grid.derived import sample_near
 from ..grid.samples import as_triple, check_spacing
 from ..grid.sdf_grid import SdfGrid, check_grid, make_grid
-from ..options import SCALED
 
 Points = NDArray[np.float64]  # (n, 3)
 Numbers = NDArray[np.float64]  # (n,)
@@ -127,7 +126,7 @@ class DistanceFunction:
             return make()
         except GridError:  # the spacing is right: what contradicts it is no distance
             with suppress(GridError):
-                return make(field=SCALED)
+                return make(field="scaled")
             raise
 
 

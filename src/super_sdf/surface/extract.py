@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import IntArray, Vectors
-from ..grid.sdf_grid import SdfGrid
+from ..arrays import CORNERS, IntArray, Vectors
+from ..grid.sdf_grid import SdfGrid, with_fields
 from ..options import AUTO, MARCHING, OPTIONS, SHARP, MesherName
+from ..refine.band import neighbour_table, rescale
 from ..refine.field import FineField
-from ..refine.nodes import block_ijk
+from ..refine.nodes import block_ijk, share_parts
 from ..threads import check_count, map_chunks
 from . import marching
 from .cap import close
@@ -128,3 +129,18 @@ def keys_of(node_ijk: IntArray, shape: NDArray[Any], factor: int) -> NDArray[np.
     _, ny, nz = (factor * (shape + 2) + 1).tolist()
     i, j, k = node_ijk.T.astype(np.int64) + factor
     return np.asarray(KEYS_PER_NODE * ((i * ny + j) * nz + k))
+
+
+def coarse_surface(grid: SdfGrid, offset: float = 0.0) -> Mesh:
+    """Return marching cubes of a grid's samples: every cell is a block of factor 1."""
+    values = rescale(grid, offset)
+    some = every = values <= 0
+    for axis in range(3):
+        low, high = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)
+        some, every = some[low] | some[high], every[low] & every[high]
+    cell_ijk = np.argwhere(some & ~every).astype(np.int32)
+    blocks = np.stack([values[tuple((cell_ijk + corner).T)] for corner in CORNERS])
+    parts = share_parts(neighbour_table(cell_ijk, some.shape))
+    field = FineField(some.shape, 1, cell_ijk, blocks, parts)
+    middle = tuple(grid.to_world([0.5, 0.5, 0.5]).tolist())
+    return extract(field, with_fields(grid, origin=middle), mesher=MARCHING, cap=False)[0]
