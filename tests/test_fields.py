@@ -153,9 +153,11 @@ def test_files_that_are_no_fields_are_refused_in_one_line(said, good):
 
 def test_a_lattice_that_does_not_fit_is_refused(monkeypatch):
     monkeypatch.setattr("super_sdf.threads.free_memory", lambda: 10**9)
-    said = refusal(OutOfMemoryError, writing.check_field_fits, Path("a.vti"), (1025,) * 3)
+    with writing.saving_field("a.vti") as file:
+        said = refusal(OutOfMemoryError, file.check_fits, (256,) * 3, 4)
     assert said.startswith("a.vti, 1025 x 1025 x 1025 values, needs 4.31 GB of memory, 1.00 GB are")
-    writing.check_field_fits(Path("a.npy"), (1025,) * 3)
+    with writing.saving_field("a.npy") as file:
+        file.check_fits((256,) * 3, 4)
 
 
 def test_the_command_writes_the_mesh_and_the_field(command):

@@ -4,6 +4,7 @@ import base64
 import hashlib
 import re
 import zlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,19 +15,20 @@ from skimage.measure import marching_cubes
 from super_sdf import Mesh, SdfGrid, reconstruct
 from super_sdf.check.check import FULL, check_mesh
 from super_sdf.options import Options
-from super_sdf.pages import meshes
+from super_sdf.pages import items
 from super_sdf.pages.html import is_page, make_page, write_page
 from super_sdf.pages.items import (
     Item,
     certificate_facts,
+    coarse_surface,
     entry_of,
     find_item,
     item_of_files,
     item_path,
     keep_item,
+    packed_mesh,
     read_meshes,
 )
-from super_sdf.pages.meshes import coarse_surface, packed_mesh, residual_bytes
 
 NASTY = '</script><img src=x onerror=alert(1)> & "quoted" \u2028\udcff'
 EMPTY = {"title": "", "lead": "", "alert": "", "summary": [], "notes": [], "files": []}
@@ -57,7 +59,7 @@ def test_a_packed_mesh_comes_out_within_half_a_step_and_a_large_one_simplified(m
     assert (faces == mesh.faces).all() and not len(residuals) and not packed["residuals"]
     assert packed["caption"] == "ball: 1,280 triangles"
     assert unpack(packed_mesh("no", Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))))[0].size == 0
-    monkeypatch.setattr(meshes, "MOST_TRIANGLES", 300)
+    monkeypatch.setattr(items, "MOST_TRIANGLES", 300)
     packed = packed_mesh("ball", mesh)
     vertices, faces, _ = unpack(packed)
     assert 150 < len(faces) <= 300
@@ -70,7 +72,16 @@ def test_a_packed_mesh_comes_out_within_half_a_step_and_a_large_one_simplified(m
 
 def test_residuals_are_full_at_a_tenth_of_a_voxel_and_unknown_ones_are_told_apart():
     values = np.array([0, FULL, -FULL, 5, -5, FULL / 2, np.nan], np.float32)
-    assert residual_bytes(values).tolist() == [0, 127, -127, 127, -127, 64, -128]
+    known = SimpleNamespace(has_evidence=True, residuals_at=lambda _: values)
+    assert unpack(packed_mesh("", icosphere(0), known))[2].tolist() == [
+        0,
+        127,
+        -127,
+        127,
+        -127,
+        64,
+        -128,
+    ]
     assert certificate_facts({"error": "no room"}) == [["not checked", "no room"]]
     assert certificate_facts({}) == []
 

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike
 from . import options
 from .arrays import CENTRE
 from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
-from .functions.function import Function, as_function, sampled
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
@@ -39,6 +38,9 @@ from .surface.extract import choose_mesher, extract
 from .surface.mesh import Mesh, vertex_type
 from .threads import in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
+
+if TYPE_CHECKING:
+    from .functions.function import Function
 
 
 def refine(
@@ -210,7 +212,8 @@ def extract_mesh(
     mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
     if function is None:
         return mesh
-    from .functions.zero import put_on_zero  # imported here, as few call it
+    from .functions.function import as_function
+    from .functions.zero import put_on_zero
 
     return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)
 
@@ -275,8 +278,14 @@ def reconstruct(
     OutOfMemoryError
         If not even small tiles of the grid fit in the memory.
     """
-    exact = None if function is None else as_function(function)
-    grid = sampled(grid, exact, bounds, spacing, OPTIONS["offset"].check(offset))
+    chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
+    exact = None
+    if function is not None or bounds is not None or spacing is not None:
+        from .functions.function import as_function, sampled  # imported here, as few need it
+
+        exact = None if function is None else as_function(function)
+        grid = sampled(grid, exact, bounds, spacing, chosen.offset)
+    grid = check_grid(grid)
     where = {"model": quality, "device": device, "precision": precision, "threads": threads}
     asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
     if network is None:
@@ -284,11 +293,10 @@ def reconstruct(
     elif asked:
         name = next(iter(asked)).replace("model", "quality")
         raise OptionError(f"a network and {name} are given: give only one of them")
-    chosen = Options(factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh
-    from .functions.zero import put_on_zero  # imported here, as few call it
+    from .functions.zero import put_on_zero
 
     return put_on_zero(mesh, exact, grid, factor, offset)
 

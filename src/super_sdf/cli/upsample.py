@@ -81,8 +81,7 @@ def command(source: str, target: str, **given: Any) -> None:
             how["save_field"] = given["save_field"]
             done = convert(source, target, network, options, force=force, **how)
         else:
-            from ..labels.files import check_options, convert_labels
-            from ..labels.names import read_names
+            from ..labels.files import check_options, convert_labels, read_names
 
             check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
             how["names"] = read_names(given["names"]) if given["names"] else None

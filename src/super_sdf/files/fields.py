@@ -139,14 +139,6 @@ def check_field_target(path: str | Path, *, force: bool = False) -> Path:
     return check_free(path, force=force)
 
 
-def check_field_fits(path: Path, shape: tuple[int, int, int]) -> None:
-    """Raise OutOfMemoryError if the fine lattice must be held for a file, and does not fit."""
-    if path.suffix.lower() == ".vti":
-        size = " x ".join(map(str, shape))
-        way_out = "write .npy, which is written plane by plane, or .npz, which is sparse"
-        check_fits(4 * prod(shape), f"{path}, {size} values,", way_out)
-
-
 @dataclass
 class FieldFile:
     """A file of a field that appears when all is done; ``report`` is what was written, for JSON."""
@@ -154,6 +146,14 @@ class FieldFile:
     path: Path
     part: Path
     report: dict[str, Any] = field(default_factory=dict)
+
+    def check_fits(self, shape: tuple[int, int, int], factor: int) -> None:
+        """Raise OutOfMemoryError if the fine lattice must be held, and does not fit."""
+        if self.path.suffix.lower() == ".vti":
+            nodes = lattice_shape(shape, factor)
+            way_out = "write .npy, which is written plane by plane, or .npz, which is sparse"
+            size = " x ".join(map(str, nodes))
+            check_fits(4 * prod(nodes), f"{self.path}, {size} values,", way_out)
 
     def write(self, field: FineField) -> None:
         """Write the field; errors name the file."""
@@ -199,8 +199,8 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
     path = check_field_target(path, force=force)
-    check_field_fits(path, lattice_shape(field.placed.shape, field.factor))
     with saving_field(path, force=force) as file:
+        file.check_fits(field.placed.shape, field.factor)
         file.write(field)
 
 

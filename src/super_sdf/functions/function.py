@@ -154,8 +154,7 @@ def sampled(
     if grid is not None or function is None:
         if bounds is not None or spacing is not None:
             raise OptionError("bounds and spacing are for a function without a grid: give that")
-        check_grid(grid)
-        return cast(SdfGrid, grid)
+        return check_grid(grid)
     if bounds is None or spacing is None:
         raise OptionError("a function needs bounds and spacing, or a grid of its samples")
     reach = REACH * max(check_spacing(spacing)) + abs(offset)
