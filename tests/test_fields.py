@@ -113,21 +113,6 @@ def test_the_examples_of_the_docs_run(capsys):
     assert Path("part-sharp.ply").read_bytes() == Path("want.ply").read_bytes()
 
 
-def test_the_keys_are_as_documented():
-    write_field(upsample(plane(), trilinear, 4), "field.npz")
-    data = np.load("field.npz")
-    text = (Path(__file__).parent.parent / "docs" / "reference" / "files.md").read_text()
-    table = text[text.index("| Key |") : text.index("Distances are float64")]
-    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
-    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(data.files)
-    samples = data["origin"] + data["spacing"] * data["sample_voxels"]
-    assert np.abs(data["sample_distances"] - to_plane(samples)).max() < 1e-6
-    assert tuple(data["shape"]) == (12, 11, 10) and int(data["version"]) == 1
-    assert data["leaves"] and float(data["offset"]) == 0
-    border = data["origin"] + data["spacing"] * data["border_inside"]
-    assert len(border) and (to_plane(border) < 0).all()
-
-
 @pytest.fixture(scope="module")
 def good(tmp_path_factory) -> dict[str, np.ndarray]:
     """Return the arrays of a field's file."""

@@ -40,19 +40,11 @@ VERSION = 1
 CHUNK = 1 << 20  # values at a time
 # Which kinds of numbers each array has, and its shape, where None is any length.
 ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
-    "version": ("iu", ()),
-    "shape": ("iu", (3,)),
-    "factor": ("iu", ()),
-    "spacing": ("f", (3,)),
-    "origin": ("f", (3,)),
-    "direction": ("f", (3, 3)),
-    "offset": ("f", ()),
-    "leaves": ("b", ()),
-    "values": ("f", (None, None, None, None)),
-    "voxels": ("i", (None, 3)),
-    "sample_voxels": ("i", (None, 3)),
-    "sample_distances": ("f", (None,)),
-    "border_inside": ("i", (None, 3)),
+    **dict.fromkeys(("version", "factor"), ("iu", ())),
+    **dict.fromkeys(("spacing", "origin"), ("f", (3,))),
+    **dict.fromkeys(("voxels", "sample_voxels", "border_inside"), ("i", (None, 3))),
+    **{"shape": ("iu", (3,)), "direction": ("f", (3, 3)), "offset": ("f", ()), "leaves": ("b", ())},
+    **{"values": ("f", (None,) * 4), "sample_distances": ("f", (None,))},
 }
 
 
@@ -197,8 +189,7 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     Raises
     ------
     OptionError
-        If the suffix is unknown, or the field was made without its grid; if voxels are too small
-        or too large for OpenVDB.
+        If the suffix is unknown, or voxels are too small or too large for OpenVDB.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; if the field is one from
         a file and the format is not .npz: others take the coarse samples.
@@ -240,12 +231,9 @@ def read_field(path: str | Path) -> FineField:
 
     Raises
     ------
-    FileError
-        If the file is missing, damaged, truncated, or holds something else.
-    OutOfMemoryError
-        If the field does not fit in memory.
-    OptionError
-        If the suffix is not .npz.
+    FileError, OutOfMemoryError, OptionError
+        If the file is missing, damaged, or holds something else; if the field does not fit in
+        memory; if the suffix is not .npz.
     """
     path = check_path(path, "path")
     if path.suffix.lower() != ".npz":
