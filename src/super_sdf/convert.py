@@ -17,12 +17,12 @@ from .files.meshes import check_target, write_mesh
 from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
-from .options import MASK, SCALED, SHARP, Options
 from .pipeline import mesh_grid
 from .progress import Progress, Stopwatch, part_of, share_of
 
 if TYPE_CHECKING:
     from .network.decoder import Decoder
+    from .options import Options
     from .simplify.simplify import Simplified
     from .surface.mesh import Mesh
 
@@ -130,7 +130,7 @@ def convert(
     is_open = made.open_edges > 0
     warnings = find_warnings(grid, options.offset, made.counts, is_open=is_open)
     notes = [*lattice.notes, *off]
-    if options.mesher == SHARP and not lattice.field.has_exact:
+    if options.mesher == "sharp" and not lattice.field.has_exact:
         why = f"{lattice.field.kind} values show no edges"
         notes.append(f"{why}: the mesh is that of marching cubes")
     sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "tiles": made.tiles}
@@ -186,7 +186,10 @@ def find_warnings(
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if grid.field.kind in (MASK, SCALED):  # only distances can be noisy, or contradict each other
+    if grid.field.kind in (
+        "mask",
+        "scaled",
+    ):  # only distances can be noisy, or contradict each other
         return warnings
     if counts["noisy_voxels"]:
         share = 100 * counts["noisy_voxels"] / counts["band_voxels"]

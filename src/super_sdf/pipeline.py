@@ -20,12 +20,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
-from .arrays import CENTRE
 from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
-from .options import OPTIONS, MesherName, Options
+from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
@@ -34,7 +33,7 @@ from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
 from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
-from .surface.extract import choose_mesher, extract
+from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
 from .threads import in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
@@ -103,7 +102,7 @@ def refine_band(
         own_ijk,
         blocks[:, :-1],
         parts,
-        spheres=SampleSpheres(band.shape, band.voxel_ijk[exact], patches[exact, CENTRE].copy()),
+        spheres=SampleSpheres.of(band.shape, band.voxel_ijk[exact], patches[exact]),
         leaves=band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
         counts={
@@ -206,8 +205,9 @@ def extract_mesh(
     grid = field.placed if grid is None else grid
     check_grid(grid)
     samples = field.spheres
-    chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
-    cap = OPTIONS["cap"].check(cap) and field.grid is not None
+    asked = Options(mesher=mesher, cap=cap)  # checks them
+    chosen = asked.mesher_for(exact=samples is not None and len(samples.distance) > 0)
+    cap = asked.cap and field.grid is not None
     check_can_close(grid, cap=cap)
     mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
     if function is None:
@@ -352,7 +352,7 @@ def mesh_grid(
     check_can_close(grid, cap=chosen.cap)
     steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
-    mesher = choose_mesher(chosen.mesher, exact=lattice.field.has_exact)
+    mesher = chosen.mesher_for(exact=lattice.field.has_exact)
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     threads, shape = useful_threads(decoder.threads), lattice.shape
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)

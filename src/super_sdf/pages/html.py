@@ -22,12 +22,12 @@ from ..check import check
 from ..convert import convert
 from ..files.formats import is_grid
 from ..files.output import replacing
-from ..options import Options
 from ..truth.mesh_files import read_mesh
 from .items import Entry, Item, entry_of_report, item_of_files
 
 if TYPE_CHECKING:
     from ..network.decoder import Decoder
+    from ..options import Options
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")

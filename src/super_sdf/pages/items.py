@@ -19,7 +19,7 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,9 +27,11 @@ from ..check.check import FULL, Certificate, check_mesh, read_for_check
 from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
 from ..grid.sdf_grid import cubic_grid
-from ..options import Options
 from ..surface.extract import coarse_surface
 from ..surface.mesh import Mesh
+
+if TYPE_CHECKING:
+    from ..options import Options
 
 MOST_TRIANGLES = 500_000  # of a mesh in a page: 3 to 5 MB
 STEPS = 65535  # along the longest side of the box

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import CORNERS, IntArray, Vectors
 from ..grid.sdf_grid import SdfGrid, with_fields
-from ..options import AUTO, MARCHING, OPTIONS, SHARP, MesherName
 from ..refine.band import neighbour_table, rescale
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, share_parts
@@ -18,24 +17,17 @@ from . import marching
 from .cap import close
 from .mesh import Mesh, vertex_type
 
+if TYPE_CHECKING:
+    from ..options import MesherName
+
 TEMPORARIES = 16  # numbers per vertex in the computation of its position
 KEYS_PER_NODE = 16  # its three edges, and the features of the cell above it
 FIRST_FEATURE = 3
 
 
-def choose_mesher(name: Any, *, exact: bool) -> MesherName:
-    """Return the mesher with a name; by itself ``sharp`` if samples are exact distances.
-
-    Without such samples it finds no edges, and its mesh is that of marching cubes.
-    """
-    automatic: MesherName = SHARP if exact else MARCHING
-    chosen = OPTIONS["mesher"].check(name)
-    return automatic if chosen == AUTO else chosen
-
-
 def reach_in_voxels(mesher: MesherName, factor: int) -> int:
     """Return how many voxels to every side a vertex and its triangles depend on."""
-    if mesher == MARCHING:
+    if mesher == "marching":
         return 1
     from .sharp.features import REACH_IN_CELLS, REACH_IN_VOXELS
 
@@ -64,7 +56,7 @@ def extract(
         The field's samples: it is from ``cubic_grid``. Mirrored axes turn triangles inward, so
         these are turned over.
     mesher : str
-        From ``choose_mesher``.
+        "marching" or "sharp".
     cap : bool
         Close a surface that leaves the whole grid.
     first, shape : three ints
@@ -92,7 +84,7 @@ def extract(
     field = close(field, cap=cap, border=border)
     crossings = marching.find_crossings(field, threads)
     features = None
-    if mesher == SHARP and field.spheres is not None and len(field.spheres.distance):
+    if mesher == "sharp" and field.spheres is not None and len(field.spheres.distance):
         from .sharp.features import find_features
 
         features = find_features(field, crossings, border, rounded, threads)
@@ -143,4 +135,4 @@ def coarse_surface(grid: SdfGrid, offset: float = 0.0) -> Mesh:
     parts = share_parts(neighbour_table(cell_ijk, some.shape))
     field = FineField(some.shape, 1, cell_ijk, blocks, parts)
     middle = tuple(grid.to_world([0.5, 0.5, 0.5]).tolist())
-    return extract(field, with_fields(grid, origin=middle), mesher=MARCHING, cap=False)[0]
+    return extract(field, with_fields(grid, origin=middle), mesher="marching", cap=False)[0]
