@@ -10,7 +10,7 @@ from super_sdf import make_grid, reconstruct, reconstruct_labels
 from super_sdf.check.check import check_mesh
 from super_sdf.grid.sdf_grid import volume_of_samples
 from super_sdf.labels.volumes import keep_volumes
-from super_sdf.truth.mesh_files import read_mesh
+from super_sdf.truth.solid import read_mesh
 
 SPACING = (1.5, 1.5, 4.0)
 
