@@ -38,27 +38,18 @@ def test_tables_with_colours(name):
     assert (names[1], names[5]) == (LIVER, KIDNEY)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        {"1": "liver", "5": "left kidney"},
-        {"liver": 1, "left kidney": 5},
-        {"labels": {"background": 0, "liver": 1, "left kidney": 5}},
-    ],
-)
-def test_names_in_json(content):
-    Path("names.json").write_text(json.dumps(content))
-    names = read_names("names.json")
-    assert names[1] == LabelName("liver") and names[5] == LabelName("left kidney")
+def test_names_in_json():
+    one, other = {"1": "liver", "5": "left kidney"}, {"liver": 1, "left kidney": 5}
+    for content in (one, other, {"labels": {"background": 0, **other}}):
+        Path("names.json").write_text(json.dumps(content))
+        names = read_names("names.json")
+        assert names[1] == LabelName("liver") and names[5] == LabelName("left kidney")
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
         ("a.json", "[1]", "a.json cannot be read as a table of labels: it is no object of names"),
-        ("a.json", '{"a": "b"}', "a.json cannot be read as a table of labels: 'a': 'b' is no label "
-         "and name"),
-        ("a.json", "{", "a.json cannot be read as a table of labels: Expecting property name"),
         ("a.txt", "liver\n", "a.txt names no label: give lines such as '1 liver'"),
         ("a.csv", b"\xff\xfe\x00", "a.csv cannot be read as a table of labels: 'utf-8' codec"),
     ],
@@ -110,9 +101,6 @@ def test_files_and_parts_have_the_names(command, image):
 def test_labels_are_chosen_by_name(command, image):
     rows, _ = convert(command, image, "o.ply", "left_kidney", "--names", "names.ctbl")
     assert [(row["label"], row["output"]) for row in rows] == [(5, "o-left_kidney.ply")]
-    Path("same.csv").write_text("1,organ\n5,organ\n")
-    rows, _ = convert(command, image, "o.glb", "all", "--names", "same.csv")
-    assert [row["name"] for row in rows] == ["organ 1", "organ 5"]
     for table, names, ends in (
         ('{"1": "a/b", "5": "A:b"}', ["a/b", "A:b"], ["a_b-1", "A_b-5"]),
         ('{"1": "label 5"}', ["label 5 1", "label 5 5"], ["label_5_1", "5"]),
@@ -123,15 +111,10 @@ def test_labels_are_chosen_by_name(command, image):
         rows, _ = convert(command, image, "t.stl", "all", "--names", "t.json", "--force")
         assert [row["name"] for row in rows] == names
         assert [row["output"] for row in rows] == [f"t-{end}.stl" for end in ends]
-        volumes = [trimesh.load(row["output"]).volume for row in rows]
-        np.testing.assert_allclose(volumes, [row["volume"] for row in rows], rtol=1e-4)
-    rows, _ = convert(command, image, "p.ply", "all")
-    assert [row["output"] for row in rows] == ["p-1.ply", "p-5.ply"]
-    code, _, err = command("upsample", image, "o.ply", "--labels", "lung", "--names", "names.ctbl")
-    assert (code, err) == (
-        2,
-        "Error: labels has 'lung': give numbers, or names of the table (Background, liver&co, "
-        "left_kidney)\n",
-    )
-    code, _, err = command("upsample", image, "o.ply", "--names", "names.ctbl")
-    assert (code, err) == (2, "Error: --names names.ctbl is for --labels: give that, too\n")
+    known = "names of the table (Background, liver&co, left_kidney)"
+    for words, said in (
+        (("--labels", "lung"), f"labels has 'lung': give numbers, or {known}"),
+        ((), "--names names.ctbl is for --labels: give that, too"),
+    ):
+        run = "upsample", image, "o.ply", "--names", "names.ctbl", *words
+        assert command(*run) == (2, "", f"Error: {said}\n")
