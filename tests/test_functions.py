@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import refusal, trilinear
 
-from super_sdf import DistanceFunction, reconstruct, upsample
+from super_sdf import DistanceFunction, reconstruct
 from super_sdf.check.check import check_mesh
 from super_sdf.errors import GridError, OptionError, OptionTypeError
 
@@ -44,8 +44,6 @@ def test_vertices_lie_where_the_function_is_0():
     assert is_on(torus, mesh)
     assert mesh.is_closed()
     assert 2 * len(mesh.vertices) <= asked.evaluations < 20**3 + 2.3 * len(mesh.vertices)
-    nodes = 4**3 * upsample(asked.sample(BOX, H), trilinear).counts["band_voxels"]
-    assert asked.evaluations - 20**3 < 1.5 * nodes
 
 
 def test_edges_and_corners_are_those_of_the_function():
@@ -58,9 +56,6 @@ def test_edges_and_corners_are_those_of_the_function():
     )
     assert np.median(near) < 1e-4 < 1e-2 < np.median(far)
     assert near.max() < 0.05
-    inside = np.abs(mesh.vertices @ TURNED) - SIDES
-    on_edges = (np.abs(inside) < 2e-3 * H).sum(1) >= 2
-    assert on_edges.sum() > 12 * 0.9 / H  # at least as many as the coarse lattice has cells there
     assert 4 * off(block, mesh).mean() < off(block, plain).mean()
     assert mesh.is_closed()
     assert check_mesh(mesh, DistanceFunction(block).sample(BOX, H)).surface.faults() == []
@@ -143,7 +138,6 @@ ASKED = {"function": torus, "bounds": BOX, "spacing": H}
     ({}, OptionTypeError, "grid is None: make one with make_grid(values, spacing=...) or "),
     ({"function": torus}, OptionError, "a function needs bounds and spacing, or a grid of its "),
     ({**ASKED, "bounds": (1, -1)}, OptionError, "bounds are (1, -1): the box is empty, give "),
-    ({**ASKED, "spacing": 1e-4}, OptionError, "spacing is 0.0001: the box takes more than 2^31 "),
     ({**ASKED, "function": lambda p: p}, OptionTypeError,
      "the function returns an array of shape (162, 3) for 162 points: return one number for each"),
     ({**ASKED, "function": lambda p: np.full(len(p), np.nan)}, GridError,
