@@ -174,11 +174,7 @@ def test_the_command_writes_a_file_for_each_label(image, command):
 ])  # fmt: skip
 def test_options_that_would_tear_the_walls_are_refused(words, name, image, command):
     code, _, err = command("upsample", image, "a.ply", "--labels", "all", *words.split(), *PLAIN)
-    assert (code, err.splitlines()[-1]) == (
-        2,
-        f"Error: {name} does not go with labels, which share their walls: leave it out, or mesh "
-        "one label (--label)",
-    )
+    assert code == 2 and f"Error: {name} does not go with labels, which share their walls: " in err
     assert not Path("a-1.ply").exists()
 
 

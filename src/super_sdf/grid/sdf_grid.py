@@ -304,13 +304,14 @@ def make_grid(
     )
 
 
-def check_grid(grid: Any) -> None:
-    """Raise OptionTypeError if ``grid`` is not an ``SdfGrid``, but an array or a path, say."""
+def check_grid(grid: Any) -> SdfGrid:
+    """Return a grid; OptionTypeError if it is no ``SdfGrid``, but an array or a path, say."""
     if not isinstance(grid, SdfGrid):
         what = f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else seen(grid)
         raise OptionTypeError(
             f"grid is {what}: make one with make_grid(values, spacing=...) or read_grid(path)"
         )
+    return grid
 
 
 def _checked(samples: SampleArray) -> Census:

@@ -15,17 +15,19 @@ from datetime import datetime
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..check import check
 from ..convert import convert
 from ..files.formats import is_grid
 from ..files.output import replacing
-from ..network.decoder import Decoder
-from ..options import Options
 from ..truth.mesh_files import read_mesh
 from .items import Entry, Item, entry_of_report, item_of_files
+
+if TYPE_CHECKING:
+    from ..network.decoder import Decoder
+    from ..options import Options
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")

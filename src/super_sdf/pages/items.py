@@ -19,22 +19,19 @@ from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..arrays import CORNERS
 from ..check.check import FULL, Certificate, check_mesh, read_for_check
 from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
-from ..grid.samples import as_triple
-from ..grid.sdf_grid import SdfGrid, cubic_grid, with_fields
-from ..options import MARCHING, Options
-from ..refine.band import neighbour_table, rescale
-from ..refine.field import FineField
-from ..refine.nodes import share_parts
-from ..surface.extract import extract
+from ..grid.sdf_grid import cubic_grid
+from ..surface.extract import coarse_surface
 from ..surface.mesh import Mesh
+
+if TYPE_CHECKING:
+    from ..options import Options
 
 MOST_TRIANGLES = 500_000  # of a mesh in a page: 3 to 5 MB
 STEPS = 65535  # along the longest side of the box
@@ -125,21 +122,6 @@ def packed_mesh(title: str, mesh: Mesh, certificate: Certificate | None = None) 
     counts = {"vertices": len(vertices), "triangles": len(mesh.faces), "residuals": shaded}
     placed = {"low": low.tolist(), "step": step, "data": base64.b64encode(data).decode("ascii")}
     return {"caption": caption, **counts, **placed}
-
-
-def coarse_surface(grid: SdfGrid, offset: float = 0.0) -> Mesh:
-    """Return marching cubes of a grid's samples: every cell is a block of factor 1."""
-    values = rescale(grid, offset)
-    some = every = values <= 0
-    for axis in range(3):
-        low, high = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)
-        some, every = some[low] | some[high], every[low] & every[high]
-    cell_ijk = np.argwhere(some & ~every).astype(np.int32)
-    blocks = np.stack([values[tuple((cell_ijk + corner).T)] for corner in CORNERS])
-    parts = share_parts(neighbour_table(cell_ijk, some.shape))
-    field = FineField(some.shape, 1, cell_ijk, blocks, parts)
-    middle = as_triple(grid.to_world([0.5, 0.5, 0.5]), "middle of the first cell")
-    return extract(field, with_fields(grid, origin=middle), mesher=MARCHING, cap=False)[0]
 
 
 def items_folder(page: Path) -> Path:

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from ..arrays import FloatArray
 from ..errors import MeshError, OptionError, seen
 from ..grid.sdf_grid import SdfGrid
 from ..surface.mesh import Mesh
@@ -106,7 +105,7 @@ def sample_solid(
 
 def sample_grid(
     solid: Solid, layout: Layout, *, band: float = np.inf, progress: Progress | None = None
-) -> FloatArray:
+) -> NDArray[np.float32]:
     """Return the signed distance at every sample of a grid, (nx, ny, nz) float32, negative inside.
 
     ``band`` is the distance in voxels up to which values are exact (to float32); they are clamped
@@ -149,7 +148,7 @@ def grid_points(layout: Layout) -> Points:
 
 def _sample_cubes(
     solid: Solid, corners: NDArray[np.int64], layout: Layout, limit: float
-) -> FloatArray:
+) -> NDArray[np.float32]:
     """Return the signed distances in cubes of samples, (c, 8, 8, 8), clamped at the limit.
 
     Two neighbours that are both more than half a spacing from the surface are on the same side of
