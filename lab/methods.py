@@ -19,7 +19,7 @@ from super_sdf.arrays import FloatArray
 from super_sdf.errors import NoSurfaceError, OptionError
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.decoder import Decoder, adapt
-from super_sdf.options import DEFAULT_MESHER, MARCHING, SHARP
+from super_sdf.options import AUTO, MARCHING, SHARP
 from super_sdf.pipeline import extract_mesh, reconstruct, refine_band
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField, SampleSpheres
@@ -73,7 +73,7 @@ def bound_surface(case: Case, network: Decoder, *, mesher: str = MARCHING) -> Su
     return Surface(dense(case.truth.copy(), case.fine, case.low))
 
 
-def our_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -> Surface:
+def our_surface(case: Case, network: Decoder, *, mesher: str = AUTO) -> Surface:
     """Mesh the coarse grid with super-sdf, capped where the surface leaves the grid.
 
     Without a surface the mesh is empty.

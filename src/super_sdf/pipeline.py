@@ -14,15 +14,13 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
-from .arrays import CENTRE
 from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
-from .functions.function import Function, as_function, sampled
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
@@ -36,10 +34,13 @@ from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
 from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
-from .surface.extract import choose_mesher, extract
+from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
 from .threads import in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
+
+if TYPE_CHECKING:
+    from .functions.function import Function
 
 
 def refine(
@@ -106,7 +107,7 @@ def refine_band(
         parts,
         grid,
         band.offset,
-        SampleSpheres(grid.shape, band.voxel_ijk[band.exact], patches[band.exact, CENTRE]),
+        SampleSpheres.of(grid.shape, band.voxel_ijk[band.exact], patches[band.exact]),
         band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
         counts={
@@ -165,7 +166,8 @@ def upsample(
     check_grid(grid)
     options.check_network(network)
     options.check_progress(progress)
-    factor, offset = options.check_factor(factor), options.check_distance(offset)
+    asked = Options(factor, offset=offset)  # checks them
+    factor, offset = asked.factor, asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
@@ -180,7 +182,7 @@ def extract_mesh(
     field: FineField,
     grid: SdfGrid | None = None,
     *,
-    mesher: options.MesherName = options.DEFAULT_MESHER,
+    mesher: options.MesherName = options.AUTO,
     cap: bool = True,
     function: Function | None = None,
 ) -> Mesh:
@@ -208,13 +210,15 @@ def extract_mesh(
     grid = field.placed if grid is None else grid
     check_grid(grid)
     samples = field.spheres
-    chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
-    cap = options.check_cap(cap) and field.grid is not None
+    asked = Options(mesher=mesher, cap=cap)  # checks them
+    chosen = asked.mesher_for(exact=samples is not None and len(samples.distance) > 0)
+    cap = asked.cap and field.grid is not None
     check_can_close(grid, cap=cap)
     mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
     if function is None:
         return mesh
-    from .functions.zero import put_on_zero  # imported here, as few call it
+    from .functions.function import as_function
+    from .functions.zero import put_on_zero
 
     return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)
 
@@ -230,7 +234,7 @@ def reconstruct(
     quality: options.Quality | str | Path | None = None,
     offset: float = 0.0,
     cap: bool = True,
-    mesher: options.MesherName = options.DEFAULT_MESHER,
+    mesher: options.MesherName = options.AUTO,
     max_memory: int | None = None,
     progress: Progress | None = None,
     device: options.Device | None = None,
@@ -279,8 +283,14 @@ def reconstruct(
     OutOfMemoryError
         If not even small tiles of the grid fit in the memory.
     """
-    exact = None if function is None else as_function(function)
-    grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
+    chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
+    exact = None
+    if function is not None or bounds is not None or spacing is not None:
+        from .functions.function import as_function, sampled  # imported here, as few need it
+
+        exact = None if function is None else as_function(function)
+        grid = sampled(grid, exact, bounds, spacing, chosen.offset)
+    grid = check_grid(grid)
     where = {"model": quality, "device": device, "precision": precision, "threads": threads}
     asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
     if network is None:
@@ -288,11 +298,10 @@ def reconstruct(
     elif asked:
         name = next(iter(asked)).replace("model", "quality")
         raise OptionError(f"a network and {name} are given: give only one of them")
-    chosen = Options(factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh
-    from .functions.zero import put_on_zero  # imported here, as few call it
+    from .functions.zero import put_on_zero
 
     return put_on_zero(mesh, exact, grid, factor, offset)
 
@@ -348,7 +357,7 @@ def mesh_grid(
     check_can_close(grid, cap=chosen.cap)
     steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
-    mesher = choose_mesher(chosen.mesher, exact=lattice.field.has_exact)
+    mesher = chosen.mesher_for(exact=lattice.field.has_exact)
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     threads, shape = useful_threads(decoder.threads), lattice.shape
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)

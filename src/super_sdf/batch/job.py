@@ -16,9 +16,9 @@ from ..files.meshes import format_of
 from ..files.output import naming
 from ..files.regular import check_grid_file
 from ..labels.files import convert_labels
-from ..labels.names import Names
+from ..labels.files import Names
 from ..network.network import Network, load_network
-from ..options import AUTO, AUTO_PRECISION, Device, Options, Precision
+from ..options import AUTO, Device, Options, Precision
 from .record import Row, fingerprint
 
 load_once = lru_cache(maxsize=1)(load_network)
@@ -30,7 +30,7 @@ class Settings:
 
     folder: Path  # of the outputs
     model: str = "base"
-    precision: Precision = AUTO_PRECISION
+    precision: Precision = AUTO
     device: Device = AUTO
     threads: int = 0  # of each worker process; 0: chosen by the number of cores
     workers: int = 0

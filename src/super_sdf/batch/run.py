@@ -114,8 +114,7 @@ class Batch:
             count = 1
         count = count_workers(settings.workers, settings.device, count, memory)
         if count > 1 and not settings.cluster:  # before the workers fill the memory
-            share = allot_each(count, threads, memory)
-            threads, memory = share.threads, share.memory
+            threads, memory = allot_each(count, threads, memory)
         work = partial(convert_job, settings=settings, stage=stage, threads=threads)
 
         def take() -> Job | None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..arrays import BoolArray, IntArray, Triple
 from ..errors import FileError, OptionError
-from ..options import Unit, check_path, check_space, check_unit
+from ..options import OPTIONS, Unit, check_path
 from ..surface.mesh import Mesh, check_mesh
 from . import mesh_writers as writers
 from .mesh_writers import Parts, World
@@ -109,7 +109,7 @@ def write_mesh(
     """
     check_mesh(mesh)
     path = check_path(path, "path")
-    world = World(check_unit(unit), check_space(space))
+    world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     check_target(path, force=force, unit=world.unit)
 
     def tell(complete: Mapping[Path, Path]) -> None:

@@ -15,16 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import pyvista
 
+from .. import SdfGrid, grid_from_image, reconstruct
 from ..errors import FileError, check_modules, how_to_install
-from ..files.grids import grid_from_image
-from ..grid.sdf_grid import SdfGrid
-from ..network.decoder import Decoder
-from ..options import DEFAULT_MESHER, MesherName, Options, Quality, Values
-from ..pipeline import reconstruct
-from ..progress import Progress
+from ..options import AUTO, MesherName, Options, Quality, Values
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+    from ..network.decoder import Decoder
+    from ..progress import Progress
 
 if not hasattr(pyvista, "register_dataset_accessor"):
     raise FileError(
@@ -74,7 +73,7 @@ class ImageAccessor:
         residuals: bool = False,
         offset: float = 0.0,
         cap: bool = True,
-        mesher: MesherName = DEFAULT_MESHER,
+        mesher: MesherName = AUTO,
         max_memory: int | None = None,
         progress: Progress | None = None,
         **values: Unpack[Values],

@@ -10,25 +10,30 @@ import base64
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from .. import __version__
 from ..check import check
 from ..convert import convert
 from ..files.formats import is_grid
 from ..files.output import replacing
-from ..network.decoder import Decoder
-from ..options import Options
-from ..truth.mesh_files import read_mesh
-from .items import Entry, Item, entry_of, entry_of_report, item_of_files, numbers
+from ..truth.solid import read_mesh
+from .items import Entry, Item, entry_of_report, item_of_files
+
+if TYPE_CHECKING:
+    from ..network.decoder import Decoder
+    from ..options import Options
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")
+COLOURS = ("touching", "pierced", "unknown", "apart", "full")
 GENERATOR = "super-sdf"
+EMPTY = {"lead": "", "alert": "", "summary": [], "notes": []}
 HEAD_BYTES = 4096  # of a page, in which its generator is looked for
 MARKUP = {ord(c): f"\\u{ord(c):04x}" for c in "<>&"}  # of JSON in which a tag could be read
 
@@ -38,34 +43,24 @@ def make_page(
 ) -> str:
     """Return a page of ``meshes``, packed and by the id of their entry.
 
-    ``facts`` are ``title``, ``lead`` (a sentence), ``alert`` (a sentence or ""), ``summary`` (rows
-    of label and text), ``notes`` and ``files``, entries. If ``beside``, the page may load scripts
-    from beside it, with the meshes that are not in it.
+    ``facts`` are ``title``, ``files``, which are entries, and some of ``EMPTY``. If ``beside``, the
+    page may load scripts from beside it, with the meshes that are not in it.
     """
 
     def hash_of(text: str) -> str:
-        """Return the hash by which a policy names an inline script or style."""
         digest = hashlib.sha256(text.encode("utf-8")).digest()
         return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
     def safe(value: Any) -> str:
-        """Return JSON in ASCII in which the characters of markup are escaped."""
         return json.dumps(value, ensure_ascii=True, allow_nan=False).translate(MARKUP)
 
     style = (HOME / "page.css").read_text("utf-8")
     scripts = [(HOME / name).read_text("utf-8") for name in SCRIPTS]
     own = " ".join(map(hash_of, scripts)) + (" 'self' file:" if beside else "")
-    known = {
-        "version": __version__,
-        "made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
-        "colours": {
-            "touching": check.TOUCHING,
-            "pierced": check.PIERCED,
-            "unknown": check.UNKNOWN,
-            "apart": check.NOT_TOUCHING,
-            "full": check.FULL,
-        },
-    }
+    values = check.TOUCHING, check.PIERCED, check.UNKNOWN, check.NOT_TOUCHING, check.FULL
+    colours = dict(zip(COLOURS, values))
+    made = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    known = {"version": __version__, "made": made, "colours": colours}
     blocks = [  # their names are ours, never a file's
         f'<script type="application/json" id="meshes-{name}">{safe(packed)}</script>'
         for name, packed in (meshes or {}).items()
@@ -75,7 +70,7 @@ def make_page(
         "img-src data:; base-uri 'none'; form-action 'none'",
         generator=GENERATOR,
         style=style,
-        facts=safe({**facts, **known}),
+        facts=safe({**EMPTY, **facts, **known}),
         meshes="\n".join(blocks),
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
     )
@@ -89,12 +84,9 @@ def write_page(text: str, path: Path, *, force: bool = False) -> None:
 
 def is_page(path: Path) -> bool:
     """Return whether a file is a page that super-sdf has written."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-    except OSError:
-        return False
-    return f'<meta name="generator" content="{GENERATOR}">'.encode() in head
+    with suppress(OSError), path.open("rb") as file:
+        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(HEAD_BYTES)
+    return False
 
 
 def page_of_conversion(
@@ -103,12 +95,7 @@ def page_of_conversion(
     made: Any = None,
     certificate: check.Certificate | None = None,
 ) -> str:
-    """Return the page of a conversion.
-
-    ``report`` is what ``upsample --json`` prints, with ``input`` and ``output``; these are read
-    unless what was ``made`` has ``mesh`` and ``grid``. The mesh is checked unless there is a
-    certificate already.
-    """
+    """Return the page of a conversion by what ``upsample --json`` says; see ``item_of_files``."""
     item = item_of_files(report["output"], report["input"], options, made, certificate)
     name = Path(report["output"]).name
     entry = entry_of_report(name, report, item)
@@ -119,11 +106,7 @@ def page_of_conversion(
 
 
 def viewed_page(sources: Sequence[str], load: Callable[[], Decoder], options: Options) -> str:
-    """Return the page of some mesh files and grid files; all that it shows is within it.
-
-    ``load`` returns the network, and is called if there is a grid; ``options`` say how that is
-    refined.
-    """
+    """Return the page of mesh files, and of grid files, for which ``load`` loads a network."""
     network = load() if any(map(is_grid, sources)) else None
     shown = []
     for source in sources:
@@ -133,28 +116,25 @@ def viewed_page(sources: Sequence[str], load: Callable[[], Decoder], options: Op
                 target = Path(folder, "mesh.ply")
                 done = convert(source, target, network, options)
                 item = item_of_files(target, source, options, done)
-            said = {"input": source, "asked": options.digest(), "seconds": done.seconds}
-            shown.append((entry_of_report(name, {**done.report(), **said}, item), item))
-            continue
-        mesh, item = read_mesh(source), Item()
-        item.show(name, mesh)
-        low, high = (numbers(corner(axis=0)) for corner in (mesh.vertices.min, mesh.vertices.max))
-        bounds = ["bounds", f"({low}) to ({high})"]
-        facts = [["mesh", source], ["vertices", f"{len(mesh.vertices):,}"], bounds]
-        line = f"{len(mesh.faces):,} triangles, {'closed' if mesh.is_closed() else 'open'}"
-        shown.append((entry_of(name, line=line, facts=facts, remarks=item.remarks), item))
+            report = {**done.report(), "input": source, "asked": options.digest()}
+            report["seconds"] = done.seconds
+        else:
+            mesh, item = read_mesh(source), Item()
+            item.show(name, mesh)
+            report = {"output": source, "vertices": len(mesh.vertices)}
+            report |= {"triangles": len(mesh.faces), "closed": mesh.is_closed()}
+            report["bounds"] = [mesh.vertices.min(0), mesh.vertices.max(0)]
+        shown.append((entry_of_report(name, report, item), item))
     title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
-    return _whole_page(title, shown, [])
+    return _whole_page(title, shown)
 
 
 def _whole_page(
-    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]]
+    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]] = ()
 ) -> str:
     """Return a page with the meshes of its entries; ``summary`` are rows of label and text."""
-    meshes = {str(number): item.meshes for number, (_, item) in enumerate(shown)}
-    entries = [
-        entry | {"id": str(number), "meshes": "page" if item.meshes else None}
-        for number, (entry, item) in enumerate(shown)
-    ]
-    facts = {"title": title, "lead": "", "alert": "", "notes": [], "files": entries}
-    return make_page({**facts, "summary": summary}, meshes)
+    for number, (entry, item) in enumerate(shown):
+        entry |= {"id": str(number), "meshes": "page" if item.meshes else None}
+    meshes = {entry["id"]: item.meshes for entry, item in shown}
+    facts = {"title": title, "summary": summary, "files": [entry for entry, _ in shown]}
+    return make_page(facts, meshes)

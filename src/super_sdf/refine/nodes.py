@@ -68,8 +68,7 @@ def nodes_of_part(factor: int) -> list[NDArray[np.intp]]:
 
 def part_sizes(factor: int) -> NDArray[np.int64]:
     """Return the number of nodes of each part, (27,)."""
-    sizes: NDArray[np.int64] = np.bincount(part_of_node(factor)[0], minlength=27)
-    return sizes
+    return np.array([len(nodes) for nodes in nodes_of_part(factor)])
 
 
 def seen_from(part: int, neighbour: int | np.integer[Any]) -> int:
@@ -86,7 +85,7 @@ class VoxelIndex:
 
     def _key_of(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the number of each voxel, (...,), in C order of the whole grid."""
-        i, j, k = np.moveaxis(voxel_ijk, -1, 0).astype(np.int64)
+        i, j, k = (voxel_ijk[..., axis].astype(np.int64) for axis in range(3))
         return (i * self.shape[1] + j) * self.shape[2] + k
 
     def find(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -229,14 +228,16 @@ def pin_to_skipped(
     isosurface has no hole there. The decoded voxels (D, 3) are the rows ``voxels`` of the band,
     with the samples ``patches`` (V, 27). Returned is how many nodes were changed.
     """
-    skipped = np.zeros(parts.table.shape, np.int8)  # sign of each neighbour, 0 of decoded ones
+    # the sign of each neighbour, 0 of decoded ones
+    skipped: NDArray[np.int8] = np.zeros(parts.table.shape, np.int8)
     inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
-    for place, step in enumerate(NEIGHBOURHOOD):
+    for place, step in enumerate(NEIGHBOURHOOD.tolist()):
         is_skipped = parts.table[place] < 0
-        for axis in np.flatnonzero(step):
-            is_skipped &= inner[axis][int(step[axis] > 0)]
-        rows = np.flatnonzero(is_skipped)
-        skipped[place][rows] = np.where(patches[voxels.take(rows), place] > 0, 1, -1)
+        for along, way in zip(inner, step):
+            if way:
+                is_skipped &= along[way > 0]
+        at = np.flatnonzero(is_skipped)
+        skipped[place, at] = np.where(patches[voxels.take(at), place] > 0, 1, -1)
     changed = 0
     for part, nodes in enumerate(nodes_of_part(factor)):
         sign = np.zeros(skipped.shape[1], np.int8)

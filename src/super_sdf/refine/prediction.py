@@ -10,6 +10,7 @@ out, so that the bits of a result do not depend on how the grid was cut.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +21,6 @@ from ..grid.derived import local_slopes
 from ..grid.field import Field
 from ..grid.samples import cropped, in_spacings
 from ..network.decoder import Adapter, decode
-from ..progress import ShareCallback
 from ..threads import chunks_of
 from .nodes import block_offsets
 from .survey import Band
@@ -44,7 +44,7 @@ def predict(
     network: Adapter,
     factor: int,
     threads: int = 1,
-    progress: ShareCallback | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> FloatArray:
     """Return the network's values in some voxels (D,), rows of a band, as blocks (Q, D + 1).
 

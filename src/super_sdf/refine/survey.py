@@ -17,7 +17,6 @@ from ..arrays import CENTRE, BoolArray, FloatArray, IntArray
 from ..errors import GridError, NoSurfaceError
 from ..grid.samples import let_go, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
-from ..options import MASK
 from ..threads import over_threads
 from .band import (
     HALF_BAND,
@@ -226,7 +225,7 @@ def _blocks(
             lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
         if grid.field.smooth is not None:  # no distances: they say nothing certain of the voxels
             decoded = np.ones(len(patches), bool)
-        elif grid.field.kind == MASK:
+        elif grid.field.kind == "mask":
             decoded = has_both_sides(patches)
         else:
             decoded = can_hold_surface(patches, lipschitz)

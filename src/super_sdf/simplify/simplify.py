@@ -8,12 +8,12 @@ The modules that do it are imported when they are needed: they need the extra ``
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from ..errors import OutOfMemoryError, check_modules
-from ..options import check_goal, check_max_memory
-from ..progress import ShareCallback
+from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import give_back, held_memory, in_words, memory_bound
 
@@ -63,7 +63,7 @@ def simplify_mesh(
     error: float | None = None,
     triangles: int | None = None,
     max_memory: int | None = None,
-    progress: ShareCallback | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Simplified:
     """Simplify a mesh within a distance, or to a number of triangles.
 
@@ -99,7 +99,7 @@ def simplify_mesh(
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
-    bound, count = memory_bound(check_max_memory(max_memory)), len(mesh.faces)
+    bound, count = memory_bound(OPTIONS["max_memory"].check(max_memory)), len(mesh.faces)
     need = count * BYTES_PER_TRIANGLE + (held_memory() or 0)
     if bound is not None and need > bound:
         raise OutOfMemoryError(
