@@ -339,11 +339,11 @@ def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Certificat
     values = band.patches[:, CENTRE]
     # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
     trusted = band.exact & (values > values.min()) & (values < values.max())
-    sampled = np.ones(len(values), bool) if band.sampled is None else band.sampled
-    rows = np.flatnonzero(trusted & sampled)  # what is interpolated promises nothing
+    rows = np.flatnonzero(trusted & band.sampled)  # what is interpolated promises nothing
+    sampled = int(np.count_nonzero(band.sampled))
     # if none is exact, too many are no distances for any to be taken for one
-    noisy = band.count_noisy() if len(rows) else int(np.count_nonzero(sampled))
-    cut_off = int(np.count_nonzero(sampled)) - len(rows) - noisy
+    noisy = band.count_noisy() if len(rows) else sampled
+    cut_off = sampled - len(rows) - noisy
     ijk, values = band.voxel_ijk[rows], values[rows] * np.float32(0.5)
     points, solid = grid.to_world(ijk), Solid(mesh)
     found, faces, feet = solid.nearest(points)
