@@ -10,21 +10,35 @@ import base64
 import hashlib
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
 from typing import Any
+from urllib.parse import quote
 
 from .. import __version__
 from ..check import check
 from ..convert import convert
+from ..errors import SuperSdfError
 from ..files.formats import is_grid
 from ..files.output import replacing
 from ..network.decoder import Decoder
 from ..options import Options
 from ..truth.mesh_files import read_mesh
-from .items import Entry, Item, entry_of, entry_of_report, item_of_files, numbers
+from .items import (
+    Entry,
+    Item,
+    entry_of,
+    entry_of_report,
+    find_item,
+    item_of_files,
+    item_path,
+    items_folder,
+    keep_item,
+    numbers,
+)
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")
@@ -145,6 +159,59 @@ def viewed_page(sources: Sequence[str], load: Callable[[], Decoder], options: Op
         shown.append((entry_of(name, line=line, facts=facts, remarks=item.remarks), item))
     title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
     return _whole_page(title, shown, [])
+
+
+def write_batch_page(
+    path: Path,
+    facts: Mapping[str, Any],
+    rows: Mapping[str, Mapping[str, Any]],
+    draw: Callable[[str], Item | None],
+    interrupted: str = "",
+    *,
+    force: bool = False,
+) -> None:
+    """Write the page of a batch, files that failed first; their meshes are beside it.
+
+    ``facts`` are title and lead; ``rows`` are of its report, by their output, empty while they are
+    not finished. ``draw`` makes an item that is missing; ``interrupted`` says what ended the batch
+    before its time.
+    """
+    folder, entries = items_folder(path), list[Entry]()
+    for name, row in rows.items():
+        if not row:
+            entries.append(entry_of(name, "waiting", line="not finished"))
+        elif row["status"] != "ok":
+            of = [["grid", row["in"]], ["mesh", name]]
+            entries.append(entry_of(name, "failed", reason=row["reason"], facts=of))
+        else:
+            digest, file = row["output"]["sha256"], item_path(folder, name)
+            item = find_item(folder, name, digest)
+            if item is None:
+                with suppress(SuperSdfError):  # then it is not shown
+                    if made := draw(name):
+                        keep_item(made, folder, name, digest)
+                item = find_item(folder, name, digest)
+            report = {**row, "input": row["in"], "output": name}
+            entry = entry_of_report(name, report, item) | {"id": file.stem}
+            if item and item.size:
+                entry["meshes"] = quote(f"{folder.name}/{file.name}")
+            entries.append(entry)
+    kinds = {"failed": 0, "waiting": 1, "ok": 3}
+    entries.sort(
+        key=lambda e: (2 if e["faults"] or e["warnings"] else kinds[e["status"]], e["name"])
+    )
+    counts = {
+        "files": len(entries),
+        "failed": sum(entry["status"] == "failed" for entry in entries),
+        "not finished": sum(entry["status"] == "waiting" for entry in entries),
+        "with faults": sum(bool(entry["faults"]) for entry in entries),
+        "with warnings": sum(bool(entry["warnings"]) for entry in entries),
+    }
+    summary = [[k, f"{count:,}"] for k, count in counts.items() if count or k == "files"]
+    left, why = counts["not finished"], f", {interrupted}" if interrupted else ""
+    alert = f"Incomplete{why}: {left} not finished; run it again to go on" if left or why else ""
+    said = {**facts, "alert": alert, "notes": [], "summary": summary, "files": entries}
+    write_page(make_page(said, beside=True), path, force=force or is_page(path))
 
 
 def _whole_page(

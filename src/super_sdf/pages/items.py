@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -129,21 +128,6 @@ def find_item(folder: Path, target: str, sha256: str) -> Item | None:
     except (OSError, ValueError, TypeError):  # missing, or damaged
         return None
     return item if item.made_of == sha256 else None
-
-
-def read_meshes(path: Path) -> list[dict[str, Any]]:
-    """Return the packed meshes from the file of an item that was just written or read."""
-    _, call = path.read_bytes().split(b"\n", 1)
-    meshes: list[dict[str, Any]] = json.loads(call[call.index(b"[") : call.rindex(b"]") + 1])
-    return meshes
-
-
-def remove_items(folder: Path, targets: Iterable[str]) -> None:
-    """Remove the items of some outputs, and the folder if nothing else is in it."""
-    with suppress(OSError):
-        for target in targets:
-            item_path(folder, target).unlink(missing_ok=True)
-        folder.rmdir()
 
 
 def entry_of(name: str, status: str = "ok", **known: Any) -> Entry:
