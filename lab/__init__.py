@@ -2,11 +2,8 @@
 
 ``python -m lab`` lists the commands. It needs the extra ``lab``.
 
-    shapes, kinds -> methods -> measuring (metrics, edges) -> runner -> rows -> tables
-    -> evaluate, figures -> documents
-
-Methods on shapes go through one runner of tasks (``runner``), what is timed through processes of
-its own (``processes``); all is kept in files of rows (``rows``) and shown by ``tables``.
+    shapes, kinds -> methods -> measuring (metrics, edges) -> rows -> tables -> documents
+    -> evaluate -> figures (costs)
 """
 
 import argparse

@@ -11,7 +11,7 @@ COMMANDS = {
     "documents": "write the measured figures into them",
     "faults": "conversions and batches ended at random moments, also on a cluster, and full disks",
     "zoo": "grids as people have them, and the ways out that refusals name",
-    "picture": "draw meshes; the pictures in README and of sharp edges",
+    "picture": "draw the pictures in README and of sharp edges",
     "fields": "random fields: are their meshes closed manifolds",
 }
 
@@ -31,7 +31,7 @@ def main() -> int:
     except OptionError as error:
         print(f"Error: {error}", file=sys.stderr)
         return 2
-    except SuperSdfError as error:
+    except (SuperSdfError, OSError) as error:
         print(f"Error: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import statistics
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,24 +19,9 @@ from super_sdf.errors import SuperSdfError
 from super_sdf.threads import count_cores
 from super_sdf.truth.sampling import sample_solid, unit_layout
 
-from .forms import torus
 from .rows import Row
-from .shapes import Shape, spread
+from .shapes import Shape
 
-if TYPE_CHECKING:
-    from .figures import Bench
-
-TIMED = 4  # shapes
-LARGE, LIMITS = 512, ("4G", "1500M", "900M")  # samples a side of a torus, and memory limits
-OPTIONS: dict[str, tuple[str, ...]] = {
-    "default": (),
-    "fast": ("--quality", "fast"),
-    "best": ("--quality", "best"),
-    "float32": ("--precision", "float32"),
-    "marching": ("--mesher", "marching"),
-    "simplify": ("--simplify", "0.02"),
-}
-ORDERS = {"scipy": 3, "trilinear": 1}  # of SciPy's zoom
 FLAGS = ("avx", "avx2", "avx512f", "avx512_vnni", "avx_vnni", "amx_int8")
 # Runs Python with its arguments; prints exit code, seconds, and the peak of memory in bytes. That
 # peak includes what the parent held when it started the process, so the parent has to be small.
@@ -101,7 +83,6 @@ def timed(words: Sequence[str], runs: int) -> Row:
 
 
 def write_grid(shape: Shape, size: int, folder: Path) -> Path:
-    """Write the exact samples of a shape, box diagonal 1 in the unit cube, as ``.npz``."""
     grid = sample_solid(shape.solid, unit_layout(size), band=np.inf)
     path = folder / f"{size}.npz"
     np.savez(path, values=grid.values, spacing=grid.spacing, origin=grid.origin)
@@ -113,7 +94,7 @@ def write_torus(path: Path, n: int) -> Path:
     centres = ((np.arange(n) + 0.5) / n - 0.5).astype(np.float32)
     field = np.lib.format.open_memmap(path, "w+", np.float32, (n, n, n))
     for plane, x in zip(field, centres):
-        plane[:] = torus(x, centres[:, None], centres, 0.28, 0.11)
+        plane[:] = np.hypot(np.hypot(x, centres[:, None]) - 0.28, centres) - 0.11
     field.flush()
     return path
 
@@ -128,59 +109,6 @@ def convert_densely(source: str, target: str, order: str, factor: int = 4) -> No
     fine = zoom(values, scale, order=int(order), mode="nearest", grid_mode=True)
     vertices, faces, _, _ = marching_cubes(fine, 0.0)
     write_mesh(Mesh(vertices, faces.astype(np.int32)), target, force=True)
-
-
-def speed_rows(bench: Bench) -> list[Row]:
-    """Measure whole processes, also beside dense upsampling, and a large grid."""
-    model = ["--model", bench.network] if bench.network != "base" else []
-    rows: list[Row] = []
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        for size in bench.sizes:
-            found: dict[str, list[Row]] = {}
-            for number, path in enumerate(spread(bench.shapes, TIMED)):
-                grid = write_grid(Shape.read(path), size, folder)
-                plans: dict[str, Callable[[], Row]] = {}
-                for option, given in OPTIONS.items():
-                    words = [*given, *(model if option != "fast" else ())]
-                    command = upsample_words(grid, "--inside", "negative", *words)
-                    plans[option] = partial(timed, command, bench.runs)
-                if number == 0 and size > bench.small:
-                    for option, order in ORDERS.items():
-                        dense = [str(grid), str(grid.with_suffix(".ply")), str(order)]
-                        plans[option] = partial(timed, ["-m", "lab.costs", *dense], 1)
-                words = {"time": path.stem, "size": size, "runs": bench.runs}
-                for option, measure in plans.items():
-                    row = bench.timed({**words, "option": option}, measure)
-                    found.setdefault(option, []).append(row)
-            own = found["default"][0]
-            for option, measured in found.items():
-                seconds = statistics.mean(row["seconds"] for row in measured)
-                peak = max(row["peak_mb"] for row in measured)
-                row = {"size": size, "option": option, "seconds": seconds, "peak_mb": peak}
-                if option in ORDERS:
-                    row |= {f"over_{key}": row[key] / own[key] for key in ("seconds", "peak_mb")}
-                rows.append(row)
-        n, grid = LARGE * bench.sizes[-1] // 128, folder / "torus.npy"
-        for limit in LIMITS:
-            key, option = {"torus": n, "limit": limit}, f"torus-{limit}"
-            row = bench.timed(key, partial(large_row, grid, limit, n, model))
-            rows.append({"size": n, "option": option, "limit": limit, **row})
-    return rows
-
-
-def large_row(grid: Path, limit: str, n: int, model: Sequence[str]) -> Row:
-    """Return what a large grid takes within a limit."""
-    if not grid.exists():
-        write_torus(grid, n)
-    options = ["--json", "--spacing", str(1 / n), "--max-memory", limit, *model]
-    try:
-        seconds, peak, printed = run_python(upsample_words(grid, *options))
-    except SuperSdfError as refusal:
-        return {"refused": str(refusal).partition("Error: ")[2]}
-    report = json.loads(printed)
-    counts = {key: report[key] for key in ("tiles", "band_voxels", "triangles")}
-    return {**counts, "seconds": seconds, "peak_mb": peak}
 
 
 if __name__ == "__main__":

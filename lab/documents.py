@@ -5,26 +5,167 @@
 
 A table stands between ``<!-- figures: NAME.TABLE -->`` and ``<!-- /figures -->``, each on a line; a
 number in a sentence between ``<!-- figures: NAME.COLUMN WORDS -->`` and ``<!-- /figures -->``.
+``TABLES`` is the list: NAME.TABLE is made from the rows of NAME.json, and only of that file, so no
+table mixes two networks or machines.
 """
 
 from __future__ import annotations
 
+import json
 import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from super_sdf.errors import FileError
 
-from . import parser_of
-from .figures import FOLDER
-from .quoted import UNKNOWN, shown
+from . import parser_of, published, tables
+from .rows import Row
+from .tables import Column, label_of, listed, wide
 
+FOLDER = Path(__file__).parent / "figures"
 ROOT = Path(__file__).parents[1]
 PLACES = ("README.md", "docs/**/*.md", "src/super_sdf/models/*.md")
 MARKED = re.compile(r"(<!-- figures: ([^>]+?) -->)(.*?)(<!-- /figures -->)", re.DOTALL)
+UNKNOWN = "(not measured)"
+COLUMNS = {**tables.BY_KEY, "peak_mb": tables.PEAK}  # of numbers in sentences
+BY_SIZE = ("size", "method")
+SUMMARY = ("mc", "bspline", "ours", "ours-marching", "bound")
+
+
+def pick(rows: Iterable[Row], **words: Any) -> list[Row]:
+    """Return the rows that have some words; of a tuple, any."""
+    return [row for row in rows if all(
+        row.get(key) in (value if isinstance(value, tuple) else (value,))
+        for key, value in words.items())]  # fmt: skip
+
+
+def among(rows: Iterable[Row], key: str, part: str) -> list[Row]:
+    return [row for row in rows if part in str(row.get(key, ""))]
+
+
+def beside(rows: Sequence[Row], word: str, theirs: Sequence[Row] = ()) -> str:
+    """Return the rows of a setting, each value with the published rows."""
+    together = sorted([*rows, *theirs], key=lambda row: float(row[word]))
+    return listed(together, tables.SETTINGS, (word, "method"))
+
+
+def kind_table(rows: Sequence[Row]) -> str:
+    """Return a row for each kind of grid: the methods' mean distances in voxels."""
+    methods, body = list(dict.fromkeys(row["method"] for row in rows)), []
+    for name, kind in dict.fromkeys((row["set"], row["kind"]) for row in rows):
+        found = {row["method"]: row for row in pick(rows, set=name, kind=kind)}
+        mine, mc = found["ours"], found["mc"]
+        taken = mine["taken_as"] + (f", told {mine['told']}" if mine["told"] else "")
+        taken += f", refused {mine['refused']}" if mine["refused"] else ""
+        voxels = Column("", "voxels", 1, 4)
+        body.append([
+            *(kind if name == "shapes" else f"{kind}, CAD parts", taken),
+            *(voxels.cell(found.get(method, {})) for method in methods),
+            f"{mc['volume_most']:.1f} %, {mine['volume_most']:.1f} %",
+            f"{mine['pieces_of_reference']}, {mc['pieces']}, {mine['pieces']}",
+            f"{mine['closed']} of {mine['grids']}",
+        ])  # fmt: skip
+    titles = ["values", "taken as", *map(label_of, methods), "volume off at most: MC, super-sdf"]
+    return tables.markdown([*titles, "pieces: true, MC, super-sdf", "closed"], body)
+
+
+TABLES: dict[str, Callable[[list[Row]], str]] = {
+    "quality.summary": lambda rows: wide(pick(rows, method=SUMMARY), "method", tables.SHORT),
+    "quality.networks": lambda rows: listed(
+        among(rows, "method", "ours-marching"), tables.NETWORKS, BY_SIZE),
+    **{f"quality.{n}": lambda rows, n=n: tables.surface_table(pick(rows, size=n), n)
+       for n in (32, 64, 128)},
+    "edges.parts": lambda rows: listed(
+        pick(rows, set="parts"), tables.MESHERS, ("size", "factor", "method")),
+    "edges.validation": lambda rows: listed(
+        pick(rows, set="validation"), tables.MESHERS, BY_SIZE),
+    "peers.contouring": lambda rows: listed(
+        among(rows, "method", "dual-contouring"), tables.PEERS, BY_SIZE),
+    "peers.ndc": lambda rows: listed(among(rows, "method", "ndc"), tables.PEERS, BY_SIZE),
+    "kinds.distances": lambda rows: kind_table(
+        [row for row in rows if row["kind"] != "mask" and "spacing 1" not in row["kind"]]),
+    "kinds.masks": lambda rows: kind_table(pick(rows, kind="mask")),
+    "kinds.unequal": lambda rows: kind_table(among(rows, "kind", "spacing 1")),
+    "speed.process": lambda rows: wide(
+        [row for row in rows if row["option"] == "default" or "--" in row["option"]],
+        "option", tables.COSTS),
+    "speed.dense": lambda rows: listed(
+        among(rows, "option", "zoom"), tables.DENSE, ("size", "option")),
+    "speed.large": lambda rows: listed(
+        [{"tiles": "refused", **row} for row in rows if "limit" in row],
+        tables.LARGE, ("size", "limit")),
+    "noise.table": lambda rows: beside(rows, "noise", published.NOISY),
+    "scale.table": lambda rows: beside(rows, "scale", published.SCALED_ROWS),
+    "factors.table": partial(beside, word="factor"),
+    "simplify.table": lambda rows: listed(rows, tables.SIMPLIFIED, ("set", "method")),
+}  # fmt: skip
+
+
+def about(figure: Mapping[str, Any]) -> str:
+    """Return where the numbers of a figure come from, in a sentence."""
+    on = figure["machine"]
+    networks = ", ".join(f"`{name}` {digest}" for name, digest in figure["networks"].items())
+    flags = ", ".join(on["instructions"])
+    return (
+        f"Measured {figure['date']} at commit {figure['commit']} on {on['cores']} cores of "
+        f"{on['processor']} ({flags}), Python {on['python']}, NumPy {on['numpy']}, onnxruntime "
+        f"{on['onnxruntime']}; networks: {networks}."
+    )
+
+
+def read(path: Path) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        content["rows"], content["networks"], content["machine"]["processor"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FileError(f"{path} is no file of python -m lab figures: {error}") from error
+    return content
+
+
+def tables_of(path: Path) -> dict[str, str]:
+    rows = read(path)["rows"]
+    return {name: make(rows) for name, make in TABLES.items() if name.startswith(f"{path.stem}.")}
+
+
+def shown(marker: str, folder: Path) -> str:
+    """Return what a marker stands for: ``NAME.TABLE``, ``NAME.about``, or ``NAME.COLUMN WORDS``."""
+    name, _, rest = marker.partition(".")
+    path, known = folder / f"{name}.json", {table.partition(".")[0] for table in TABLES}
+    if name not in known:
+        raise FileError(f"there is no figure {name!r}: give one of {', '.join(sorted(known))}")
+    what, *words = rest.split()
+    if not words and what != "about" and marker not in TABLES:
+        raise FileError(f"there is no table {marker!r}: give one of {', '.join(TABLES)}")
+    if not path.exists():
+        return UNKNOWN
+    content = read(path)
+    if words:
+        return number(content["rows"], what, words)
+    return about(content) if what == "about" else TABLES[marker](content["rows"])
+
+
+def number(rows: Sequence[Row], name: str, words: Sequence[str]) -> str:
+    """Return one number of a figure, or of two rows with "over" between."""
+    if name not in COLUMNS:
+        raise FileError(f"there is no column {name!r}: give one of {', '.join(COLUMNS)}")
+    if "over" not in words:
+        return COLUMNS[name].cell(row_of(rows, words))
+    cut = list(words).index("over")
+    one, other = (float(row_of(rows, w)[name]) for w in (words[:cut], words[cut + 1 :]))
+    return f"{one / other:.0f}" if one >= 10 * other else f"{one / other:.1f}"
+
+
+def row_of(rows: Sequence[Row], words: Sequence[str]) -> Row:
+    """Return the first row in which every word stands."""
+    found = [row for row in rows if set(words) <= {f"{value}" for value in row.values()}]
+    if not found:
+        raise FileError(f"no row has {' '.join(words)}")
+    return found[0]
 
 
 def documents() -> list[Path]:
-    """Return the documents that show figures."""
     return sorted(path for place in PLACES for path in ROOT.glob(place))
 
 

@@ -16,7 +16,7 @@ import igl
 import numpy as np
 from scipy.spatial import cKDTree
 
-from super_sdf.arrays import BoolArray, IntArray
+from super_sdf.arrays import IntArray
 from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.solid import Distances, Points, Solid
 
@@ -54,7 +54,6 @@ class EdgeCurves:
 
     @classmethod
     def of(cls, mesh: Mesh, seed: tuple[int, int]) -> EdgeCurves:
-        """Return the sharp edges of a mesh."""
         edges = sharp_edges(mesh)
         drawn = sample_edges(mesh.vertices, edges, seed)
         return cls(mesh.vertices, edges, drawn[order_in_space(drawn)])
@@ -99,28 +98,14 @@ def edge_points(drawn: SurfacePoints) -> Points:
     more than the angle of `sharp_edges`, whatever its sign: the two sides of a thin sheet are no
     edge.
     """
-    tree, count = drawn.tree, len(drawn.points)
-    found, crowded = np.zeros(count, bool), np.ones(count, bool)
-    if tree.count_neighbors(tree, EDGE_RADIUS) <= EDGE_NEIGHBOURS * count:  # so few pairs fit
-        pairs = tree.query_pairs(EDGE_RADIUS, output_type="ndarray")
-        found[pairs[is_turned(drawn.normals, *pairs.T)]] = True
-        crowded = np.bincount(pairs.ravel(), minlength=count) >= EDGE_NEIGHBOURS
-    found[crowded] = edge_among_nearest(drawn, np.flatnonzero(crowded))
-    return drawn.points[found]
-
-
-def edge_among_nearest(drawn: SurfacePoints, index: Indices) -> BoolArray:
-    """Return which of the points of an index (k,) have an edge among their nearest points, (k,)."""
-    points = drawn.points[index]
-    nearby = drawn.tree.query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
-    # Missing neighbours have the index n; the point itself replaces them, which is no edge.
-    nearby = np.where(nearby == len(drawn.points), index[:, None], nearby)
-    return np.any([is_turned(drawn.normals, index, column) for column in nearby.T], axis=0)
-
-
-def is_turned(normals: Points, one: Indices, other: Indices) -> BoolArray:
-    """Return for pairs (p,) of normals (n, 3) whether they make an edge, whatever their signs."""
-    return np.abs(np.einsum("pd,pd->p", normals[one], normals[other])) < SHARP_COSINE
+    points, normals, is_edge = drawn.points, drawn.normals, []
+    for some in np.array_split(np.arange(len(points)), len(points) // 10_000 + 1):
+        nearby = drawn.tree.query(points[some], EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)
+        # Missing neighbours have the index n; the point itself replaces them, which is no edge.
+        other = np.where(nearby[1] == len(points), some[:, None], nearby[1])
+        cosine = np.abs(np.einsum("pd,pkd->pk", normals[some], normals[other]))
+        is_edge.append((cosine < SHARP_COSINE).any(1))
+    return points[np.concatenate(is_edge)]
 
 
 def compare_edges(reference: EdgeCurves, result: Points) -> Numbers:
@@ -137,7 +122,6 @@ def compare_edges(reference: EdgeCurves, result: Points) -> Numbers:
 
 
 def edge_f1(there: Distances, back: Distances, reach: float) -> float:
-    """Return F1 of distances both ways at ``reach``."""
     return harmonic_mean(float(np.mean(there < reach)), float(np.mean(back < reach)))
 
 

@@ -29,9 +29,9 @@ from . import parser_of
 from .measuring import NO_SETTING, Task, network_of
 from .methods import BY_NAME, FLOOR, METHODS, OURS
 from .ndc import add_ndc
-from .rows import LeftOut, OnTask, Row, Rows, complete
+from .rows import OnTask, Row, Rows, complete
 from .shapes import Setting, find_meshes, spread
-from .tables import EDGES, GAPS, gap_closed, listed, percent, summary, surface_table
+from .tables import EDGES, GAPS, gaps_closed, listed, summary, surface_table
 
 ROWS = "results.jsonl"
 PROTOCOL_LINES = """\
@@ -61,26 +61,26 @@ class Results:
     ``floors`` are the references against themselves, by shape.
     """
 
-    def __init__(self, tasks: Sequence[Task], rows: Rows, left_out: Sequence[LeftOut] = ()) -> None:
+    def __init__(self, tasks: Sequence[Task], rows: Rows, left_out: Sequence[str] = ()) -> None:
         self.tasks, self.rows, self.left_out = tasks, rows, list(left_out)
         self.failed: dict[Setting, set[str]] = {}
         self.floors: dict[str, Row] = {}
         for task in tasks:
-            found = {method: rows.get(task.key(method)) for method in task.methods}
+            found = {method: rows.get(task.key(method)) or {} for method in task.methods}
             errors: dict[str, list[str]] = {}
             for method, row in found.items():
-                if row is not None and row["error"] is not None:
+                if row.get("error") is not None:
                     errors.setdefault(row["error"], []).append(method)
             for reason, names in errors.items():
                 what = f"{', '.join(names)} ({task.setting}): {reason}"
-                self.left_out.append(LeftOut(task.path.stem, what))
-            if errors and task.limit is None:
+                self.left_out.append(f"{task.path.stem}: {what}")
+            if errors:
                 self.failed.setdefault(task.setting, set()).add(task.path.stem)
-            if FLOOR in found and not errors and found[FLOOR]:
-                self.floors[task.path.stem] = found[FLOOR] or {}
+            if found.get(FLOOR) and not errors:
+                self.floors[task.path.stem] = found[FLOOR]
 
-    def of(self, setting: Setting, method: str, names: Sequence[str] | None = None) -> list[Row]:
-        """Return the measurements of a method, in the order of the tasks; ``names``: of shapes.
+    def of(self, setting: Setting, method: str) -> list[Row]:
+        """Return the measurements of a method, in the order of the tasks.
 
         ``excess_cd`` is added: CD less the CD of two samplings of the reference.
         """
@@ -88,31 +88,27 @@ class Results:
         found: list[Row] = []
         for task in self.tasks:
             is_meant = method in task.methods and task.setting in (setting, NO_SETTING)
-            is_wanted = names is None or task.path.stem in names
-            row = self.rows.get(task.key(method)) if is_meant and is_wanted else None
+            row = self.rows.get(task.key(method)) if is_meant else None
             if row and row["error"] is None and row["shape"] not in failed:
                 floor = self.floors.get(row["shape"], {}).get("cd", 0.0)
                 found.append({**row, "excess_cd": row["cd"] - floor})
         return found
 
-    def by_method(self, setting: Setting, methods: Sequence[str]) -> dict[str, list[Row]]:
-        """Return the measurements of methods."""
-        return {method: self.of(setting, method) for method in methods}
-
-
-def tasks_of(paths: Sequence[Path], settings: Sequence[Setting], like: Task) -> list[Task]:
-    """Return a task for each shape and setting, and for the floor of each shape."""
-    floors = [replace(like, path=p, setting=NO_SETTING, methods=(FLOOR,)) for p in paths]
-    return floors + [replace(like, path=p, setting=s) for s in settings for p in paths]
-
 
 def results_of(
-    tasks: Sequence[Task], rows: Rows, jobs: int, on_task: OnTask | None = None
+    paths: Sequence[Path],
+    settings: Sequence[Setting],
+    like: Task,
+    rows: Rows,
+    jobs: int,
+    on_task: OnTask | None = None,
 ) -> Results:
     """Measure what the rows lack; return the results, and name on stderr what was left out."""
+    tasks = [replace(like, path=p, setting=NO_SETTING, methods=(FLOOR,)) for p in paths]
+    tasks += [replace(like, path=p, setting=s) for s in settings for p in paths]
     results = Results(tasks, rows, complete(tasks, rows, jobs, on_task))
     for entry in results.left_out:
-        print(f"Left out: {entry.shape}: {entry.reason}", file=sys.stderr)
+        print(f"Left out: {entry}", file=sys.stderr)
     return results
 
 
@@ -121,14 +117,14 @@ def report(results: Results, like: Task) -> str:
     parts = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
     if like.turned is not None:
         parts.append(f"The shapes are turned at random, by seed {like.turned}.")
-    parts += [f"Left out, {entry.shape}: {entry.reason}." for entry in results.left_out]
+    parts += [f"Left out, {entry}." for entry in results.left_out]
     for setting in dict.fromkeys(t.setting for t in results.tasks if t.setting != NO_SETTING):
         found = {method: results.of(setting, method) for method in (*like.methods, FLOOR)}
         means = [{"method": method, **summary(rows)} for method, rows in found.items()]
         parts += [f"## {setting}", surface_table(means, setting.size)]
-        if {OURS, "bspline", "bound"} <= found.keys():
-            three = found[OURS], found["bspline"], found["bound"]
-            gaps = (f"{title} {percent(gap_closed(*three, key))}" for key, title in GAPS.items())
+        ends = found.get("bspline", []), found.get("bound", [])
+        if closed := gaps_closed(found.get(OURS, []), *ends):
+            gaps = (f"{title} {closed[f'gap_{key}']:.0%}" for key, title in GAPS.items())
             parts.append(f"Of the gap from B-spline to the bound closed: {', '.join(gaps)}.")
         parts += [f"### Edges and triangles\n\n{EDGE_LINES}", listed(means, EDGES)]
     return "\n\n".join(parts) + "\n"
@@ -147,7 +143,6 @@ def progress_lines() -> OnTask:
 
 
 def add_jobs(parser: ArgumentParser) -> None:
-    """Add the option of the number of processes."""
     parser.add_argument(
         "--jobs", type=int, default=count_cores(), help="processes at a time; 0: in this one"
     )
@@ -182,7 +177,7 @@ def main() -> int:
     like = Task(paths[0], settings[0], methods, words.model, words.precision, threads, words.turned)
     rows = Rows(words.out / ROWS)
     on_task = None if words.quiet else progress_lines()
-    results = results_of(tasks_of(paths, settings, like), rows, words.jobs, on_task)
+    results = results_of(paths, settings, like, rows, words.jobs, on_task)
     if not results.floors:
         raise FileError("no shape could be measured")
     text = report(results, like)

@@ -12,7 +12,6 @@ record of a batch has one valid row for each file.
 
 from __future__ import annotations
 
-import argparse
 import json
 import random
 import resource
@@ -33,7 +32,6 @@ import psutil
 from super_sdf.files.meshes import MESH_SUFFIXES
 
 from . import parser_of
-from .forms import ball
 
 COMMAND = [sys.executable, "-m", "super_sdf"]
 SIGNALS = ("SIGTERM", "SIGHUP", "SIGKILL")
@@ -60,21 +58,16 @@ def run(words: list[str], fault: str, longest: float, largest: int) -> str:
     return "" if process.returncode in fine else f"exit code {process.returncode}: {said}"
 
 
-def half_written(out: Path, right: dict[str, bytes]) -> str:
-    """Return the files with a final name that are not complete; empty if none is."""
-    half = [n for n, data in right.items() if (p := out / n).exists() and p.read_bytes() != data]
-    return f"half-written: {', '.join(half)}" if half else ""
-
-
-def wrong_at_the_end(out: Path, right: dict[str, bytes], is_batch: bool) -> str:
-    """Return what is missing, left over, or recorded twice after the last run."""
-    found = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
-    lost, more = right.keys() - found, {n for n in found - right.keys() if n.endswith(".ply")}
-    if lost or more:
-        return f"missing: {sorted(lost)}, left over: {sorted(more)}"
-    if not is_batch:
+def wrong_files(out: Path, right: dict[str, bytes], is_last: bool, is_batch: bool) -> str:
+    """Return what is half-written; after the last run also what is missing, or recorded twice."""
+    found = {p.relative_to(out).as_posix(): p for p in out.rglob("*") if p.is_file()}
+    if half := [n for n in right.keys() & found if found[n].read_bytes() != right[n]]:
+        return f"half-written: {half}"
+    if is_last and (more := right.keys() ^ {n for n in found if n != RECORD and n[0] != "."}):
+        return f"missing or left over: {sorted(more)}"
+    if not (is_last and is_batch):
         return ""
-    rows = [json.loads(line) for line in (out / RECORD).read_bytes().splitlines()]
+    rows = [json.loads(line) for line in found[RECORD].read_bytes().splitlines()]
     twice = [n for n, k in Counter(r["out"] for r in rows if r["status"] == "ok").items() if k > 1]
     return f"made twice: {twice}" if twice else ""
 
@@ -98,9 +91,10 @@ def trial(words: list[str], out: Path, fault: str, runs: int) -> Counter[str]:
             rmtree(out)
             out.mkdir()
         longest = seconds / runs * 2 if is_batch else seconds
-        wrong = run(words, fault, longest, largest) or half_written(out, right)
+        wrong = run(words, fault, longest, largest)
+        wrong = wrong or wrong_files(out, right, False, is_batch)
         found[wrong or "right"] += 1
-    found[run(words, "", 0, 1) or wrong_at_the_end(out, right, is_batch) or "right"] += 1
+    found[run(words, "", 0, 1) or wrong_files(out, right, True, is_batch) or "right"] += 1
     return found
 
 
@@ -113,14 +107,14 @@ def write_balls(folder: Path, count: int, size: int, bad: float) -> None:
         if random.random() < bad:
             path.write_bytes(b"no grid")
             continue
-        values = ball(x, y, z, 2 * number / count, size / 3 - number / count).astype(np.float32)
+        values = np.sqrt((x - 2 * number / count) ** 2 + y**2 + z**2) - size / 3 + number / count
+        values = values.astype(np.float32)
         np.savez(path, values=values, spacing=1.0, origin=0.0)
 
 
 def main() -> int:
     """Run all trials, print a line for each fault; exit code 1 if anything was wrong."""
     parser = parser_of(__doc__)
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("--runs", type=int, default=50, help="of each fault")
     parser.add_argument("--only", choices=("upsample", "batch"))
     parser.add_argument("--size", type=int, default=24, help="samples along each axis")

@@ -14,12 +14,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from super_sdf import Mesh, SdfGrid, load_network, reconstruct
-from super_sdf.network.decoder import Decoder
-from super_sdf.options import DEFAULT_MESHER, MARCHING, SHARP
+from super_sdf.options import MARCHING, SHARP
 from super_sdf.surface.marching import CAP_HEIGHT
 
 from . import parser_of
@@ -90,12 +87,6 @@ KINDS = {
 }
 
 
-def mesh_of_field(field: RandomField, network: Decoder, mesher: str = DEFAULT_MESHER) -> Mesh:
-    """Return a field's mesh."""
-    grid = SdfGrid.trusted(field.values, 1.0)  # they are no distances, and need not be
-    return reconstruct(grid, network, field.factor, cap=field.cap, mesher=mesher)
-
-
 def faults_of_mesh(field: RandomField, mesh: Mesh) -> list[str]:
     """Return what is wrong with a mesh: holes, edges or vertices of two surfaces, no numbers."""
     faults = []
@@ -111,7 +102,7 @@ def faults_of_mesh(field: RandomField, mesh: Mesh) -> list[str]:
     inner, border = open_edges(mesh, field.values.shape)
     if inner or (field.cap and border):
         faults.append(f"{inner} open edges within the grid, {border} at its border")
-    elif not border and (count_fans(mesh.faces) != 1).any():
+    elif not border and (mesh.count_fans(mesh.pair_edges()[0])[np.unique(mesh.faces)] != 1).any():
         faults.append("surfaces share a vertex")
     return [f"{field.name}: {fault}" for fault in faults]
 
@@ -121,27 +112,10 @@ def open_edges(mesh: Mesh, shape: tuple[int, ...]) -> tuple[int, int]:
 
     The fine lattice ends half a voxel beyond the outer samples; there a surface may run out.
     """
-    size = len(mesh.vertices)
-    start, end = mesh.faces.ravel().astype(np.int64), np.roll(mesh.faces, -1, axis=1).ravel()
-    lonely = np.setxor1d(start * size + end, end * size + start)
-    ends = mesh.vertices[np.stack([lonely // size, lonely % size])]
+    ends = mesh.vertices[mesh.boundary()]
     in_face = (np.abs(ends + 0.5) < 1e-3) | (np.abs(ends - np.array(shape) + 0.5) < 1e-3)
-    at_border = in_face.all(0).any(1)
+    at_border = in_face.all(1).any(1)
     return int((~at_border).sum()), int(at_border.sum())
-
-
-def count_fans(faces: np.ndarray) -> np.ndarray:
-    """Return for each used vertex how many closed fans of triangles meet there: 1 in a manifold."""
-    turns = np.concatenate([np.roll(faces, shift, axis=1) for shift in range(3)]).astype(np.int64)
-    size = faces.max() + 1
-    keys, spoke = np.unique(
-        np.concatenate([turns[:, 0] * size + turns[:, 1], turns[:, 0] * size + turns[:, 2]]),
-        return_inverse=True,
-    )
-    graph = coo_matrix((np.ones(len(turns)), spoke.reshape(2, -1)), shape=(len(keys),) * 2)
-    _, fan = connected_components(graph, directed=False)
-    _, first = np.unique(fan, return_index=True)
-    return np.bincount(keys[first] // size)[np.unique(faces)]
 
 
 def main() -> int:
@@ -152,8 +126,10 @@ def main() -> int:
     words = parser.parse_args()
     network, faults = load_network("fast", threads=1), list[str]()
     for field in make_fields(words.count, words.seed):
+        grid = SdfGrid.trusted(field.values, 1.0)  # they are no distances, and need not be
         for mesher in (MARCHING, SHARP):
-            found = faults_of_mesh(field, mesh_of_field(field, network, mesher))
+            mesh = reconstruct(grid, network, field.factor, cap=field.cap, mesher=mesher)
+            found = faults_of_mesh(field, mesh)
             faults += [f"{mesher}, {fault}" for fault in found]
     print("\n".join(faults), file=sys.stderr)
     print(f"{words.count} fields, {len(faults)} faults")

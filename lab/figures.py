@@ -13,43 +13,46 @@ method, network, code, and for times the machine), so a run that was killed goes
 from __future__ import annotations
 
 import datetime
-import hashlib
 import json
+import statistics
 import subprocess
 import sys
+import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from super_sdf.errors import FileError, OptionError
+from super_sdf.errors import OptionError, SuperSdfError
 from super_sdf.files.output import replacing
 from super_sdf.network.network import find_model
 from super_sdf.options import DEFAULT_QUALITY, QUALITIES
 from super_sdf.threads import count_cores
 
-from . import costs, parser_of, quoted
-from .costs import machine
-from .evaluate import Results, add_jobs, progress_lines, results_of, tasks_of
+from . import costs, parser_of
+from .documents import FOLDER, tables_of
+from .evaluate import Results, add_jobs, progress_lines, results_of
 from .kinds import KINDS
-from .measuring import Task, digest_of_ours
+from .measuring import Task, digest_of_file, digest_of_ours
 from .methods import FLOOR, ON
 from .ndc import add_ndc
 from .rows import Row, Rows
-from .shapes import Setting, find_meshes, spread
-from .tables import GAPS, gap_closed, mean_of, summary
+from .shapes import Setting, Shape, find_meshes, spread
+from .tables import gaps_closed, mean_of, summary
 
-FOLDER = Path(__file__).parent / "figures"
 ROWS = "rows.jsonl"
-FEW = 10  # shapes of the smaller figures, spread over all
-BASELINES = ("mc", "mc-lewiner", "trilinear", "bspline")
+FEW, FEW_PARTS, TIMED = 10, 6, 4  # shapes and parts of the smaller figures, and of times
 # Networks are compared by marching cubes of their fields, as the bound is made.
-MODELS = ("@fast", "@noisy", "", "@base:float32", "@best")
-NETWORKS = ("ours", *(f"ours-marching{model}" for model in MODELS))
-LATE, FEW_PARTS = 900.0, 6  # seconds for another method on a part, and parts
+NETWORKS = [f"ours-marching{model}" for model in ("@fast", "@noisy", "@base:float32", "@best")]
+LARGE, LIMITS = 512, ("4G", "1500M", "900M")  # samples a side of a torus, and memory limits
+OPTIONS = ("", "--quality fast", "--quality best", "--precision float32", "--mesher marching",
+           "--simplify 0.02")  # fmt: skip
+DENSE = {"zoom-cubic": 3, "zoom-linear": 1}  # orders of SciPy's zoom
+Words = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -64,121 +67,96 @@ class Bench:
     jobs: int = 1  # processes at a time
     runs: int = 5  # of each that is timed
 
-    @property
-    def small(self) -> int:
-        """The size of the smaller figures."""
-        return self.sizes[0]
-
-    @property
-    def few(self) -> tuple[Path, ...]:
-        """Some of the shapes."""
-        return spread(self.shapes, FEW)
-
-    def measured(
+    def results(
         self,
         name: str,
         settings: Sequence[Setting],
         methods: Sequence[str],
-        limit: float | None = None,
     ) -> Results:
-        """Return the measurements of methods on a set, "parts", "few" or "validation", in settings.
+        """Return the measurements of methods on a set, in settings; measure what is missing.
 
-        What is missing is measured. Parts are turned.
+        Sets are "validation", "few" of them, "parts", which are turned, and "few parts".
         """
-        paths = {"parts": self.parts, "few": self.few}.get(name, self.shapes)
-        paths = paths[:FEW_PARTS] if limit else paths
+        paths = {"parts": self.parts, "few parts": self.parts[:FEW_PARTS],
+                 "few": spread(self.shapes, FEW)}.get(name, self.shapes)  # fmt: skip
         if not paths:
             raise OptionError("the CAD parts are needed: make them, python -m export.parts PARTS, "
                               "and give --parts PARTS")  # fmt: skip
-        threads, turned = max(1, count_cores() // max(self.jobs, 1)), 0 if name == "parts" else None
-        like = Task(paths[0], settings[0], tuple(methods), self.network, threads=threads,
-                    turned=turned, limit=limit)  # fmt: skip
-        return results_of(tasks_of(paths, settings, like), self.rows, self.jobs, progress_lines())
+        threads, turned = max(1, count_cores() // max(self.jobs, 1)), 0 if "parts" in name else None
+        methods = tuple(method for method in methods if method != FLOOR)
+        like = Task(paths[0], settings[0], methods, self.network, threads=threads,
+                    turned=turned)  # fmt: skip
+        return results_of(paths, settings, like, self.rows, self.jobs, progress_lines())
 
-    def kept(self, key: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> Row:
-        """Return the row of a key with the code and the network; measure it if there is none."""
-        key = {**key, "digest": digest_of_ours(self.network)}
+    def measured(
+        self,
+        name: str,
+        settings: Sequence[tuple[Words, Setting]],
+        methods: Sequence[str],
+    ) -> list[Row]:
+        """Return the means of each method in each setting, a row of its words."""
+        results = self.results(name, [setting for _, setting in settings], methods)
+        rows = []
+        for words, setting in settings:
+            found = {method: results.of(setting, method) for method in methods}
+            ends = found.get("bspline", []), found.get("bound", [])
+            for method, some in found.items():
+                gaps = gaps_closed(some, *ends)
+                rows.append({**words, "method": method, **summary(some), **gaps})
+        return rows
+
+    def timed(self, key: Words, measure: Callable[[], Words]) -> Row:
+        """Return a row, measured if there is none by the code, the network and this machine."""
+        key = {**key, "machine": str(costs.machine()), "digest": digest_of_ours(self.network)}
         if not self.rows.is_final(key):
             print(", ".join(map(str, key.values())), file=sys.stderr, flush=True)
             self.rows.add(key, {**measure(), "error": None})
         return self.rows.get(key) or {}
-
-    def timed(self, key: Mapping[str, Any], measure: Callable[[], Mapping[str, Any]]) -> Row:
-        """Return a row as ``kept`` does; it counts for this machine and its versions only."""
-        return self.kept({**key, "machine": str(machine())}, measure)
-
-
-def name_of(method: str) -> str:
-    """Return the word for a method in a figure: "ours" is default, "ours-marching" base."""
-    name, _, model = method.partition("@")
-    if name == "ours-marching":
-        return model.replace(":", "-") or "base"
-    return "default" if name == "ours" else name
 
 
 # The figures: each takes the bench and returns rows, with words that tell them apart.
 
 
 def quality(bench: Bench) -> list[Row]:
-    """Measure all methods on all shapes at all sizes."""
-    methods = [*BASELINES, *NETWORKS, "bound"]
-    if bench.network != DEFAULT_QUALITY:  # the others do not change with it
-        methods = [*BASELINES, "ours", "ours-marching", "bound"]
-    results = bench.measured("validation", [Setting(n) for n in bench.sizes], methods)
-    rows = []
-    for size in bench.sizes:
-        found = {m: results.of(Setting(size), m) for m in (*methods, FLOOR)}
-        three = found["bspline"], found["bound"]
-        for method, measured in found.items():
-            gaps = {f"gap_{key}": gap_closed(measured, *three, key) for key in GAPS}
-            rows.append({"size": size, "method": name_of(method), **summary(measured), **gaps})
-    return rows
+    others = NETWORKS if bench.network == DEFAULT_QUALITY else []  # they do not change with it
+    baselines = ("mc", "mc-lewiner", "trilinear", "bspline")
+    methods = [*baselines, "ours", "ours-marching", *others, "bound", FLOOR]
+    return bench.measured("validation", [({"size": n}, Setting(n)) for n in bench.sizes], methods)
 
 
 def edges(bench: Bench) -> list[Row]:
     """Measure the meshers, on CAD parts and on the validation shapes."""
     rows = []
-    small, sizes = bench.small, bench.sizes[:2]
     both = ("ours-marching", "ours", "bound", "bound-sharp")
+    sizes = bench.sizes[:2]
     plans = (
-        *(("parts", n, 4, (*both, *(f"ours/{k}" for k in (4, 16)))) for n in sizes),
-        ("parts", small, 2, ("ours",)),
+        *(("parts", n, 4, (*both, "ours/4", "ours/16")) for n in sizes),
+        ("parts", bench.sizes[0], 2, ("ours",)),
         *(("validation", n, 4, both) for n in sizes),
     )
     for name, size, factor, methods in plans:
-        setting = Setting(size, factor)
-        results = bench.measured(name, [setting], methods)
-        for method in methods:
-            word = method.replace("ours-marching", "marching").replace("ours", "sharp")
-            word += f"-{factor}" if factor != 4 else ""
-            words = {"set": name, "size": size, "method": word}
-            rows.append({**words, **summary(results.of(setting, method))})
+        words = {"set": name, "size": size, "factor": factor}
+        rows += bench.measured(name, [(words, Setting(size, factor))], methods)
     return rows
 
 
 def peers(bench: Bench) -> list[Row]:
     """Measure dual contouring of distances and NDC, and ours with as many triangles."""
-    other = "dual-contouring"
-    methods, setting = (other, f"ours-marching/{other}", f"ours/{other}"), Setting(bench.small)
-    results = bench.measured("parts", [setting], methods, LATE)
-    rows: list[Row] = [{"method": m, **summary(results.of(setting, m))} for m in methods]
-    settings = [Setting(size) for size in bench.sizes[:2]]
-    methods = "ndc", "ours-marching/ndc", "ours/ndc"
-    results = bench.measured("parts", settings, methods)
-    for setting in settings:
-        for m in methods:
-            rows.append({"method": m, "size": setting.size, **summary(results.of(setting, m))})
+    rows = []
+    for peer, name, sizes in (("dual-contouring", "few parts", 1), ("ndc", "parts", 2)):
+        settings = [({"size": n}, Setting(n)) for n in bench.sizes[:sizes]]
+        methods = peer, f"ours-marching/{peer}", f"ours/{peer}"
+        rows += bench.measured(name, settings, methods)
     return rows
 
 
 def kinds(bench: Bench) -> list[Row]:
-    """Measure grids that are not exact distances, by us and by what people do today."""
-    rows, setting = [], Setting(bench.small)
+    rows, setting = [], Setting(bench.sizes[0])
     masks = {name: kind for name, kind in KINDS.items() if kind.group == "mask"}
     sets = {"shapes": ("few", KINDS), **({"parts": ("parts", masks)} if bench.parts else {})}
     for name, (paths, some) in sets.items():
         methods = [f"{method}{ON}{kind}" for kind in some for method in some[kind].methods]
-        results = bench.measured(paths, [setting], methods)
+        results = bench.results(paths, [setting], methods)
         for title in dict.fromkeys(kind.title for kind in some.values()):
             rows += kind_rows(results, setting, name, title)
     return rows
@@ -192,17 +170,14 @@ def kind_rows(results: Results, setting: Setting, name: str, title: str) -> list
         for method in alike[0].methods
     }
     taken = [not row.get("refused") for row in by_method["ours"]]
-    words = {"set": name, "kind": title, "size": setting.size}
     rows = []
     for method, measured in by_method.items():
         used = [row for row, good in zip(measured, taken) if good]
-        far = [setting.size * row["p2s"] for row in used] or [np.nan]
         off = [100 * abs(row["volume_off"]) for row in used] or [np.nan]
-        row = {**words, "method": method, "grids": len(used), "voxels": float(np.mean(far))}
-        row |= {"largest": max(far), "volume": float(np.mean(off)), "volume_most": max(off)}
-        row |= {key: mean_of(used, key) for key in ("f1", "nc")}
-        row |= {key: sum(one[key] for one in used) for key in ("pieces", "closed")}
-        row["pieces_of_reference"] = sum(one["pieces_of_reference"] for one in used)
+        row = {"set": name, "kind": title, "size": setting.size, "method": method}
+        row |= {"voxels": setting.size * (mean_of(used, "p2s") or np.nan), "volume_most": max(off)}
+        counted = ("pieces", "pieces_of_reference", "closed")
+        row |= {"grids": len(used), **{key: sum(one[key] for one in used) for key in counted}}
         if method == "ours":
             kinds_of = Counter(one["taken_as"] for one in used).most_common()
             several = len(kinds_of) > 1
@@ -213,50 +188,80 @@ def kind_rows(results: Results, setting: Setting, name: str, title: str) -> list
 
 
 def noise(bench: Bench) -> list[Row]:
-    """Measure uniform noise, in percent of half a voxel."""
-    methods = ("mc", "bspline", "ours")
-    settings = {p: Setting(bench.small, noise=p / 100) for p in (0, 20, 50, 100)}
-    return few_rows(bench, "noise", settings, methods)
+    shares = [({"noise": p}, Setting(bench.sizes[0], noise=p / 100)) for p in (0, 20, 50, 100)]
+    return bench.measured("few", shares, ("mc", "bspline", "ours"))
 
 
 def scale(bench: Bench) -> list[Row]:
-    """Measure shapes that fill a part of the grid."""
-    settings = {s: Setting(bench.small, scale=s) for s in (0.25, 0.5, 0.75)}
-    return few_rows(bench, "scale", settings, ("mc", "bspline", "ours", "bound"))
+    scales = [({"scale": s}, Setting(bench.sizes[0], scale=s)) for s in (0.25, 0.5, 0.75)]
+    return bench.measured("few", scales, ("mc", "bspline", "ours", "bound"))
 
 
 def factors(bench: Bench) -> list[Row]:
-    """Measure the upscaling factors."""
-    settings = {f: Setting(bench.small, f) for f in (2, 4, 8, 16)}
-    return few_rows(bench, "factor", settings, ("mc", "bspline", "ours", "bound"))
-
-
-def few_rows(
-    bench: Bench, word: str, settings: Mapping[Any, Setting], methods: Sequence[str]
-) -> list[Row]:
-    """Return a row for each setting and method, on some of the shapes."""
-    results = bench.measured("few", list(settings.values()), methods)
-    rows = []
-    for value, setting in settings.items():
-        found = results.by_method(setting, methods)
-        for method, measured in found.items():
-            gap = gap_closed(measured, found["bspline"], found.get("bound", []), "f1")
-            words = {word: value, "method": name_of(method)}
-            rows.append({**words, **summary(measured), "gap_f1": gap})
-    return rows
+    some = [({"factor": f}, Setting(bench.sizes[0], f)) for f in (2, 4, 8, 16)]
+    return bench.measured("few", some, ("mc", "bspline", "ours", "bound"))
 
 
 def simplify(bench: Bench) -> list[Row]:
-    """Measure meshes simplified within .02 voxel."""
-    rows, setting = [], Setting(bench.small)
-    methods = ("ours-marching", "ours-marching/within", "ours", "ours/within")
+    """Measure meshes simplified within .02 voxel, and the share of triangles that is left."""
+    rows = []
     for name in ("parts", "validation"):
-        results = bench.measured(name, [setting], methods)
-        for method in methods:
-            mesher = "marching" if "marching" in method else "sharp"
-            words = {"set": name, "mesher": mesher, "simplified": "within" in method}
-            rows.append({**words, **summary(results.of(setting, method))})
+        for whole in ("ours-marching", "ours"):
+            methods, setting = (whole, f"{whole}/within"), Setting(bench.sizes[0])
+            before, after = bench.measured(name, [({"set": name}, setting)], methods)
+            rows.append({**after, "method": whole, "left": after["faces"] / before["faces"]})
     return rows
+
+
+def speed(bench: Bench) -> list[Row]:
+    """Measure whole processes, also beside dense upsampling, and a large grid."""
+    model = ["--model", bench.network] if bench.network != DEFAULT_QUALITY else []
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for size in bench.sizes:
+            found: dict[str, list[Row]] = {}
+            for number, path in enumerate(spread(bench.shapes, TIMED)):
+                grid = costs.write_grid(Shape.read(path), size, folder)
+                plans: dict[str, Callable[[], Row]] = {}
+                for option in OPTIONS:
+                    words = [*option.split(), *(model if "quality" not in option else ())]
+                    command = costs.upsample_words(grid, "--inside", "negative", *words)
+                    plans[option or "default"] = partial(costs.timed, command, bench.runs)
+                if number == 0 and size > bench.sizes[0]:
+                    for option, order in DENSE.items():
+                        dense = [str(grid), str(grid.with_suffix(".ply")), str(order)]
+                        plans[option] = partial(costs.timed, ["-m", "lab.costs", *dense], 1)
+                for option, measure in plans.items():
+                    key = {"time": path.stem, "size": size, "runs": bench.runs, "option": option}
+                    found.setdefault(option, []).append(bench.timed(key, measure))
+            own = found["default"][0]
+            for option, some in found.items():
+                seconds = statistics.mean(row["seconds"] for row in some)
+                peak = max(row["peak_mb"] for row in some)
+                row = {"size": size, "option": option, "seconds": seconds, "peak_mb": peak}
+                if option in DENSE:
+                    row |= {f"over_{key}": row[key] / own[key] for key in ("seconds", "peak_mb")}
+                rows.append(row)
+        n, grid = LARGE * bench.sizes[-1] // 128, folder / "torus.npy"
+        for limit in LIMITS:
+            key = {"size": n, "option": f"torus-{limit}", "limit": limit}
+            row = bench.timed(key, partial(large_row, grid, limit, n, model))
+            rows.append({**key, **row})
+    return rows
+
+
+def large_row(grid: Path, limit: str, n: int, model: Sequence[str]) -> Row:
+    if not grid.exists():
+        costs.write_torus(grid, n)
+    options = ["--json", "--spacing", str(1 / n), "--max-memory", limit, *model]
+    try:
+        seconds, peak, printed = costs.run_python(costs.upsample_words(grid, *options))
+    except SuperSdfError as refusal:
+        return {"refused": str(refusal).partition("Error: ")[2]}
+    report = json.loads(printed)
+    counts = {key: report[key] for key in ("tiles", "band_voxels", "triangles")}
+    return {**counts, "seconds": seconds, "peak_mb": peak}
 
 
 # How each is measured, and by which networks.
@@ -268,34 +273,26 @@ FIGURES: dict[str, tuple[Callable[[Bench], list[Row]], tuple[str, ...]]] = {
     "scale": (scale, ("base",)),
     "factors": (factors, ("base",)),
     "simplify": (simplify, ("base",)),
-    "speed": (costs.speed_rows, ("fast", "base", "best", "mask", "noisy")),
+    "speed": (speed, ("fast", "base", "best")),
     "peers": (peers, ("base",)),
 }
 RARE = ("peers",)  # takes long for what few ask for
 
 
-def digests(networks: Iterable[str], chosen: str) -> dict[str, str]:
-    """Return the SHA-256 of the files of networks, the int8 ones that the CPU runs."""
-    found = {}
-    for name in networks:
-        model = chosen if name == DEFAULT_QUALITY else QUALITIES.get(name, (name, 1))[0]
-        found[name] = hashlib.sha256(find_model(model, "auto")[0].read_bytes()).hexdigest()[:12]
-    return found
-
-
-def commit() -> str:
-    """Return the commit of the sources; "unknown" outside of a clone."""
-    words = ["git", "-C", str(FOLDER.parent), "rev-parse", "--short=9", "HEAD"]
-    return subprocess.run(words, capture_output=True, text=True).stdout.strip() or "unknown"
-
-
 def write(name: str, rows: list[Row], bench: Bench, out: Path) -> Path:
-    """Write a figure's file."""
+    """Write a figure's file, with the commit of the sources and hashes of the networks' files."""
+    git = ["git", "-C", str(FOLDER.parent), "rev-parse", "--short=9", "HEAD"]
+    commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or "unknown"
+    digests = {}
+    for network in FIGURES[name][1]:
+        model = QUALITIES.get(network, (network, 1))[0]
+        model = bench.network if network == DEFAULT_QUALITY else model
+        digests[network] = digest_of_file(find_model(model, "auto")[0])[:12]
     content = {
         "name": name,
-        "networks": digests(FIGURES[name][1], bench.network),
-        "commit": commit(),
-        "machine": machine(),
+        "networks": digests,
+        "commit": commit,
+        "machine": costs.machine(),
         "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
         "shapes": len(bench.shapes),
         "rows": [{key: rounded(value) for key, value in row.items()} for row in rows],
@@ -332,21 +329,11 @@ def main() -> None:
         raise OptionError("--network measures another network: give it its own folder, --out")
     for size in words.sizes:
         Setting(size).check()
-    try:
-        words.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"{words.out} cannot be made: {error.strerror}") from error
     shapes, parts = (find_meshes(given) for given in (words.shapes, words.parts))
-    bench = Bench(
-        spread(shapes, words.count or len(shapes)),
-        spread(parts, words.count or len(parts)),
-        Rows(words.out / ROWS),
-        words.network,
-        tuple(words.sizes),
-        words.jobs,
-        words.runs,
-    )
+    some = (spread(paths, words.count or len(paths)) for paths in (shapes, parts))
+    rows, sizes = Rows(words.out / ROWS), tuple(words.sizes)
+    bench = Bench(*some, rows, words.network, sizes, words.jobs, words.runs)
     for name in words.only or [name for name in FIGURES if name not in RARE]:
         path = write(name, FIGURES[name][0](bench), bench, words.out)
-        for table, text in quoted.tables_of(path).items():
+        for table, text in tables_of(path).items():
             print(f"{table}\n\n{text}\n", flush=True)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,28 +21,19 @@ from super_sdf.grid.sdf_grid import make_grid
 from super_sdf.network.decoder import Decoder
 from super_sdf.options import AUTO, SCALED
 from super_sdf.pipeline import reconstruct
-from super_sdf.truth.solid import Solid
 
 from .shapes import FIELD_NOISE, Case
 from .surfaces import EMPTY, Surface, closed_isosurface, interpolate_spline, stretched
 
 Array = NDArray[Any]
+Spacing = NDArray[np.float64]
 
 CUTS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # voxels
 INTEGERS = 30_000.0  # of the diagonal, in steps of whole numbers of 16 bits
 RATIOS = (1.5, 5.0)  # of the coarse spacing to the others
-CHUNK = 1 << 18  # samples at a time
-
 WIDTHS = (0.5, 0.8, 1.2)  # voxels, of the Gaussians by which masks are smoothed
 DISTANCES = ("mc", "bspline", "ours")
 MASKS = ("mc", "mc-distances", *(f"mc-gaussian-{width:g}" for width in WIDTHS), "ours")
-KIND_LABELS = {
-    "mc": "MC",
-    "mc-distances": "MC of SciPy's distance transform",
-    **{f"mc-gaussian-{width:g}": f"MC, Gaussian of {width:g} voxels" for width in WIDTHS},
-    "bspline": "B-spline + MC",
-    "ours": "super-sdf",
-}
 AXES = "xyz"
 
 
@@ -53,7 +44,7 @@ class Kind:
     group: str  # exact, mask, truncated, scaled, density, noisy or unequal
     title: str  # kinds with the same title share their rows
     make: Callable[[Case], Array]  # values as they stand in a user's file
-    methods: tuple[str, ...] = DISTANCES  # by the names in ``KIND_LABELS``
+    methods: tuple[str, ...] = DISTANCES  # by the names in ``BY_METHOD``
     level: float | None = None  # for other methods; above it is inside; else distances
     options: Mapping[str, Any] = field(default_factory=dict)  # what the user says
     unit: float | None = None  # of distances whose spacing the user does not know
@@ -66,20 +57,15 @@ class Kind:
         return f"{self.title}, {self.axis}" if self.axis else self.title
 
 
-class FieldSamples(NamedTuple):
-    """The values of a kind for a case."""
-
-    values: Array  # (nx, ny, nz)
-    spacing: NDArray[np.float64]  # (3,)
-    origin: NDArray[np.float64]  # of sample (0, 0, 0)
-
-
 @lru_cache(maxsize=1)
-def samples_of(kind: Kind, case: Case) -> FieldSamples:
-    """Return the values of a kind; the methods of a kind follow one another, so one is kept."""
+def samples_of(kind: Kind, case: Case) -> tuple[Array, Spacing, Spacing]:
+    """Return values (nx, ny, nz), spacing (3,) and the position of sample (0, 0, 0).
+
+    The methods of a kind follow one another, so the samples of one kind are kept.
+    """
     values = kind.make(case)
     spacing = case.side / np.array(values.shape)
-    return FieldSamples(values, spacing, case.low + spacing / 2)
+    return values, spacing, case.low + spacing / 2
 
 
 def level_set(kind: Kind, values: Array) -> FloatArray:
@@ -122,30 +108,21 @@ def noisy(case: Case, *, amplitude: float) -> Array:
 def unequal(case: Case, *, ratio: float, axis: str) -> Array:
     """Return exact distances at the case's samples along an axis, and more along the others."""
     size = case.setting.size
-    x, y, z = (size if letter == axis else round(size * ratio) for letter in AXES)
-    return sample_box(case.shape.solid, (x, y, z), case.side)
-
-
-def sample_box(solid: Solid, shape: tuple[int, int, int], side: float) -> FloatArray:
-    """Return the distances at the centres of the boxes into which a cube of some side is cut."""
-    spacing = side / np.array(shape)
-    values = np.empty(shape, np.float32)
-    flat = values.reshape(-1)
-    for start in range(0, flat.size, CHUNK):
-        numbers = np.arange(start, min(start + CHUNK, flat.size))
-        ijk = np.stack(np.unravel_index(numbers, shape), axis=1)
-        flat[numbers] = solid.signed_distance((ijk + 0.5) * spacing - side / 2)
-    return values
+    shape = [size if letter == axis else round(size * ratio) for letter in AXES]
+    layers = []
+    for plane in range(shape[0]):
+        ijk = np.indices((1, *shape[1:])).reshape(3, -1).T + np.array([plane, 0, 0])
+        points = ((ijk + 0.5) / shape - 0.5) * case.side
+        layers.append(case.shape.solid.signed_distance(points).reshape(shape[1:]))
+    return np.stack(layers).astype(np.float32)
 
 
 def truncated_kind(title: str, inside: float, outside: float) -> Kind:
-    """Return the kind of distances cut off at these voxels."""
     return Kind("truncated", f"cut off at {title}", lambda case: np.clip(
         case.coarse, -inside * case.spacing, outside * case.spacing))  # fmt: skip
 
 
 def unequal_kind(ratio: float, axis: str) -> Kind:
-    """Return the kind of grid that is coarser along an axis."""
     make = partial(unequal, ratio=ratio, axis=axis)
     return Kind("unequal", f"spacing 1:1:{ratio:g}", make, ("mc", "ours"), ratio=ratio, axis=axis)
 
@@ -183,7 +160,6 @@ KINDS = {kind.name: kind for kind in ALL_KINDS}
 def coarse_surface(
     kind: Kind, case: Case, network: Decoder, change: Callable[[Array], FloatArray] | None = None
 ) -> Surface:
-    """Mesh the values by marching cubes, as they are or changed."""
     values, spacing, origin = samples_of(kind, case)
     found = change(values) if change else level_set(kind, values)
     return Surface(closed_isosurface(found, spacing, origin))
@@ -195,14 +171,9 @@ def transformed(mask: Array) -> FloatArray:
     return np.where(mask > 0, 0.5 - into, out - 0.5).astype(np.float32)
 
 
-def smoothed(mask: Array, width: float) -> FloatArray:
-    """Return 1/2 less the values of a mask, smoothed by a Gaussian of a width in voxels."""
-    return 0.5 - ndimage.gaussian_filter(mask.astype(np.float32), width, mode="nearest")
-
-
 def spline_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
     """Mesh the cubic B-spline of the values at the fine nodes."""
-    found = interpolate_spline(level_set(kind, samples_of(kind, case).values), case.factor, 3)
+    found = interpolate_spline(level_set(kind, samples_of(kind, case)[0]), case.factor, 3)
     return Surface(closed_isosurface(found, case.fine, case.low))
 
 
@@ -231,10 +202,9 @@ def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
 BY_METHOD: dict[str, Callable[[Kind, Case, Decoder], Surface]] = {
     "mc": coarse_surface,
     "mc-distances": partial(coarse_surface, change=transformed),
-    **{
-        f"mc-gaussian-{width:g}": partial(coarse_surface, change=partial(smoothed, width=width))
-        for width in WIDTHS
-    },
+    **{f"mc-gaussian-{width:g}": partial(coarse_surface, change=lambda mask, width=width: (
+        0.5 - ndimage.gaussian_filter(mask.astype(np.float32), width, mode="nearest")))
+       for width in WIDTHS},
     "bspline": spline_of_kind,
     "ours": our_surface_of_kind,
-}
+}  # fmt: skip

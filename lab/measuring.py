@@ -28,6 +28,7 @@ from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.solid import Solid
 
 from . import edges, metrics
+from .kinds import MASKS
 from .methods import FLOOR, ON, make_surface
 from .shapes import RESULT_EDGES, RESULT_POINTS, Case, Setting, Shape
 from .surfaces import Surface
@@ -40,11 +41,11 @@ NO_SETTING = Setting(0, 0)  # of the floor: nothing is sampled
 VOXEL_NUMBERS = ("efv", "edge_distance", "angle_near", "angle_beyond")
 # Methods whose results do not depend on the code and the networks of this package.
 OF_OTHERS = (
-    *("mc", "mc-lewiner", "mc-distances", "trilinear", "bspline", "bound"),
+    *(*MASKS[:-1], "mc-lewiner", "trilinear", "bspline", "bound"),
     *(FLOOR, "dual-contouring", "ndc"),
 )
 # Folders of the package whose code does not change any surface.
-NOT_THE_METHOD = {"batch", "certificate", "cli", "cluster", "pages"}
+NOT_THE_METHOD = {"batch", "check", "cli", "labels", "pages"}
 
 
 @dataclass(frozen=True)
@@ -58,31 +59,24 @@ class Task:
     precision: str = AUTO_PRECISION
     threads: int = 0  # of the network; 0: one per core
     turned: int | None = None  # seed by which the shape is turned at random
-    limit: float | None = None  # seconds
     triangles: tuple[tuple[str, int], ...] = ()  # of methods that were measured before
 
     def network(self, method: str) -> tuple[str, str]:
-        """Return model and precision of a method."""
         model, _, precision = method.partition("@")[2].partition(":")
         return (model, precision or AUTO_PRECISION) if model else (self.model, self.precision)
 
     def key(self, method: str) -> Measurement:
         """Return the key of a method's measurement: it is valid as long as nothing here changes."""
+        is_others = method.partition("@")[0].partition(ON)[0] in OF_OTHERS
         return {
             "shape": self.path.stem,
             "mesh": digest_of_file(self.path),
             "turned": self.turned,
             **asdict(self.setting),
             "method": method,
-            "digest": digest_of_ours(*self.network(method)) if is_of_our_code(method) else "",
+            "digest": "" if is_others else digest_of_ours(*self.network(method)),
             "protocol": PROTOCOL,
         }
-
-
-def is_of_our_code(method: str) -> bool:
-    """Return whether a measurement depends on the code and the networks of this package."""
-    name = method.partition("@")[0].partition(ON)[0]
-    return name not in OF_OTHERS and not name.startswith("mc-gaussian")
 
 
 def measure_task(task: Task, shape: Shape) -> Iterator[tuple[str, Measurement]]:
@@ -98,7 +92,7 @@ def measure_task(task: Task, shape: Shape) -> Iterator[tuple[str, Measurement]]:
         figures = measure_method(shape, case, method, task)
         if case and "faces" in figures:
             case.triangles[method] = figures["faces"]
-        yield method, {**figures, "notes": list(shape.notes)}
+        yield method, figures
 
 
 @lru_cache(maxsize=4)
@@ -118,11 +112,11 @@ def measure_method(shape: Shape, case: Case | None, method: str, task: Task) -> 
         clock = time.perf_counter()
         surface = make_surface(method, case, network) if case else Surface(shape.mesh)
         seconds = time.perf_counter() - clock
-        if ON in method:
-            figures = measure_on_kind(shape, surface.mesh)
-        else:
-            figures = measure_surface(shape, surface.mesh, case.spacing if case else None)
-        figures |= measure_field(case, surface)
+        spacing = case.spacing if case else None
+        figures = measure_mesh(shape, surface.mesh, spacing, ON in method)
+        if case and surface.field:  # at the nodes of the band, each counted once
+            off = surface.field()[case.band].astype(np.float64) - case.truth[case.band]
+            figures |= {"field_mse": np.mean(off**2).item(), "field_mae": np.abs(off).mean().item()}
     except Exception as problem:  # named in the report; the other shapes still count
         return {"error": reason_of(problem)}
     return {**figures, **(surface.facts or {}), "seconds": seconds, "error": None}
@@ -140,62 +134,36 @@ def reason_of(problem: Exception) -> str:
     return f"{type(problem).__name__}: {message}{place}"
 
 
-def measure_surface(shape: Shape, mesh: Mesh, spacing: float | None) -> Measurement:
+def measure_mesh(shape: Shape, mesh: Mesh, spacing: float | None, is_kind: bool) -> Measurement:
     """Return the figures of a result's mesh; a mesh without faces counts as a dot at the origin.
 
-    ``spacing`` is that of the coarse grid; without one, figures in voxels are None.
+    ``spacing`` is that of the coarse grid; without one, figures in voxels are None. Results on a
+    kind of grid have no table of edges: without edges and angles they take half the time.
     """
-    figures, result, drawn, nearest = compare(shape, mesh)
+    result = Solid(mesh)
+    drawn = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS)).ordered()
+    there = metrics.distance_or_dot(result, shape.drawn.points)
+    back, nearest = metrics.nearest_or_dot(shape.solid, drawn.points)
+    figures: Measurement = {
+        **metrics.compare_samples(shape.drawn, drawn),
+        **metrics.compare_distances(there, back),
+        **{"closed": mesh.is_closed(), "outward": mesh.volume() > 0, "faces": len(mesh.faces)},
+    }
+    if is_kind:
+        volume_off = mesh.volume() / shape.mesh.volume() - 1
+        pieces = {"pieces": mesh.components()[0], "pieces_of_reference": shape.pieces}
+        return {**figures, "volume_off": volume_off, **pieces}
     in_voxels: Measurement = dict.fromkeys(VOXEL_NUMBERS)
     if spacing is not None:
         seed = shape.seed(RESULT_EDGES)
         in_voxels = edges.compare_in_voxels(shape.sharp, result, seed, spacing)
         in_voxels |= edges.compare_angles(shape.mesh, nearest, shape.sharp, drawn, spacing)
-    return {
-        **figures,
-        **edges.compare_edges(shape.sharp, edges.edge_points(drawn)),
-        **in_voxels,
-        **metrics.compare_triangles(mesh),
-    }
-
-
-def measure_on_kind(shape: Shape, mesh: Mesh) -> Measurement:
-    """Return the figures of a result on a kind of grid, which has no table of edges.
-
-    Without edges and angles it takes half the time.
-    """
-    return {
-        **compare(shape, mesh)[0],
-        "volume_off": mesh.volume() / shape.mesh.volume() - 1,
-        "pieces": mesh.components()[0],
-        "pieces_of_reference": shape.mesh.components()[0],
-    }
-
-
-def compare(
-    shape: Shape, mesh: Mesh
-) -> tuple[Measurement, Solid, metrics.SurfacePoints, metrics.Indices]:
-    """Return the figures of every result, its solid, its points, and the shape's nearest faces."""
-    result = Solid(mesh)
-    drawn = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS)).ordered()
-    there = metrics.distance_or_dot(result, shape.drawn.points)
-    back, nearest = metrics.nearest_or_dot(shape.solid, drawn.points)
-    state = {"closed": mesh.is_closed(), "outward": mesh.volume() > 0, "faces": len(mesh.faces)}
-    figures = metrics.compare_samples(shape.drawn, drawn)
-    return {**figures, **metrics.compare_distances(there, back), **state}, result, drawn, nearest
-
-
-def measure_field(case: Case | None, surface: Surface) -> Measurement:
-    """Return the mean squared and absolute errors at the nodes of the band, each counted once."""
-    if case is None or surface.field is None:
-        return {"field_mse": None, "field_mae": None}
-    error = surface.field()[case.band].astype(np.float64) - case.truth[case.band]
-    return {"field_mse": float(np.mean(error**2)), "field_mae": float(np.abs(error).mean())}
+    figures |= edges.compare_edges(shape.sharp, edges.edge_points(drawn))
+    return {**figures, **in_voxels, **metrics.compare_triangles(mesh)}
 
 
 @cache
 def digest_of_file(path: Path) -> str:
-    """Return a hash of a file's content."""
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 

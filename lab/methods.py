@@ -12,9 +12,10 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from scipy import ndimage
 
-from super_sdf.arrays import FloatArray, IntArray
+from super_sdf.arrays import FloatArray
 from super_sdf.errors import NoSurfaceError, OptionError
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.decoder import Decoder
@@ -39,12 +40,13 @@ ON = " on "
 WITHIN, ERROR = "within", 0.02  # simplified within this error, in voxels
 
 Method = Callable[[Case, Decoder], Surface]
-# What tables call each method.
+# What tables call each method; kinds of a method follow its name: "mc-gaussian-0.5".
 LABELS = {
-    "mc": "MC",
-    "mc-lewiner": "MC, Lewiner's table",
-    "trilinear": "trilinear + MC",
-    "bspline": "B-spline + MC",
+    "mc": "marching cubes",
+    "mc-lewiner": "marching cubes, Lewiner's table",
+    "mc-distances": "marching cubes of SciPy's distance transform",
+    "trilinear": "trilinear + marching cubes",
+    "bspline": "B-spline + marching cubes",
     OURS: "super-sdf",
     "bound": "bound: true distance at the nodes",
     FLOOR: "floor: the reference against itself",
@@ -108,25 +110,18 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     field = np.pad(field, [(0, (nodes + 1) % 2) for nodes in field.shape], mode="edge")  # even
     factor = FACTOR_OF_BLOCKS if (len(field) - 1) % FACTOR_OF_BLOCKS == 0 else 2
     shape = tuple((nodes - 1) // factor for nodes in field.shape)
-    block = block_ijk(factor)
-    inside = np.stack([_node_of_blocks(field, node, factor) <= 0 for node in block])
-    crossed = ndimage.binary_dilation(inside.any(0) & ~inside.all(0), np.ones((3, 3, 3)), 2)
+    whole = sliding_window_view(field, (factor + 1,) * 3)[::factor, ::factor, ::factor]
+    inside = whole.reshape(*shape, -1) <= 0
+    crossed = ndimage.binary_dilation(inside.any(-1) & ~inside.all(-1), np.ones((3, 3, 3)), 2)
     voxel_ijk = np.argwhere(crossed).astype(np.int32)
-    values = [_node_of_blocks(field, node, factor)[crossed] for node in block]
-    parts = share_parts(neighbour_table(voxel_ijk, shape))
     side = spacing * factor
-    blocks = np.stack(values) * np.float32(2 / side)
-    middle = blocks[len(block) // 2]
-    spheres = SampleSpheres(shape, voxel_ijk, middle)
+    blocks = whole[crossed].reshape(len(voxel_ijk), -1).T * np.float32(2 / side)
+    blocks = np.ascontiguousarray(blocks)
+    spheres = SampleSpheres(shape, voxel_ijk, blocks[len(blocks) // 2])
+    parts = share_parts(neighbour_table(voxel_ijk, shape))
     fine = FineField(shape, factor, voxel_ijk, blocks, parts, spheres=spheres)
-    grid = SdfGrid.trusted(_node_of_blocks(field, block[0], factor), side, low + side / 2)
+    grid = SdfGrid.trusted(whole[..., 0, 0, 0], side, low + side / 2)
     return extract_mesh(fine, grid, mesher=SHARP)
-
-
-def _node_of_blocks(field: FloatArray, node: IntArray, factor: int) -> FloatArray:
-    """Return one node of every block of a dense field."""
-    first = tuple(slice(start, start + n - factor, factor) for start, n in zip(node, field.shape))
-    return field[first]
 
 
 def dual_contouring(case: Case, network: Decoder) -> Surface:
@@ -161,7 +156,6 @@ BY_NAME: dict[str, Method] = {
 
 
 def make_surface(method: str, case: Case, network: Decoder) -> Surface:
-    """Return the surface that a method makes of a case."""
     name, _, kind = method.partition("@")[0].partition(ON)
     if kind:
         return BY_METHOD[name](KINDS[kind], case, network)

@@ -37,11 +37,9 @@ class SurfacePoints:
 
     @cached_property
     def tree(self) -> cKDTree:
-        """A search tree of the points."""
         return cKDTree(self.points)
 
     def ordered(self) -> SurfacePoints:
-        """Return the same points in the order of ``order_in_space``."""
         order = order_in_space(self.points)
         return SurfacePoints(self.points[order], self.normals[order])
 
@@ -112,7 +110,6 @@ def normal_agreement(normals: Points, others: Points) -> tuple[float, float]:
 
 
 def harmonic_mean(recall: float, precision: float) -> float:
-    """Return 2rp/(r + p), 0 if both are 0."""
     total = recall + precision
     return float(2 * recall * precision / total) if total > 0 else 0.0
 
@@ -145,7 +142,6 @@ def nearest_or_dot(solid: Solid, points: Points) -> tuple[Distances, Indices]:
 
 
 def distance_or_dot(solid: Solid, points: Points) -> Distances:
-    """Return the distances of ``nearest_or_dot``, (n,)."""
     return nearest_or_dot(solid, points)[0]
 
 

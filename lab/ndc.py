@@ -8,11 +8,11 @@ it is in this one: the option ``--ndc`` names a checkout.
 from __future__ import annotations
 
 import os
+import sys
 from argparse import ArgumentParser
 from functools import lru_cache
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -29,7 +29,6 @@ PADDING, FAR, CLIPPED = 3, 10.0, 2.0  # samples of the receptive field; voxels, 
 
 
 def add_ndc(parser: ArgumentParser) -> None:
-    """Add the option that names a checkout of NDC."""
     parser.add_argument("--ndc", type=name_folder, metavar="FOLDER", help="checkout of NDC c036901")
 
 
@@ -43,13 +42,13 @@ def neural_dual_contouring(case: Case, network: Decoder) -> Surface:
     """Mesh the grid by NDC; a sample lies at whole numbers of its lattice."""
     import torch
 
+    net, contour = peer()
     distances = np.asarray(case.grid.values, np.float32) / np.float32(case.spacing)
     far = np.copysign(FAR, distances[0, 0, 0])
     padded = np.pad(distances, PADDING, constant_values=far).clip(-CLIPPED, CLIPPED)
     with torch.no_grad():
-        inner = _network()(torch.from_numpy(padded)[None, None])[0].clamp(0, 1)
+        inner = net(torch.from_numpy(padded)[None, None])[0].clamp(0, 1)
     places = np.ascontiguousarray(np.moveaxis(inner.numpy(), 0, 3))
-    contour = _module("utils").dual_contouring_ndc_test
     vertices, triangles = contour((distances < 0).astype(np.int32), places)
     if not len(triangles):
         return Surface(EMPTY)
@@ -58,27 +57,16 @@ def neural_dual_contouring(case: Case, network: Decoder) -> Surface:
 
 
 @lru_cache(maxsize=1)
-def _network() -> Any:
-    """Return the network for distances, with its weights."""
+def peer() -> tuple[Any, Any]:
+    """Return the network for distances, with its weights, and the function that meshes."""
     import torch
 
-    net = _module("model").CNN_3d_rec7(out_bool=False, out_float=True)
-    weights = torch.load(_path("network_float.pth"), map_location="cpu", weights_only=True)
-    net.load_state_dict(weights)
-    return net.eval()
-
-
-@lru_cache
-def _module(name: str) -> ModuleType:
-    spec = spec_from_file_location(f"ndc_{name}", _path(f"{name}.py"))
-    assert spec and spec.loader
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-def _path(name: str) -> Path:
-    path = Path(os.environ.get(FOLDER, ""), name)
-    if FOLDER not in os.environ or not path.exists():
-        raise OptionError(f"{path} is missing: give a checkout of NDC at c036901 (--ndc FOLDER)")
-    return path
+    folder = Path(os.environ.get(FOLDER, ""))
+    weights = folder / "network_float.pth"
+    if not weights.exists():
+        raise OptionError(f"{weights} is missing: give a checkout of NDC at c036901 (--ndc FOLDER)")
+    sys.path.insert(0, str(folder))
+    model, utils = import_module("model"), import_module("utils")
+    net = model.CNN_3d_rec7(out_bool=False, out_float=True)
+    net.load_state_dict(torch.load(weights, map_location="cpu", weights_only=True))
+    return net.eval(), utils.dual_contouring_ndc_test

@@ -2,24 +2,21 @@
 
 Rows are appended as they come, so a kill costs only the tasks under way. A row is valid as long as
 its key is asked for; a line that is damaged is measured again. A process that crashes, or runs out
-of memory or time, fails the method that it was at, and harms no other.
+of memory, fails the method that it was at, and harms no other.
 """
 
 from __future__ import annotations
 
 import json
 import multiprocessing
-import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
-
-from super_sdf.errors import WriteError
 
 from .measuring import Measurement, Task, measure_task, reason_of
 from .shapes import Shape
@@ -42,16 +39,9 @@ class Rows:
                 self.rows[name_of(record["key"])] = record
 
     def add(self, key: Key, figures: Row) -> None:
-        """Keep a row, in memory and in the file."""
         record = {"key": dict(key), **figures}
-        try:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(record) + "\n")
-        except OSError as error:
-            raise WriteError(
-                f"{self.path} cannot be written: {error.strerror}; the rows in it are kept, and "
-                "the same command goes on from there"
-            ) from error
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
         self.rows[name_of(key)] = record
 
     def get(self, key: Key) -> Row | None:
@@ -61,39 +51,23 @@ class Rows:
             return None
         return {**record["key"], **{name: v for name, v in record.items() if name != "key"}}
 
-    def is_final(self, key: Key, limit: float | None = None) -> bool:
-        """Return whether a row need not be measured again.
-
-        A failure may have a passing cause, so it is measured again. What ran out of time is
-        measured again only with a higher limit.
-        """
-        row = self.get(key)
-        if row is None or row.get("error") is None:
-            return row is not None
-        return limit is not None and row.get("limit") is not None and row["limit"] >= limit
+    def is_final(self, key: Key) -> bool:
+        """Return whether a row need not be measured again; a failure may have a passing cause."""
+        return (self.get(key) or {"error": ""})["error"] is None
 
 
 def name_of(key: Key) -> str:
-    """Return a key as text."""
     return json.dumps(key, sort_keys=True)
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A shape that could not be measured, or not everywhere, and why."""
-
-    shape: str
-    reason: str
 
 
 def complete(
     tasks: Sequence[Task], rows: Rows, jobs: int, on_task: OnTask | None = None
-) -> list[LeftOut]:
+) -> list[str]:
     """Measure what the rows lack and keep it there; return the shapes that could not be read."""
     left = [
         replace(
             task,
-            methods=tuple(m for m in task.methods if not rows.is_final(task.key(m), task.limit)),
+            methods=tuple(m for m in task.methods if not rows.is_final(task.key(m))),
             triangles=tuple((m, row["faces"]) for m in task.methods
                             if "faces" in (row := rows.get(task.key(m)) or {})),
         )
@@ -103,7 +77,7 @@ def complete(
     unreadable = []
     for done, (task, outcome) in enumerate(outcomes(left, jobs), 1):
         if isinstance(outcome, str):
-            unreadable.append(LeftOut(task.path.stem, outcome))
+            unreadable.append(f"{task.path.stem}: {outcome}")
         else:
             for method, figures in outcome.items():
                 rows.add(task.key(method), figures)
@@ -136,23 +110,16 @@ def outcomes(
                     outcome = pool.submit(measured, replace(task, methods=(method,))).result()
                 figures |= {method: {"error": outcome}} if isinstance(outcome, str) else outcome
             except BrokenProcessPool:
-                late = {"limit": task.limit} if task.limit else {}
-                figures[method] = {"error": f"its process died (limit: {task.limit} s)", **late}
+                figures[method] = {"error": "its process died"}
         yield task, figures
 
 
 def measured(task: Task) -> dict[str, Measurement] | str:
-    """Return the figures of each method of a task, or why its shape cannot be read.
-
-    At the limit of the task the process is ended.
-    """
-    signal.setitimer(signal.ITIMER_REAL, task.limit or 0)  # 0: none
+    """Return the figures of each method of a task, or why its shape cannot be read."""
     try:
         return dict(measure_task(task, shape_of(task.path, task.turned)))
     except Exception as problem:  # the other shapes still count
         return reason_of(problem)
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 @lru_cache(maxsize=1)

@@ -47,12 +47,9 @@ class Setting:
     scale: float = 0.0  # longest side of the box over the grid's; 0: the grid's is the diagonal
 
     def check(self) -> None:
-        """Raise OptionError if a number is out of range."""
         check_factor(self.factor)
-        if self.size < 4:
-            raise OptionError(f"size is {self.size}: give at least 4 samples along an axis")
-        if self.size > LARGEST_SIZE:
-            raise OptionError(f"size is {seen(self.size)}: give at most {LARGEST_SIZE:,} samples")
+        if not 4 <= self.size <= LARGEST_SIZE:
+            raise OptionError(f"size is {seen(self.size)}: give 4 to {LARGEST_SIZE:,} samples")
 
     def __str__(self) -> str:
         parts = {"noise": self.noise, "scale": self.scale}
@@ -67,9 +64,9 @@ class Shape:
         self.name = name
         self.solid = Solid(normalise(mesh))
         self.mesh = self.solid.mesh
-        self.notes: Sequence[str] = ()
         self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
         self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
+        self.pieces = self.mesh.components()[0]
 
     @classmethod
     def read(cls, path: Path, turned: int | None = None) -> Shape:
@@ -78,19 +75,15 @@ class Shape:
         With a seed ``turned`` it is turned at random, the same way for the same seed and name,
         before it is put into the frame.
         """
-        solid, notes = load_solid(path)
+        mesh = load_solid(path)[0].mesh
         turn = np.eye(3) if turned is None else turn_of(path.stem, turned)
-        shape = cls(path.stem, solid.mesh.transformed(turn, np.zeros(3)))
-        shape.notes = notes
-        return shape
+        return cls(path.stem, mesh.transformed(turn, np.zeros(3)))
 
     def seed(self, stream: int) -> tuple[int, int]:
-        """Return the seed of a stream of random numbers."""
         return name_seed(self.name, stream)
 
 
 def name_seed(name: str, stream: int) -> tuple[int, int]:
-    """Return the seed of a stream of random numbers of a shape."""
     return zlib.crc32(name.encode(errors="surrogateescape")), stream
 
 
@@ -152,8 +145,22 @@ class Case:
 
     @cached_property
     def truth(self) -> FloatArray:
-        """Exact distances at the fine nodes, (K n + 1)^3: see ``exact_field``."""
-        return exact_field(self)
+        """Signed distances at the fine nodes, (K n + 1)^3.
+
+        They are exact in the band and at every cell that the surface may cross: a node of such a
+        cell is within sqrt(3) h/K of the surface, so the sample of its block is within sqrt(3)
+        (1/2 + 1/K) h. Elsewhere they are the nearest sample, which has the right sign.
+        """
+        factor, coarse = self.factor, self.coarse
+        reach = 3**0.5 * (0.5 + 1 / factor) * self.spacing
+        nearest = [np.minimum(np.arange(factor * n + 1) // factor, n - 1) for n in coarse.shape]
+        field = coarse[np.ix_(*nearest)]
+        nodes = np.argwhere(self.band | spread_to_nodes(np.abs(coarse) < reach, factor))
+        samples = np.minimum(nodes // factor, self.setting.size - 1)
+        apart = np.linalg.norm(nodes - factor * (samples + 0.5), axis=1) * self.fine
+        points, known = nodes * self.fine + self.low, coarse[tuple(samples.T)]
+        field[tuple(nodes.T)] = signed_from_samples(self.shape.solid, points, known, apart)
+        return field
 
 
 def spread_to_nodes(voxels: BoolArray, factor: int) -> BoolArray:
@@ -165,27 +172,6 @@ def spread_to_nodes(voxels: BoolArray, factor: int) -> BoolArray:
             target[offset : offset + factor * (len(source) - 1) + 1 : factor] |= source
         voxels = np.moveaxis(target, 0, axis)
     return voxels
-
-
-def exact_field(case: Case) -> FloatArray:
-    """Return the signed distances at the fine nodes, (K n + 1)^3.
-
-    They are exact in the band and at every cell that the surface may cross: a node of such a cell
-    is within sqrt(3) h/K of the surface, so the sample of its block is within
-    sqrt(3) (1/2 + 1/K) h. Elsewhere they are the nearest sample, which has the right sign.
-    """
-    factor = case.factor
-    reach = 3**0.5 * (0.5 + 1 / factor) * case.spacing
-    nearest = [np.minimum(np.arange(factor * n + 1) // factor, n - 1) for n in case.coarse.shape]
-    field = case.coarse[np.ix_(*nearest)]
-    nodes = np.argwhere(case.band | spread_to_nodes(np.abs(case.coarse) < reach, factor))
-    samples = np.minimum(nodes // factor, case.setting.size - 1)
-    steps = nodes - factor * (samples + 0.5)
-    apart = np.linalg.norm(steps, axis=1) * case.fine
-    field[tuple(nodes.T)] = signed_from_samples(
-        case.shape.solid, nodes * case.fine + case.low, case.coarse[tuple(samples.T)], apart
-    )
-    return field
 
 
 def signed_from_samples(

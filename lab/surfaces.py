@@ -76,6 +76,5 @@ def closed_isosurface(field: FloatArray, spacing: ArrayLike, low: ArrayLike) -> 
 
 
 def stretched(mesh: Mesh, spacing: ArrayLike, low: ArrayLike) -> Mesh:
-    """Return a mesh in samples as one in the world."""
     step = np.broadcast_to(np.asarray(spacing, np.float64), 3)
     return mesh.transformed(np.diag(step), np.broadcast_to(np.asarray(low, np.float64), 3))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,8 +22,9 @@ class Column:
     scale: float = 1.0
     digits: int = 3
 
-    def cell(self, figure: Any) -> str:
-        """Return a figure as text, "-" if it is unknown."""
+    def cell(self, row: Mapping[str, Any]) -> str:
+        """Return the figure of a row as text, "-" if it is unknown."""
+        figure = row.get(self.key)
         if figure is None or isinstance(figure, str):
             return figure or "-"
         return f"{figure * self.scale:,.{self.digits}f}"
@@ -34,26 +35,36 @@ P2S = Column("p2s x1e4", "p2s", 1e4, 2)
 THERE = Column("ref to res", "p2s_there", 1e4, 2)
 BACK = Column("res to ref", "p2s_back", 1e4, 2)
 EF1 = Column("EF1", "ef1")
+MAE = Column("field MAE x1e4", "field_mae", 1e4, 2)
 TRIANGLES = Column("triangles", "faces", 1, 0)
+SLIVERS = Column("slivers %", "slivers", 100, 2)
+SECONDS = Column("seconds", "seconds", 1, 2)
 SURFACE = (
     *(CD, Column("excess CD x1e5", "excess_cd", 1e5), F1, NC, Column("signed NC", "signed_nc")),
     *(P2S, THERE, BACK),
     *(Column("p99 x1e4", "p99", 1e4, 1), Column("max x1e4", "max", 1e4, 0)),
     *(Column("ECD x1e5", "ecd", 1e5, 2), EF1),
-    *(Column("field MSE x1e6", "field_mse", 1e6), Column("field MAE x1e4", "field_mae", 1e4, 2)),
-    TRIANGLES,
+    *(Column("field MSE x1e6", "field_mse", 1e6), MAE, TRIANGLES),
 )
 EDGES = (
     *(EF1, Column("EFv", "efv"), Column("edge distance", "edge_distance")),
     *(Column("angle near", "angle_near", 1, 2), Column("angle beyond", "angle_beyond", 1, 2)),
-    *(TRIANGLES, Column("slivers %", "slivers", 100, 2), Column("min angle", "min_angle", 1, 2)),
+    *(TRIANGLES, SLIVERS, Column("min angle", "min_angle", 1, 2)),
 )
-COST = (Column("mean s", "seconds", 1, 2),)
-GAPS = {  # the last is one-sided: lost thin parts do not count
-    **{"f1": "F1", "nc": "NC", "p2s": "point to surface"},
-    "p2s_back": "result to reference",
-}
-BY_KEY = {column.key: column for column in (*SURFACE, *EDGES)}
+GAPS = {"f1": "F1", "nc": "NC", "p2s": "point to surface", "p2s_back": "result to reference"}
+GAP = Column("F1 gap closed %", "gap_f1", 100, 0)
+PEAK = Column("peak MB", "peak_mb", 1, 0)
+SHORT, COSTS = (F1, NC), (SECONDS, PEAK)
+NETWORKS = (F1, NC, THERE, BACK, EF1, MAE, GAP)
+MESHERS = (F1, NC, THERE, BACK, *EDGES[:-1])
+PEERS = (*MESHERS, SECONDS)
+SETTINGS = (CD, F1, NC, P2S, BACK, GAP)
+SIMPLIFIED = (Column("triangles left %", "left", 100, 1), TRIANGLES, THERE, BACK, SLIVERS)
+DENSE = (SECONDS, PEAK, Column("time over ours", "over_seconds", 1, 1),
+         Column("memory over ours", "over_peak_mb", 1, 1))  # fmt: skip
+LARGE = (Column("tiles", "tiles", 1, 0), Column("band voxels", "band_voxels", 1, 0),
+         Column("triangles", "triangles", 1, 0), SECONDS, PEAK)  # fmt: skip
+BY_KEY = {column.key: column for column in (*SURFACE, *EDGES, SECONDS)}
 
 
 def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -62,92 +73,73 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(head + [f"| {' | '.join(row)} |" for row in rows])
 
 
-def mean_of(rows: Sequence[Row], key: str) -> float | None:
-    """Return the mean of a figure over the rows that have it; of ``..._max`` the maximum."""
-    name = key.removesuffix("_max")
-    figures = [row[name] for row in rows if row.get(name) is not None]
-    if not figures:
-        return None
-    return float(max(figures) if key.endswith("_max") else np.mean(figures))
-
-
-def cells(figures: Mapping[str, Any], columns: Sequence[Column]) -> list[str]:
-    """Return the cells of figures by key."""
-    return [column.cell(figures.get(column.key)) for column in columns]
-
-
-def summary(rows: Sequence[Row]) -> Row:
-    """Return means of all figures over shapes, how many those are, and how many are closed."""
-    columns = [*BY_KEY.values(), *COST]
-    found = {column.key: mean_of(rows, column.key) for column in columns}
-    return {**found, "shapes": len(rows), "closed": sum(row["closed"] for row in rows)}
-
-
-def method_of(row: Row) -> list[str]:
-    """Return what tables call the method of a row."""
-    return [label_of(row["method"])]
-
-
 def listed(
-    rows: Iterable[Row],
-    columns: Sequence[Column],
-    words: Callable[[Row], list[str]] = method_of,
-    heads: Sequence[str] = ("method",),
+    rows: Iterable[Row], columns: Sequence[Column], words: Sequence[str] = ("method",)
 ) -> str:
-    """Return a line for each row: words under ``heads``, figures, and how many are closed."""
-    body, last = [], []
-    for row in rows:
-        last = ["closed"] if "closed" in row else []
-        body.append([*words(row), *cells(row, columns), *(closed_of(row) for _ in last)])
-    return markdown([*heads, *(column.title for column in columns), *last], body)
+    """Return a line for each row: some of its words, figures, and how many meshes are closed."""
+    rows = list(rows)
+    last = ["closed"] if any("closed" in row for row in rows) else []
+    body = [
+        [
+            *(word_of(row, word) for word in words),
+            *(column.cell(row) for column in columns),
+            *(f"{row['closed']} of {row['shapes']}" if "closed" in row else "-" for _ in last),
+        ]
+        for row in rows
+    ]
+    return markdown([*words, *(column.title for column in columns), *last], body)
 
 
-def closed_of(row: Row) -> str:
-    """Return how many meshes are closed."""
-    return f"{row['closed']:d} of {row.get('shapes', row.get('grids', 1))}"
+def wide(rows: Iterable[Row], word: str, columns: Sequence[Column]) -> str:
+    """Return a line for each method or other word, with the columns of each size side by side."""
+    found = {(word_of(row, word), row["size"]): row for row in rows}
+    names, sizes = (list(dict.fromkeys(keys)) for keys in zip(*found))
+    heads = [f"{n}^3, {c.title}" if len(columns) > 1 else f"{n}^3" for n in sizes for c in columns]
+    body = [[name, *(c.cell(found.get((name, n), {})) for n in sizes for c in columns)]
+            for name in names]  # fmt: skip
+    return markdown([word, *heads], body)
 
 
-def surface_table(
-    rows: Iterable[Row], size: int, words: Callable[[Row], list[str]] = method_of
-) -> str:
-    """Return all columns of all methods at a size, the published rows below ours."""
-    published = (f"| {' | '.join([*row, '-'])} |" for row in published_rows(size, SURFACE))
-    return "\n".join([listed(rows, SURFACE, words), *published])
-
-
-def published_rows(size: int, columns: Sequence[Column]) -> list[list[str]]:
-    """Return the published rows of a size, marked as such; "-" where a figure is not given."""
-    rows = []
-    for name, (cd, f1, nc) in published.SURFACES.get(size, {}).items():
-        mse, mae = published.FIELDS[size].get(name, (None, None))
-        given = {"cd": cd * 1e-5, "f1": f1, "nc": nc, "field_mse": mse, "field_mae": mae}
-        rows.append([f"*{name}, published, Thingi30*", *cells(given, columns)])
-    return rows
+def word_of(row: Row, key: str) -> str:
+    value = row.get(key, "-")
+    shown = label_of(value) if key == "method" else f"{value}^3" if key == "size" else f"{value}"
+    return f"`{shown}`" if shown.startswith("--") else shown
 
 
 def label_of(method: str) -> str:
     """Return what tables call a method: of ``ours-marching@fast`` super-sdf, marching, fast."""
+    if method.startswith("*"):
+        return method
     name, _, model = method.partition("@")
     name, _, share = name.partition("/")
     plain = name if name in LABELS else name.partition("-")[0]
-    words, mesher = [LABELS.get(plain, plain)], name[len(plain) + 1 :]
-    words += [mesher] if mesher else []
-    words += [model.replace(":", ", ")] if model else []
+    words = [LABELS.get(plain, plain), name[len(plain) + 1 :], model.replace(":", ", ")]
     if share:
         words.append(f"1/{share}" if share.isdigit() else f"as many triangles as {LABELS[share]}")
-    return ", ".join(words)
+    return ", ".join(filter(None, words))
 
 
-def gap_closed(
-    ours: Sequence[Row], base: Sequence[Row], bound: Sequence[Row], key: str
-) -> float | None:
-    """Return the share of the gap from B-spline to the bound that ours closes, of the means."""
-    mine, start, end = (mean_of(rows, key) for rows in (ours, base, bound))
-    if mine is None or start is None or end is None or end == start:
-        return None
-    return (mine - start) / (end - start)
+def mean_of(rows: Sequence[Row], key: str) -> float | None:
+    figures = [row[key] for row in rows if row.get(key) is not None]
+    return float(np.mean(figures)) if figures else None
 
 
-def percent(share: float | None, digits: int = 0) -> str:
-    """Return a share as text in percent, "-" if it is unknown."""
-    return "-" if share is None else f"{100 * share:.{digits}f} %"
+def summary(rows: Sequence[Row]) -> Row:
+    """Return means of all figures over shapes, how many those are, and how many are closed."""
+    means = {key: mean_of(rows, key) for key in BY_KEY}
+    return {**means, "shapes": len(rows), "closed": sum(row["closed"] for row in rows)}
+
+
+def gaps_closed(ours: Sequence[Row], base: Sequence[Row], bound: Sequence[Row]) -> Row:
+    """Return the shares of the gap from one method to the bound that ours closes, of the means."""
+    found = {}
+    for key in GAPS:
+        mine, start, end = (mean_of(rows, key) for rows in (ours, base, bound))
+        if mine is not None and start is not None and end is not None and end != start:
+            found[f"gap_{key}"] = (mine - start) / (end - start)
+    return found
+
+
+def surface_table(rows: Iterable[Row], size: int) -> str:
+    """Return all columns of all methods at a size, the published rows below ours."""
+    return listed([*rows, *published.surfaces(size)], SURFACE)

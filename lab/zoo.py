@@ -21,11 +21,11 @@ import numpy as np
 import SimpleITK as sitk  # noqa: N813
 from scipy import ndimage
 
-from super_sdf import Mesh, load_network, make_grid, reconstruct
+from super_sdf import load_network, make_grid, reconstruct
 from super_sdf.errors import SuperSdfError
 from super_sdf.network.decoder import Decoder
 
-from . import forms, parser_of
+from . import parser_of
 from .kinds import without_unknown
 from .metrics import distance
 from .surfaces import closed_isosurface
@@ -68,30 +68,38 @@ def at(p: Array, n: int, turn: Array | None = None) -> Array:
     return np.moveaxis(q if turn is None else q @ turn, -1, 0)
 
 
+def sphere(x: Array, y: Array, z: Array, at: float = 0.0, radius: float = 0.3) -> Array:
+    return np.sqrt((x - at) ** 2 + y**2 + z**2) - radius
+
+
+def box(xyz: Array, *sides: float) -> Array:
+    off = np.stack([np.abs(u) - side for u, side in zip(xyz, sides)])
+    return np.sqrt((np.maximum(off, 0) ** 2).sum(0)) + np.minimum(off.max(0), 0)
+
+
 def ball(p: Array, n: int, radius: float = 0.31) -> Array:
-    """Return the distance to a ball."""
-    return n * forms.ball(*at(p, n), 0, radius)
+    return n * sphere(*at(p, n), 0, radius)
 
 
 def body(p: Array, n: int) -> Array:
     """Return the distance to a tilted torus with a ball in its hole."""
-    q = at(p, n, TURN)
-    return n * np.minimum(forms.torus(*q, 0.3, 0.1), forms.ball(*q, 0, 0.11))
+    x, y, z = at(p, n, TURN)
+    torus = np.hypot(np.hypot(x, y) - 0.3, z) - 0.1
+    return n * np.minimum(torus, sphere(x, y, z, 0, 0.11))
 
 
 def block(p: Array, n: int, sides=(0.3, 0.22, 0.15)) -> Array:
-    """Return the distance to a turned box."""
-    return n * forms.box(*at(p, n, TURN), *sides)
+    return n * box(at(p, n, TURN), *sides)
 
 
 def bar(p: Array, n: int) -> Array:
     """Return the distance to a box along the axes, its faces on samples."""
-    return forms.box(*np.moveaxis(p - n // 2, -1, 0), n // 3, n // 4, n // 6)
+    return box(np.moveaxis(p - n // 2, -1, 0), n // 3, n // 4, n // 6)
 
 
 def quadric(p: Array, n: int) -> Array:
-    """Return the polynomial of an ellipsoid, 0 on it and -1 in the middle."""
-    return forms.quadric(*at(p, n))
+    x, y, z = at(p, n)
+    return (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.2) ** 2 - 1
 
 
 def cut_quadric(p: Array, n: int) -> Array:
@@ -102,13 +110,24 @@ def cut_quadric(p: Array, n: int) -> Array:
 
 
 def smooth_union(p: Array, n: int) -> Array:
-    """Return two balls with a smooth joint."""
-    one, other = (forms.ball(*at(p, n), x, 0.2) for x in (-0.15, 0.17))
-    return n * forms.smooth_union(one, other, 0.1)
+    one, other = (sphere(*at(p, n), x, 0.2) for x in (-0.15, 0.17))
+    blend = np.maximum(0.1 - np.abs(one - other), 0) / 0.1
+    return n * (np.minimum(one, other) - blend**2 * 0.1 / 4)
+
+
+def gyroid(p: Array, n: int) -> Array:
+    x, y, z = 9 * at(p, n)
+    wave = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+    return np.maximum(wave, sphere(x, y, z, 0, 0.4 * 9))
+
+
+def metaballs(p: Array, n: int) -> Array:
+    x, y, z = at(p, n)
+    middles = ((-0.15, 0.0, 0.0), (0.15, 0.05, 0.0), (0.0, -0.15, 0.1))
+    return sum(np.exp(-((x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2) / 0.02) for a, b, c in middles)
 
 
 def places(shape, steps=(1.0, 1.0, 1.0)) -> Array:
-    """Return the places of the samples of a grid of some shape, in voxels."""
     return np.moveaxis(np.indices(shape), 0, -1) * np.array(steps)
 
 
@@ -149,23 +168,19 @@ def kind(
 
 
 def random(shape) -> Array:
-    """Return random numbers from -1 to 1."""
     return np.random.default_rng(0).uniform(-1, 1, shape)
 
 
 def transforms(d: Array) -> tuple[Array, Array]:
-    """Return SciPy's distance transforms outside and inside."""
     return tuple(ndimage.distance_transform_edt(side) for side in (d > 0, d <= 0))
 
 
 def signed_transform(d: Array) -> Array:
-    """Return the difference of SciPy's distance transforms."""
     out, into = transforms(d)
     return out - into
 
 
 def by_itk(call: Callable[[Any], Any]) -> Form:
-    """Return the change that ITK makes of a mask."""
 
     def change(d: Array) -> Array:
         return sitk.GetArrayFromImage(call(sitk.GetImageFromArray((d <= 0).astype(np.uint8))))
@@ -190,7 +205,6 @@ def bordered(value: float) -> Form:
 
 
 def sigmoid(d: Array, width: float = 0.7) -> Array:
-    """Return 1 deep inside, 1/2 on the surface."""
     return 1 / (1 + np.exp(np.clip(d / width, -60, 60)))
 
 
@@ -367,8 +381,8 @@ kind("quadric", quadric, **AS_IT_IS)
 kind("quadric, in world units", quadric, lambda f: f * 3 * H)
 kind("CSG of quadrics", cut_quadric, **AS_IT_IS)
 kind("CSG of quadrics, no spacing", cut_quadric, **AS_IT_IS, **NO_SPACING)
-kind("gyroid", lambda p, n: forms.gyroid(*at(p, n), 9), **AS_IT_IS)
-kind("metaballs", lambda p, n: 0.6 - forms.blobs(*at(p, n)), **AS_IT_IS, **ABOVE)
+kind("gyroid", gyroid, **AS_IT_IS)
+kind("metaballs", metaballs, **AS_IT_IS, **ABOVE)
 kind("smooth union", smooth_union)
 kind("smooth union, thirds", smooth_union, lambda d: 3 * d * H)
 kind("CSG by max, no distances", lambda p, n: np.maximum(quadric(p, n) * n / 8, -ball(p, n, 0.1)))
@@ -411,35 +425,15 @@ def level_set(sample: Kind, options: dict[str, Any]) -> tuple[Array, Form]:
     return without_unknown(np.where(np.isfinite(found), found, np.nan)), form
 
 
-def true_mesh(form: Form, shape: Array, steps: Array) -> Mesh:
-    """Return marching cubes of a form on a fine lattice over a grid, in voxels."""
-    fine = form(places(FINE * (shape - 1) + 1, steps / FINE)).astype(np.float32)
-    return closed_isosurface(fine, steps / FINE, 0.0)
-
-
 @dataclass(frozen=True)
 class Outcome:
     """What came of a call: refused with a message, or errors in voxels."""
 
     options: str
+    verdict: str  # "refused", "right", "worse" or "volume"
     message: str = ""
     ours: float = float("nan")
     theirs: float = float("nan")
-    volume: float = 0.0
-
-    @property
-    def verdict(self) -> str:
-        """Return "refused", "right", "worse" or "volume"."""
-        if self.message:
-            return "refused"
-        if self.volume > VOLUME_OFF:
-            return "volume"
-        return "right" if self.ours <= WORSE * self.theirs + MARGIN else "worse"
-
-
-def spacing_of(words: str) -> list[float] | str:
-    """Return a spacing; as it stands if it is only named, since the user knows it."""
-    return words if "X" in words else [*map(float, words.split(","))]
 
 
 NUMBER = r"-?[\d.]+(?:e[+-]?\d+)?"
@@ -447,29 +441,36 @@ OPTION = re.compile(
     rf"--(?:(field|inside) (\w+)|(level|scale|offset) ({NUMBER})|(label) (-?\d+)"
     rf"|(spacing) ({NUMBER}(?:,{NUMBER})*|X,Y,Z))"
 )
-TYPES = {"field": str, "inside": str, "label": int, "spacing": spacing_of}  # of others float
 
 
 def advised(message: str) -> dict[str, Any]:
-    """Return the options that a message names, as ``make_grid`` takes them; the first of each."""
+    """Return the options that a message names, as ``make_grid`` takes them; the first of each.
+
+    A spacing that is only named stays as it is: the user knows it.
+    """
     named = [[*filter(None, groups)] for groups in OPTION.findall(message)]
     named += [["spacing", "X,Y,Z"]] if "give --spacing" in message else []
-    return {name: TYPES.get(name, float)(word) for name, word in reversed(named)}
+    found: dict[str, Any] = dict(reversed(named))
+    for name, word in found.items():
+        if name == "spacing" and "X" not in word:
+            found[name] = [*map(float, word.split(","))]
+        elif name in ("label", "level", "scale", "offset"):
+            found[name] = int(word) if name == "label" else float(word)
+    return found
 
 
 def call(sample: Kind, options: dict[str, Any], network: Decoder) -> Outcome:
     """Make a mesh, and measure it."""
     named = " ".join(f"{key}={value}" for key, value in options.items())
     steps = np.array(sample.steps)
-    true = steps * sample.unit
-    told = {"spacing": true, "origin": 0.0, **options}
+    told = {"spacing": steps * sample.unit, "origin": 0.0, **options}
     offset = told.pop("offset", 0.0)
-    told["spacing"] = true if isinstance(told["spacing"], str) else told["spacing"]
+    told["spacing"] = steps * sample.unit if isinstance(told["spacing"], str) else told["spacing"]
     try:
         grid = make_grid(sample.values, **told)
         mesh = reconstruct(grid, network, FACTOR, offset=offset)
     except SuperSdfError as problem:
-        return Outcome(named, str(problem))
+        return Outcome(named, "refused", str(problem))
     values, form = level_set(sample, options)
     scale = steps / np.array(grid.spacing)  # an estimate is off by some per cent
     if np.abs(scale * sample.unit - 1).max() > ESTIMATE and told["spacing"] is not None:
@@ -477,11 +478,14 @@ def call(sample: Kind, options: dict[str, Any], network: Decoder) -> Outcome:
     mesh = mesh.transformed(np.diag(scale), np.zeros(3))
     other = closed_isosurface(values.astype(np.float32), steps, 0.0)
     shape = np.array(values.shape)
-    truth, top = true_mesh(form, shape, steps), (shape - 1) * steps
+    fine = form(places(FINE * (shape - 1) + 1, steps / FINE)).astype(np.float32)
+    truth, top = closed_isosurface(fine, steps / FINE, 0.0), (shape - 1) * steps
     ours, theirs = (distance(truth, m, POINTS, within=top) for m in (mesh, other))
     volume = max(truth.volume(), 1.0)
     ours_off, theirs_off = (abs(m.volume() / volume - 1) for m in (mesh, other))
-    return Outcome(named, "", ours, theirs, ours_off - theirs_off)
+    verdict = "right" if ours <= WORSE * theirs + MARGIN else "worse"
+    verdict = "volume" if ours_off - theirs_off > VOLUME_OFF else verdict
+    return Outcome(named, verdict, "", ours, theirs)
 
 
 def follow(sample: Kind, network: Decoder) -> Iterator[Outcome]:
@@ -500,7 +504,7 @@ def problem(sample: Kind, outcomes: list[Outcome]) -> str:
     """Return what is wrong with the outcomes of a kind; empty if nothing is."""
     last = outcomes[-1]
     if last.verdict not in ("right", "refused"):
-        return f"{last.verdict}: {last.ours:.4f} of {last.theirs:.4f}, volume {last.volume:.2f}"
+        return f"{last.verdict}: {last.ours:.4f} of {last.theirs:.4f}"
     wanted = {"mesh": ("right",), "refusal": ("refused",)}.get(sample.ends, ("right", "refused"))
     return "" if last.verdict in wanted else f"ends {last.verdict} {last.message}"
 

@@ -1,67 +1,51 @@
-"""A grid is read at most three times: the census, a look beside the surface, the survey."""
+"""Grids that are read by planes, and in parts, are taken as arrays in memory are."""
 
 import numpy as np
 import pytest
 from test_field_kinds import box
 
 from super_sdf import make_grid
-from super_sdf.grid import census
-from super_sdf.grid.planes import SamplePlanes
-from super_sdf.refine.survey import survey
+from super_sdf.grid import census, samples
+from super_sdf.grid.sdf_grid import crop
 
-RANDOM = np.random.default_rng(0)
-
-
-class Counted(SamplePlanes):
-    """An array whose planes are counted as they are read."""
-
-    name = "the grid"
-
-    def __init__(self, values):
-        self.values, self.shape, self.dtype = values, values.shape, values.dtype
-        self.reads = np.zeros(len(values), int)
-
-    def read(self, first, last):
-        self.reads[first:last] += 1
-        return self.values[first:last].copy()
-
-
-def with_nan(values):
-    """Return truncated distances that are unknown beyond where they were cut off."""
-    return np.where(np.abs(values) < 3, values, np.nan)
-
-
-def plate():
-    """Return distances to a plate between two planes of samples."""
-    apart = np.abs(np.indices((24, 24, 24)).T - 11.5).T - np.reshape([7.3, 8.1, 0.2], (3, 1, 1, 1))
-    return np.linalg.norm(np.maximum(apart, 0), axis=0) + np.minimum(apart.max(0), 0)
-
-
+NOISE = np.random.default_rng(0).normal(0, 0.2, (32, 32, 32))
+APART = np.abs(np.indices((32,) * 3).T - 15.5).T - np.reshape([7.3, 8.1, 0.2], (3, 1, 1, 1))
 KINDS = {
     "exact": ("exact", box()),
     "truncated": ("truncated", np.clip(box(), -2, 2)),
+    "truncated at 1": ("truncated", np.clip(box(), -1, 1)),
+    "truncated at .5": ("truncated", np.clip(box(), -0.5, 0.5)),
     "mask": ("mask", box() < 0),
     "mask of numbers": ("mask", np.where(box() < 0, -1.0, 1.0)),
     "scaled": ("scaled", box() * np.exp(0.02 * box())),
-    "noisy": ("noisy", box() + RANDOM.normal(0, 0.2, box().shape)),
-    "NaN": ("truncated", with_nan(box())),
-    "thin": ("exact", plate()),
+    "noisy": ("noisy", box() + NOISE),
+    "NaN": ("truncated", np.where(np.abs(box()) < 3, box(), np.nan)),
+    "thin": ("exact", np.linalg.norm(np.maximum(APART, 0), axis=0) + np.minimum(APART.max(0), 0)),
 }
 
 
-@pytest.mark.parametrize("small", [True, False], ids=["kept", "not kept"])
+class Stored(samples.SamplePlanes):
+    """An array that is read by planes."""
+
+    def __init__(self, values):
+        self.values, self.shape, self.dtype = values, values.shape, values.dtype
+
+    def read(self, first, last):
+        return self.values[first:last].copy()
+
+
 @pytest.mark.parametrize("name", KINDS)
-def test_a_grid_is_read_at_most_three_times_and_taken_the_same_in_parts(name, small, monkeypatch):
+def test_planes_and_parts_are_taken_as_the_whole_array_is(name, monkeypatch):
     kind, values = KINDS[name]
     want = make_grid(values, spacing=1.0, origin=0.0)
-    if not small:  # in several parts
-        monkeypatch.setattr(census, "KEPT_BYTES", 0)
-        monkeypatch.setattr(census, "TOGETHER", values[0].size)
-        monkeypatch.setattr(census, "READ_SAMPLES", 4 * values[0].size)
-    counted = Counted(values)
-    grid = make_grid(counted, spacing=1.0, origin=0.0)
+    monkeypatch.setattr(census, "KEPT_BYTES", 0)
+    monkeypatch.setattr(census, "TOGETHER", values[0].size)
+    monkeypatch.setattr(samples, "WORKING_BYTES", 1)
+    grid = make_grid(Stored(values), spacing=1.0, origin=0.0)
     assert grid.field.kind == kind == want.field.kind and grid.notes == want.notes
-    band, reads = survey(grid), counted.reads.copy()
-    assert np.array_equal(band.patches, survey(want).patches)
-    # blocks of the survey share two planes, and those of filled samples some more
-    assert np.median(reads) <= 3 and (reads <= 6).all()
+    assert grid.field.report() == want.field.report()
+    np.testing.assert_array_equal(grid.values, want.values)
+    low, high = (3, 9, 14), (21, 24, 32)
+    part = crop(grid, low, high)
+    np.testing.assert_array_equal(part.values, want.values[3:21, 9:24, 14:32])
+    assert part.origin == low and (part.low, part.high) == (want.low, want.high)

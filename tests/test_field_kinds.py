@@ -1,29 +1,14 @@
 """What the values of a grid are, and what becomes of masks, truncated and scaled fields."""
 
-import json
-import re
-import shutil
-
 import numpy as np
 import pytest
-from batches import rows
 from conftest import ball, refusal, trilinear
 from scipy import ndimage
 
 from lab.surfaces import isosurface
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
-from super_sdf.errors import GridError, OptionError, OutOfMemoryError
-from super_sdf.grid import planes
-from super_sdf.grid.census import Census
-from super_sdf.grid.derived import mask_distances, mask_planes
-from super_sdf.grid.field import weigh
-from super_sdf.threads import Resources
-from super_sdf.network.network import network_for, shipped_models
+from super_sdf.errors import GridError, OptionError
 from super_sdf.options import FIELDS
-from super_sdf.refine import spline
-from super_sdf.refine.nodes import block_ijk
-from super_sdf.refine.spline import network_share, spline_blocks
-from super_sdf.refine.survey import plan_reading, survey
 
 PLACE = {"spacing": 1.0, "origin": 0.0}
 
@@ -132,32 +117,11 @@ def test_distances_in_another_unit_are_exact_in_that_of_the_spacing(unit):
     assert told.notes == () and np.allclose(told.values, box(), atol=1e-5)
 
 
-def test_noise_is_told_from_slopes_that_vary():
-    for amplitude in (0.05, 0.25, 0.4):
-        for values in (box(), torus(), thin_frame(), np.indices((32, 32, 32))[0] - 15.3):
-            grid = make_grid(noisy(values, amplitude), **PLACE, inside="negative")
-            assert grid.field.kind in ("noisy", "exact"), amplitude
-    assert not make_grid(thin_frame() * WAVES, **PLACE).field.has_kinks
-
-
-@pytest.mark.parametrize("cut", [0.3, 0.5, 0.8])
-def test_samples_that_were_not_cut_off_are_exact_and_plateaus_are_no_band(cut):
-    grid = make_grid(np.clip(box(), -cut, cut), **PLACE)
-    band = survey(grid)
-    assert band.exact.sum() == (np.abs(box()) < cut).sum()
-    assert len(band.voxel_ijk) < 0.3 * box().size and band.lipschitz.all()
-
-
 @pytest.mark.parametrize("field", FIELDS[1:])
 def test_the_user_may_overrule_the_evidence(field):
     grid = make_grid(torus(), **PLACE, field=field)
     assert (grid.field.kind, grid.field.given) == (field, True)
     assert reconstruct(grid, trilinear).is_closed()
-
-
-def test_distances_of_a_mask_are_those_of_scipy():
-    want = np.clip(np.where(MASK, 0.5 - INTO, OUT - 0.5), -3.5, 3.5)
-    np.testing.assert_allclose(mask_distances(MASK), want, atol=1e-6)
 
 
 def test_all_forms_of_a_mask_give_the_same_mesh():
@@ -247,10 +211,9 @@ BAD = {
     "label is 1.5: give a whole number, -2^63 to 2^64 - 1": {"label": 1.5},
     "label is True: give a whole number, -2^63 to 2^64 - 1": {"label": True},
     f"label is {2**64}: give a whole number, -2^63 to 2^64 - 1": {"label": 2**64},
-    f"label {2**53 + 1} and level 2: give only one of them": {"label": 2**53 + 1, "level": 2},
+    f"label {2**53 + 1} and level 2.5: give only one of them": {"label": 2**53 + 1, "level": 2.5},
     "level is nan: give a finite number": {"level": float("nan")},
     "scale is -1: give a number greater than 0": {"scale": -1},
-    "label 1 and level 2: give only one of them": {"label": 1, "level": 2},
     "label 1 and field exact: the samples of a label are a mask": {"label": 1, "field": "exact"},
 }
 
@@ -291,32 +254,6 @@ def test_samples_of_a_mask_keep_their_side(network):
     assert reconstruct(grid, network).is_closed()
 
 
-@pytest.mark.parametrize("precision", ["float32", "int8"])
-def test_a_network_of_the_package_is_replaced_by_that_for_the_kind(precision, tmp_path):
-    network = load_network("base", device="cpu", threads=1, precision=precision)
-    assert network_for(network, "exact") is network_for(network, "truncated") is network
-    masks, noise = (network_for(network, kind) for kind in ("mask", "noisy"))
-    assert masks.card["inputs"] == "masks" and noise.card["name"].split("-")[0] == "noisy"
-    for kind, found in (("mask", masks), ("noisy", noise)):
-        assert found.threads == network.threads and network_for(found, kind) is found
-    assert noise.card.get("precision", "float32") == precision
-    assert network_for(load_network("best", device="cpu"), "noisy").symmetries == 4
-    own = shutil.copy(shipped_models()["base"], tmp_path / "own.onnx")
-    trained = load_network("fast", device="cpu")  # on noise, too
-    for kept in (trained, load_network(own, device="cpu"), trilinear):
-        assert network_for(kept, "noisy") is kept
-
-
-def test_the_network_for_masks_is_nearer_than_marching_cubes():
-    def off(mesh):
-        x, y, z = (mesh.vertices.T + 0.5) / 32 - 0.5
-        return np.abs(np.hypot(np.hypot(x, y) - 0.3, z) - 0.12).mean() * 32
-
-    ours = off(reconstruct(make_grid(MASK, **PLACE), load_network(device="cpu")))
-    cubes = off(reconstruct(make_grid(MASK, **PLACE), trilinear, 2))
-    assert ours < 0.7 * cubes
-
-
 @pytest.mark.parametrize("low", [-1, -10])
 def test_distances_over_their_truncation_get_their_unit_back(low):
     grid = make_grid(np.clip(box(), low, 1), spacing=1.5, origin=0)
@@ -326,40 +263,11 @@ def test_distances_over_their_truncation_get_their_unit_back(low):
     np.testing.assert_allclose(grid.values[kept], 1.5 * box()[kept], rtol=0.03)
 
 
-@pytest.mark.parametrize("unit", [0.01, 37])
-def test_a_scaled_field_has_the_same_mesh_in_any_unit(unit):
-    want = reconstruct(make_grid(ellipsoid(), **PLACE, field="scaled"), trilinear)
-    mesh = reconstruct(make_grid(ellipsoid() * unit, **PLACE, field="scaled"), trilinear)
-    np.testing.assert_allclose(mesh.vertices, want.vertices, atol=1e-4)
-
-
 def test_a_smooth_field_of_another_slope_is_that_of_its_spline():
     mesh = reconstruct(make_grid(ellipsoid(), **PLACE, field="scaled"), opposite)
     x, y, z = (mesh.vertices.T + 0.5) / 32 - 0.5
     value = (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.15) ** 2 - 1
     assert np.abs(value).max() < 0.02  # a twentieth of a change from sample to sample
-
-
-def test_the_spline_is_that_of_scipy_and_exact_for_planes_up_to_the_border():
-    values = np.random.default_rng(0).normal(size=(30, 31, 32)).astype(np.float32)
-    ijk = np.array([[14, 15, 15], [15, 14, 16]], np.int32)
-    blocks, _ = spline_blocks(values, ijk, 4, 1.0)
-    for row, voxel in enumerate(ijk):
-        at = (block_ijk(4) / 4 - 0.5 + voxel).T
-        want = ndimage.map_coordinates(values.astype(float), at, order=3, mode="mirror")
-        np.testing.assert_allclose(blocks[:, row], want, atol=2e-5)
-    plane = np.indices((6, 7, 8)).astype(np.float32)[1] * 2 - 3
-    ijk = np.argwhere(np.ones(plane.shape, bool)).astype(np.int32)
-    blocks, share = spline_blocks(plane, ijk, 2, 1.0)
-    want = (block_ijk(2)[:, 1, None] / 2 - 0.5 + ijk[:, 1]) * 2 - 3
-    np.testing.assert_allclose(blocks[:, :-1], want, atol=1e-4)
-    assert not share.any()
-
-
-def test_the_network_adds_to_a_scaled_field_at_kinks_of_distances_only():
-    assert network_share(box(48).astype(np.float32)).max() == 1
-    assert not network_share(torus(64).astype(np.float32))[16:48, :8].any()
-    assert not network_share(2 * box(48).astype(np.float32)).any()
 
 
 def test_the_command_takes_labels_levels_and_scales(folder, command):
@@ -373,22 +281,11 @@ def test_the_command_takes_labels_levels_and_scales(folder, command):
     assert command(*check)[0] == 0
     whole = "give a whole number, -2^63 to 2^64 - 1"
     for run, said in (
-        ((*labels, "--label", "3.0"), f"--label is 3.0: {whole}"),
         ((*labels, "--label", 2**64), f"--label is {2**64}: {whole}"),
         ((*level, "--scale", "0"), "--scale is 0: give a number greater than 0"),
     ):
         code, _, err = command(*run)
         assert (code, err.splitlines()[-1]) == (2, f"Error: {said}")
-
-
-def test_a_list_of_batch_takes_what_the_values_are(tmp_path, command):
-    np.save(tmp_path / "labels.npy", np.where(MASK, 3, 0))
-    job = {"in": "labels.npy", "spacing": 1, "label": 3, "field": "mask"}
-    (tmp_path / "list.jsonl").write_text(json.dumps(job))
-    run = "batch", str(tmp_path / "list.jsonl"), "--out", str(tmp_path / "out")
-    assert command(*run)[0] == 0
-    (row,) = rows(tmp_path / "out")
-    assert row["field"]["kind"] == "mask" and row["closed"] and row["out"] == "labels-label3.ply"
 
 
 def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
@@ -409,24 +306,6 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         )
 
 
-@pytest.mark.parametrize("name", ["truth", "cut off at 1", "a smooth union", "cut off at 0.5"])
-def test_planes_are_the_same_in_whatever_strips_they_are_made(name, monkeypatch):
-    grid = make_grid(KINDS[name][0], **PLACE)
-    want = grid.values
-    monkeypatch.setattr(planes, "WORKING_BYTES", 1)
-    for first, last in ((0, 5), (7, 8), (20, 48)):
-        np.testing.assert_array_equal(grid.planes(first, last), want[first:last])
-
-
-def test_the_spline_is_the_same_in_whatever_strips_it_is_made(monkeypatch):
-    values = smooth_union(64)
-    ijk = np.argwhere(np.abs(values) < 2).astype(np.int32)
-    want = spline_blocks(values, ijk, 4, 1.0)
-    monkeypatch.setattr(spline, "STRIP_SAMPLES", 1)
-    for found, expected in zip(spline_blocks(values, ijk, 4, 1.0), want):
-        np.testing.assert_array_equal(found, expected)
-
-
 def torus_at(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
     """Return distances to a torus that stands askew in a grid of 24^3, in voxels."""
     x, y, z = x - 11.6, y - 11.3, z - 11.7
@@ -443,31 +322,3 @@ def test_what_is_nearly_a_distance_is_no_worse_than_marching_cubes(factor):
     plain = isosurface(values.astype(np.float32), 1.0, 0.0)
     ours, theirs = (np.abs(torus_at(*m.vertices.T)).mean() for m in (mesh, plain))
     assert mesh.is_closed() and ours < 0.8 * theirs
-
-
-def test_samples_that_contradict_each_other_are_told_from_noise_and_exact_ones():
-    exact = torus_at(*np.indices((24,) * 3))
-    corner = np.maximum(exact, np.indices((24,) * 3)[0] - 12.2)  # no distance beyond the edge
-    for values in (exact, corner, noisy(exact, 0.05), np.round(exact, 1), exact.astype(np.float16)):
-        assert not weigh(Census(values).looked, (1.0, 1.0, 1.0)).is_contradictory
-    other = (np.abs(np.indices((24,) * 3) - 11.6) ** 2.5).sum(0) ** 0.4 - 7.3  # by another norm
-    assert weigh(Census(other).looked, (1.0, 1.0, 1.0)).is_contradictory
-    assert make_grid(other, **PLACE).field.kind == "scaled"
-
-
-def test_padding_near_the_surface_makes_no_surface():
-    plain, place = ball(16, 5.0).values, {"spacing": 1, "origin": -1}
-    near, far, other = (
-        reconstruct(make_grid(np.pad(plain, 1, constant_values=pad), **place), trilinear)
-        for pad in (0.1, 5.0, 1.4)
-    )
-    assert near.is_closed()
-    for mesh in (near, other):
-        assert mesh.volume() == pytest.approx(far.volume(), rel=1e-3)
-
-
-@pytest.mark.parametrize("added", [0.01, 0.1])
-@pytest.mark.parametrize("shape", [torus, box])
-def test_unsigned_distances_that_are_never_0_are_refused(shape, added):
-    with pytest.raises(GridError, match="unsigned"):
-        make_grid(np.abs(shape(16)) + added, **PLACE)

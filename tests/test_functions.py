@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from super_sdf import DistanceFunction, extract_mesh, make_grid, reconstruct, upsample
 from super_sdf.check.check import check_mesh
 from super_sdf.errors import GridError, OptionError, OptionTypeError
-from super_sdf.grid.near import sample_near
+from super_sdf.grid.derived import sample_near
 
 H = 2 / 19
 BOX = (-1.0, 1.0)

@@ -80,13 +80,6 @@ def test_fill_values_end_the_distances_too(network):
     assert mesh.volume() == pytest.approx(cube_volume(1.49), rel=0.02)
 
 
-def test_fields_truncated_near_the_surface_have_only_the_surface_at_0(network):
-    grid = make_grid(np.clip(cube(), -1, 1), spacing=1, field="exact")
-    with pytest.raises(GridError, match=r"but they end at 1: only 0 works$"):
-        reconstruct(grid, network, 2, offset=0.2)
-    assert reconstruct(grid, network, 2).is_closed()
-
-
 def test_truncated_distances_are_filled_in_for_an_offset(network):
     grid = make_grid(np.clip(cube(), -1, 1), spacing=1)
     for offset in (-0.3, 0.4, 0.8):
@@ -104,12 +97,6 @@ def test_an_offset_beyond_all_values_has_no_surface(network, fill):
         reconstruct(make_grid(values, spacing=1), network, 2, offset=99)
     ends = "-3 to 3" if fill == 3 else f"{near.min():.6g} to {near.max():.6g}"
     assert str(caught.value) == f"no surface at 99: the values go from {ends}"
-
-
-def test_noisy_distances_may_be_moved(network):
-    noise = np.random.default_rng(0).uniform(-0.4, 0.4, (22, 22, 22))
-    mesh = reconstruct(make_grid(cube() + noise, spacing=1), network, 2, offset=1.0)
-    assert mesh.volume() == pytest.approx(cube_volume(1.0), rel=0.1)
 
 
 def test_the_command_reads_the_sign_from_the_solid(command, tmp_path, monkeypatch):

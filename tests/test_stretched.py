@@ -5,7 +5,15 @@ import pytest
 from conftest import refusal, trilinear
 from scipy import ndimage
 
-from super_sdf import (extract_mesh, fine_grid, make_grid, read_field, reconstruct, upsample, write_field)
+from super_sdf import (
+    extract_mesh,
+    fine_grid,
+    make_grid,
+    read_field,
+    reconstruct,
+    upsample,
+    write_field,
+)
 from super_sdf.errors import GridError
 
 SPACING = np.array([1.0, 1.0, 2.5])
@@ -93,15 +101,6 @@ def test_a_mask_with_unequal_spacings_is_the_stretched_mask(mesher):
     mesh = reconstruct(make_grid(mask, spacing=SPACING, origin=0), trilinear, 2, mesher=mesher)
     np.testing.assert_allclose(mesh.vertices, cubes.vertices * SPACING, rtol=1e-5)
     np.testing.assert_array_equal(mesh.faces, cubes.faces)
-
-
-def test_the_kinds_of_distances_are_told_apart_with_unequal_spacings():
-    distances = two_parts()
-    noise = np.random.default_rng(0).uniform(-0.4, 0.4, SHAPE)
-    for values, kind in ((distances, "exact"), (distances + noise, "noisy")):
-        grid = make_grid(values, spacing=SPACING, origin=0)
-        assert grid.field.kind == kind and grid.spacing == tuple(SPACING)
-    assert make_grid(distances, spacing=SPACING).field.report()["slope"] == pytest.approx(1, 0.02)
 
 
 @pytest.mark.parametrize("name", ["mask", "scaled"])

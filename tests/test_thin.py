@@ -8,7 +8,7 @@ import trimesh
 from conftest import ball, refusal
 
 from super_sdf.errors import GridError
-from super_sdf.grid.refusals import BEYOND, FAR
+from super_sdf.grid.interpret import BEYOND, FAR
 from super_sdf.grid.sdf_grid import make_grid
 
 N = 32
@@ -88,14 +88,6 @@ def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
         want = DENSITY
     said = refusal(GridError, make_grid, FIELDS[name], spacing=spacing)
     assert said.startswith("no value is below 0 (the smallest is ") and want in said
-
-
-def test_large_unsigned_fields_are_told_from_fewer_samples(monkeypatch):
-    x, y, z = (np.arange(64, dtype=np.float32) - 31.3)[:, None, None], *np.ogrid[:64, :64]
-    values = np.abs(np.sqrt(x**2 + (y - 32) ** 2 + (z - 32) ** 2) - 20)
-    monkeypatch.setattr("super_sdf.grid.refusals.MOST_FLOODED", values.size // 5)
-    with pytest.raises(GridError, match="unsigned distances have no inside: mesh the shell"):
-        make_grid(values, spacing=1)
 
 
 def test_a_given_spacing_is_believed_of_a_thin_part():

@@ -167,21 +167,6 @@ def test_exact_distances_at_45_degrees_are_no_city_block_distances():
         assert grid.field.kind == "exact"
 
 
-@pytest.mark.parametrize(
-    ("dtype", "unit", "metre"), [(np.uint8, 1, 1), (np.int16, 8, 1), (np.float64, 1, 1e-3)]
-)
-def test_densities_of_thick_slices_have_their_spline(dtype, unit, metre):
-    x, y, z = (axis * h for axis, h in zip(np.indices((40, 40, 16)), (0.2, 0.2, 0.5)))
-    distances = np.sqrt((x - 3.9) ** 2 + (y - 3.9) ** 2 + (z - 3.9) ** 2) - 2.4
-    values = np.rint(np.clip(127 - 100 * distances, 10, 245) * unit).astype(dtype)
-    spacing = np.array([0.2, 0.2, 0.5]) * metre
-    grid = make_grid(values, spacing=spacing, origin=0, level=127.5 * unit)
-    assert grid.field.kind in ("scaled", "truncated")
-    vertices = reconstruct(grid, trilinear).vertices / metre
-    off = np.linalg.norm(vertices - 3.9, axis=1) - 2.4
-    assert np.abs(off).mean() < 0.08 * 0.2
-
-
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32, np.float64, bool])
 def test_two_slices_are_a_mask(dtype):
     mask = np.zeros((20, 18, 2), bool)

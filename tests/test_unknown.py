@@ -1,7 +1,6 @@
 """Unknown far samples, NaN or infinite: their side, their cut-off, and what is refused."""
 
 import os
-import warnings
 
 import numpy as np
 import pytest
@@ -12,9 +11,8 @@ from skimage.measure import marching_cubes
 from test_field_kinds import PLACE, box, thin_frame
 from trimesh import grouping
 
-from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
+from super_sdf import SdfGrid, make_grid, reconstruct
 from super_sdf.errors import GridError
-from super_sdf.grid.census import Census
 from super_sdf.options import FIELDS
 
 FACES = ndimage.generate_binary_structure(3, 1)
@@ -23,22 +21,6 @@ FACES = ndimage.generate_binary_structure(3, 1)
 def truncated(cut: float = 2.0) -> np.ndarray:
     """Return distances to a box, clipped."""
     return np.clip(box(), -cut, cut).astype(np.float32)
-
-
-def test_the_sides_of_regions_are_those_of_scipys_components():
-    random = np.random.default_rng(0)
-    for _ in range(12):
-        values = random.normal(size=(6, 7, 8))
-        values[random.random(values.shape) < random.uniform(0.2, 0.9)] = np.nan
-        unknown, regions = np.isnan(values), Census(values).unknown
-        labels = ndimage.label(unknown)[0]
-        for found, side in ((regions.positive, values > 0), (regions.negative, values <= 0)):
-            beside = labels[ndimage.binary_dilation(side, FACES) & unknown]
-            want = np.isin(labels, beside)
-            for i in range(len(values)):
-                runs = regions.runs_of(i, unknown[i])
-                np.testing.assert_array_equal(found[runs[unknown[i]]], want[i][unknown[i]])
-        assert regions.size.sum() == unknown.sum()
 
 
 @pytest.mark.parametrize("hollow", [np.nan, -np.inf])
@@ -57,23 +39,6 @@ def test_unknown_far_samples_are_taken_as_cut_off_on_their_side(hollow):
         f"{limits[1]:.6g}"
     )
     assert grid.field.kind == "truncated" and reconstruct(grid, trilinear).is_closed()
-
-
-def test_a_signalling_nan_is_unknown_and_numpy_warns_of_nothing():
-    values, plain = truncated(), truncated()
-    values.view(np.uint32)[0, 0, :5], plain[0, 0, :5] = 0x7FA00001, np.nan
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        grid = make_grid(values, **PLACE)
-    np.testing.assert_array_equal(grid.values, make_grid(plain, **PLACE).values)
-
-
-def test_densities_may_be_unknown_outside_what_was_seen():
-    densities = 100 - 10 * truncated()
-    seen = densities.copy()
-    seen[:2] = np.nan
-    want, grid = (make_grid(v, **PLACE, level=100) for v in (densities, seen))
-    np.testing.assert_array_equal(grid.values, want.values)
 
 
 def split() -> np.ndarray:
@@ -224,13 +189,6 @@ def test_flat_ground_of_a_thin_plate_was_seen_where_values_level_off(half):
     outside = np.abs(np.indices((32,) * 3).T - 15.5) - np.array([11, 11, half])
     distances = np.linalg.norm(np.maximum(outside, 0), axis=-1) + np.minimum(outside.max(-1), 0)
     grid = make_grid(2 * np.tanh(distances / 2), **PLACE)
-    assert not any("exactly" in note for note in grid.notes)
-
-
-def test_zeros_on_the_surface_were_seen():
-    place = np.abs(np.indices((24,) * 3) - 12) - np.array([7, 6, 4])[:, None, None, None]
-    whole = np.linalg.norm(np.maximum(place, 0), axis=0) + np.minimum(place.max(0), 0)
-    grid = make_grid(whole, **PLACE)
     assert not any("exactly" in note for note in grid.notes)
 
 

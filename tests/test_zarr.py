@@ -11,7 +11,7 @@ from conftest import ball, refusal
 
 from super_sdf import read_grid
 from super_sdf.errors import FileError, GridError
-from super_sdf.grid.planes import SamplePlanes
+from super_sdf.grid.samples import SamplePlanes
 
 SHAPE = (30, 26, 22)  # x, y, z
 MODEL = ("--quality", "fast", "--spacing", "1", "-q")

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from solids import cube, saved, sphere, torus
 
-from lab import costs, documents, quoted, tables
+from lab import costs, documents, tables
 from lab.__main__ import main as lab
 from lab.documents import rendered
 from lab.rows import Rows
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.errors import FileError
 
-ROOT = Path(__file__).parents[2]
 MACHINE = {
     "processor": "a processor", "cores": 2, "instructions": ["avx2"], "system": "Linux",
     "python": "3.11", "numpy": "2", "onnxruntime": "1.32",
@@ -26,7 +24,6 @@ MACHINE = {
 
 @pytest.fixture
 def meshes(tmp_path: Path) -> Path:
-    """A folder of three shapes."""
     folder = tmp_path / "meshes"
     folder.mkdir()
     for name, mesh in {"box": cube(), "ball": sphere(), "ring": torus()}.items():
@@ -74,12 +71,12 @@ def test_a_bad_shape_is_named_and_the_others_are_measured(meshes, tmp_path, comm
     assert "| super-sdf |" in text and "3 of 3" in text and "at random, by seed 5" in text
 
 
-def test_failures_are_tried_again_but_not_what_ran_out_of_time(tmp_path):
+def test_failures_are_tried_again(tmp_path):
     rows, key = Rows(tmp_path / "rows.jsonl"), {"shape": "box"}
     rows.add(key, {"error": "OSError: disk"})
     assert not rows.is_final(key)
-    rows.add(key, {"error": "over the limit of 10 s", "limit": 10.0})
-    assert rows.is_final(key, 10.0) and not rows.is_final(key, 20.0)
+    rows.add(key, {"error": None, "f1": 0.5})
+    assert rows.is_final(key)
     assert Rows(tmp_path / "rows.jsonl").get(key) == rows.get(key)
 
 
@@ -97,11 +94,10 @@ def test_random_fields_are_closed_manifolds(command):
 
 @pytest.fixture
 def speeds(tmp_path):
-    """A folder with figures of speed."""
     rows = [
         {"size": 32, "option": "default", "seconds": 0.5, "peak_mb": 100.0},
         {"size": 64, "option": "default", "seconds": 1.0, "peak_mb": 1234.0},
-        {"size": 64, "option": "scipy", "seconds": 16.2, "peak_mb": 400.0},
+        {"size": 64, "option": "zoom-cubic", "seconds": 16.2, "peak_mb": 400.0},
     ]
     content = {"name": "speed", "networks": {"base": "0123"}, "commit": "abc", "rows": rows}
     content |= {"machine": MACHINE, "date": "2026-01-01"}
@@ -111,16 +107,15 @@ def speeds(tmp_path):
 
 def test_tables_and_numbers_stand_where_they_are_marked(speeds):
     text = "a\n<!-- figures: speed.process -->\nold\n<!-- /figures -->\nb"
-    table = ["|  | 32^3 | 64^3 |", "| --- | ---: | ---: |", "| default | 0.50 | 1.00 |"]
-    assert rendered(text, speeds).splitlines()[3:6] == table
+    assert "| default | 0.50 | 100 | 1.00 | 1,234 |" in rendered(text, speeds).splitlines()
     assert rendered(rendered(text, speeds), speeds) == rendered(text, speeds)
     for marker, shown in {
         "speed.seconds 32 default": "0.50",
-        "speed.seconds 64 scipy over 64 default": "16",
+        "speed.seconds 64 zoom-cubic over 64 default": "16",
     }.items():
         line = f"it is <!-- figures: {marker} -->?<!-- /figures --> so"
         assert rendered(line, speeds) == line.replace("?", shown)
-    assert "2 cores of a processor (avx2)" in quoted.shown("speed.about", speeds)
+    assert "2 cores of a processor (avx2)" in documents.shown("speed.about", speeds)
     for marker, said in {
         "spead.process": "there is no figure 'spead'",
         "speed.procss": "there is no table 'speed.procss'",
@@ -142,12 +137,11 @@ def test_figures_are_measured_kept_and_printed(meshes, tmp_path, command):
     words = ["figures", "--shapes", meshes, "--parts", meshes, "--sizes", 8, "--jobs", 0]
     code, printed, _ = command(*words, "--only", "simplify", "--out", out)
     assert code == 0
-    assert "simplify.table" in printed and "| CAD parts, marching | CAD parts, sharp |" in printed
-    content = quoted.read(out / "simplify.json")
-    assert len(content["rows"]) == 8 and content["networks"].keys() == {"base"}
+    assert "simplify.table" in printed and "| parts | super-sdf, marching |" in printed
+    content = documents.read(out / "simplify.json")
+    assert len(content["rows"]) == 4 and content["networks"].keys() == {"base"}
     assert tables.label_of("ours/4@base:float32") == "super-sdf, base, float32, 1/4"
 
 
-def test_the_commands_are_listed():
-    done = subprocess.run([sys.executable, "-m", "lab"], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0 and "evaluate" in done.stdout
+def test_the_commands_are_listed(command):
+    assert "evaluate" in command("--help")[1]

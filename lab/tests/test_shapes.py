@@ -19,11 +19,6 @@ from super_sdf import Mesh
 TASK = Task(Path(), Setting(8), ())
 
 
-def case_of(mesh: Mesh, setting: Setting) -> Case:
-    """Return a mesh, put into the frame and sampled."""
-    return Case(Shape("some", mesh), setting)
-
-
 def test_upsampling_is_that_of_scipy():
     coarse = np.random.default_rng(2).random((6, 6, 6))
     position = np.meshgrid(*[np.arange(25) / 4 - 0.5] * 3, indexing="ij")
@@ -33,7 +28,7 @@ def test_upsampling_is_that_of_scipy():
 
 @pytest.mark.parametrize("setting", [Setting(12, 2), Setting(12, 4), Setting(12, 4, scale=0.5)])
 def test_the_truth_is_exact_near_the_surface_and_right_in_sign(setting):
-    case = case_of(cube(), setting)
+    _, case = shape_and_case(cube(), setting)
     nodes = np.indices(case.truth.shape).reshape(3, -1).T
     exact = case.shape.solid.signed_distance(nodes * case.fine + case.low)
     exact = exact.reshape(case.truth.shape)
@@ -61,7 +56,6 @@ def test_the_bound_is_better_than_ours_and_ours_than_the_coarse_grid():
 
 
 def shape_and_case(mesh: Mesh, setting: Setting) -> tuple[Shape, Case]:
-    """Return a shape and its case in a setting."""
     shape = Shape("some", mesh)
     return shape, Case(shape, setting)
 

@@ -18,9 +18,8 @@ from .files.grids import read_grid
 from .files.meshes import check_format_holds, check_target, local_origin_note, write_mesh
 from .files.output import check_apart, check_free
 from .files.regular import files_of
-from .grid.cubic import cubic_grid
-from .grid.placement import as_triple
-from .grid.sdf_grid import SdfGrid, describe_place, mean_spacing, volume_of_samples
+from .grid.samples import as_triple
+from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
 from .network.decoder import Decoder
 from .options import MASK, SCALED, SHARP, Options
 from .pipeline import mesh_grid

@@ -22,8 +22,7 @@ from . import options
 from .arrays import CENTRE
 from .errors import OptionTypeError, OutOfMemoryError, seen
 from .functions.function import Function, as_function, sampled
-from .grid.cubic import cubic_grid
-from .grid.sdf_grid import SdfGrid, check_grid, crop
+from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import given_or_loaded, network_for
 from .options import MesherName, Options

@@ -19,8 +19,7 @@ from ..errors import OptionError, OutOfMemoryError
 from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
-from ..grid.cubic import cubic_grid
-from ..grid.sdf_grid import SdfGrid, volume_of_samples
+from ..grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from ..options import LENGTHS, MASK, Options, check_distance, check_max_memory
 from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh

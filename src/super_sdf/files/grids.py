@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
-from ..grid.placement import check_kind
-from ..grid.planes import Index, SamplePlanes
+from ..grid.samples import Index, SamplePlanes, check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import AxisOrder, Options, Space, Values, check_path
 from ..threads import held_memory, memory_bound

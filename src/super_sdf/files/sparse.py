@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray
 from ..errors import FileError, GridError, OptionError, SuperSdfError
 from ..grid.field import Field
-from ..grid.planes import SamplePlanes
+from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..options import check_factor, check_path
 from ..refine.band import neighbour_table

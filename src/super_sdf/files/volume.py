@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Triple
 from ..errors import FileError, GridError, OptionError, OutOfMemoryError
-from ..grid.placement import Direction, as_direction, check_direction
+from ..grid.samples import Direction, as_direction, check_direction
 from ..threads import in_words
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it

@@ -1,4 +1,1 @@
-"""The coarse input: its samples, and the sign and spacing that are inferred from them.
-
-It may import ``machine``, ``neighbourhood`` and ``errors``.
-"""
+"""The coarse input: its samples, and the sign and spacing that are inferred from them."""

@@ -9,15 +9,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import BoolArray, Triple
+from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
 from ..options import AUTO, FieldKind, Inside, Options
 from .census import Census, Extremes, not_finite
-from .distances import check_negative_inside, choose_spacing
+from .derived import Resampled
 from .field import Field
-from .interpret import interpret
-from .placement import (STRAIGHT, Direction, as_samples, as_triple, check_direction, check_kind, check_spacing, in_rows, is_cubic, placed)
-from .planes import Index, SampleArray, SamplePlanes, cropped
+from .interpret import check_negative_inside, choose_spacing, interpret
+from .samples import (
+    EQUAL_SPACING,
+    STRAIGHT,
+    Direction,
+    Index,
+    SampleArray,
+    SamplePlanes,
+    as_samples,
+    as_triple,
+    check_direction,
+    check_kind,
+    check_spacing,
+    cropped,
+    in_rows,
+    is_cubic,
+    placed,
+)
 
 MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
@@ -364,3 +379,71 @@ def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
 def mean_spacing(grid: SdfGrid) -> float:
     """Return the edge of a cube with the volume of a box round a sample."""
     return float(np.prod(grid.spacing) ** (1 / 3))
+
+
+def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
+    """Return a grid on the lattice that is refined: the same if it is cubic or ``on_lattice``.
+
+    A grid with the same spacing on all axes is refined as it is. Of others, the coarser axes are
+    resampled to the finest spacing, the coarsest last: the finer the others are, the better they
+    tell its slopes. Masks, and fields that are meshed by their spline, need no cubes: a solid
+    stretched along an axis is as good a solid, and the mesh gets its spacings at the end.
+
+    Other samples are made when they are read. Only values near the offset of the surface are as
+    accurate as they can be. GridError if there is an offset, and the values are no distances.
+    """
+    if grid.is_cubic or grid.field.on_lattice:
+        check_has_offsets(grid, offset)
+        return grid
+    if grid.field.unseen is not None:
+        raise GridError(
+            "samples beside the surface are unknown, and the spacing differs between axes: mesh "
+            "the spline of the values (--field scaled)"
+        )
+    samples, h = grid.samples, grid.voxel_size
+    steps, known = list(grid.spacing), [np.ones(count, bool) for count in grid.shape]
+    for axis in np.argsort(grid.spacing, kind="stable").tolist():
+        if steps[axis] > h * (1 + EQUAL_SPACING):
+            level = -offset if grid.positive_inside else offset
+            samples = Resampled(samples, (steps[0], steps[1], steps[2]), axis, h, level)
+            steps[axis], known[axis] = h, samples.on_sample
+    coarser = " and ".join(
+        f"{name} from {step:.6g}"
+        for name, step in zip("xyz", grid.spacing)
+        if step > h * (1 + EQUAL_SPACING)
+    )
+    note = (
+        f"the spacing differs between axes: the values are resampled along {coarser} to "
+        f"{h:.6g}, the finest, to {' x '.join(map(str, samples.shape))} samples"
+    )
+    more = {"notes": (*grid.notes, note), "on_sample": tuple(known)}
+    return with_fields(grid, samples=samples, spacing=(steps[0], steps[1], steps[2]), **more)
+
+
+def check_has_offsets(grid: SdfGrid, offset: float) -> None:
+    """Raise GridError if there is an offset, and no distances in the world to find it by."""
+    if offset and grid.field.on_lattice and not grid.is_cubic:
+        each = ", ".join(f"{h:g}" for h in grid.spacing)
+        raise GridError(
+            f"offset {offset:g}: the values are taken as {grid.field.kind}, and with the spacing "
+            f"{each} they are no distances by which an offset surface could be found; mesh the "
+            "solid itself (--offset 0), sample the mesh (super-sdf sample), and mesh that grid "
+            "with the offset"
+        )
+
+
+def sampled_places(grid: SdfGrid) -> NDArray[np.intp]:
+    """Return the places of ``NEIGHBOURHOOD`` that hold samples, too: across resampled axes."""
+    across = np.ones(27, bool)
+    for axis, known in enumerate(grid.on_sample or ()):
+        if not known.all():
+            across &= NEIGHBOURHOOD[:, axis] == 0
+    return np.flatnonzero(across)
+
+
+def on_samples(grid: SdfGrid, voxel_ijk: IntArray) -> BoolArray:
+    """Return which values of a cubic grid, at (n, 3) indices, are samples, not interpolated."""
+    known = np.ones(len(voxel_ijk), bool)
+    for axis, sampled in enumerate(grid.on_sample or ()):
+        known &= sampled[voxel_ijk[:, axis]]
+    return known

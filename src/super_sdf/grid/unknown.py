@@ -12,17 +12,15 @@ from __future__ import annotations
 
 from collections import deque
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .census import Census, Extremes, not_finite
-from .planes import SampleArray, SamplePlanes
-from .regions import Ints, Regions, with_the_one_before
-from .slopes import as_float64
+from .census import ENOUGH, Census, Extremes, Floats, Ints, Regions, as_float64, not_finite
+from .samples import DerivedPlanes, SampleArray
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
 WAY_OUT = "replace each by a distance of the right sign (the cut-off value of its side)"
@@ -37,66 +35,79 @@ MIXED, FILLED_IN = 0.1, 0.03
 FEW_SPANS = 3.0  # times what few values span is more than they change by
 MANY = 4096  # samples among which different values are counted
 A_SIDE = 0.75  # share of the changes of sign beside one value from which it is one side
-ENOUGH = 30  # changes from which the steepest is known
 LEAST_JUMPS = 6  # beside one value
-SIDES = slice(1, None), slice(None, -1)  # of two samples beside each other
-
-Floats = NDArray[np.float64]
+ALIKE = 0.4  # share of equal pairs among those with a value that fills regions; of lines: a third
 
 
-class _OfRegions(SamplePlanes):
-    """Samples of which those in some regions are others, when they are read."""
-
-    name = "the grid"
-
-    def __init__(
-        self, source: SampleArray, regions: Regions, dtype: DTypeLike | None = None
-    ) -> None:
-        self.source, self.regions = source, regions
-        self.shape, self.dtype = tuple(source.shape), np.dtype(dtype or source.dtype)
-
-
-class KnownPlanes(_OfRegions):
+class Filled(NamedTuple):
     """Samples whose unknown ones are replaced by the cut-off of their side, when they are read.
 
-    Where both sides are near, the samples are continued linearly over ``LAYERS`` unknown ones;
-    farther away, unknown ones get ``outside``, one of the two ``limits``.
+    Where both sides are near, they are ``continued`` linearly over ``LAYERS`` unknown ones, which
+    says nothing of the field; farther away they are outside, as in all of ``plain``. ``unseen`` is
+    which of them are unknown and have both sides, or none, beside their region; None if none.
     """
 
-    def __init__(
-        self, source: SampleArray, regions: Regions, limits: Extremes, outside: float
-    ) -> None:
-        super().__init__(source, regions)
-        self.limits, self.outside = limits, outside
-        self.beside = 2 * LAYERS if regions.unsure.any() else 0
+    continued: SampleArray
+    plain: SampleArray
+    unseen: SampleArray | None
+    why_open: str
 
-    @property
-    def not_continued(self) -> KnownPlanes:
-        """The same without continuations, which say nothing of the field."""
-        planes = KnownPlanes(self.source, self.regions, self.limits, self.outside)
-        planes.beside = 0
+
+def filled(census: Census, notes: list[str]) -> Filled:
+    """Return samples of which the unknown ones are replaced, and say so in the notes."""
+    samples, numbers, (low, high) = census.samples, census.numbers, finite_extremes(census)
+    regions = Regions(samples, np.isnan)
+    count = int(regions.size.sum())
+    outer = int(regions.size[regions.positive & ~regions.unsure].sum())
+    notes.append(
+        f"{count + numbers.infinite:,} samples are unknown ({count:,} NaN, of which {outer:,} lie "
+        f"on the positive side, and {numbers.infinite:,} infinite): they are taken as cut off at "
+        f"{low:.6g} and {high:.6g}"
+    )
+    below, above, _ = numbers.border
+    outside = low if below > above else high
+
+    def known(planes: NDArray[Any], first: int, is_continued: bool = False) -> NDArray[Any]:
+        planes = np.array(planes)
+        for i, plane in enumerate(planes, first):
+            unknown, infinite = np.isnan(plane), np.isinf(plane)
+            runs = regions.runs_of(i, unknown)[unknown]
+            of_side = np.where(regions.positive[runs], high, low)
+            plane[unknown] = np.where(regions.unsure[runs], np.nan, of_side)
+            plane[infinite] = np.where(plane[infinite] > 0, high, low)
+        planes = _continued(planes, (low, high)) if is_continued else planes
+        planes[np.isnan(planes)] = outside
         return planes
 
-    @property
-    def unseen(self) -> SampleArray | None:
-        """Which samples are unknown and have both sides, or none, beside their region."""
-        return UnseenPlanes(self.source, self.regions, bool) if self.beside else None
+    def unseen(planes: NDArray[Any], first: int) -> BoolArray:
+        marked: BoolArray = np.isnan(planes)
+        for i, unknown in enumerate(marked, first):
+            unknown[unknown] = regions.unsure[regions.runs_of(i, unknown)[unknown]]
+        return marked
 
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive)."""
-        start, stop = max(first - self.beside, 0), min(last + self.beside, len(self))
-        planes = np.array(self.source[start:stop])
-        low, high = self.limits
-        for i, plane in enumerate(planes, start):
-            unknown, infinite = np.isnan(plane), np.isinf(plane)
-            runs = self.regions.runs_of(i, unknown)[unknown]
-            filled = np.where(self.regions.positive[runs], high, low)
-            plane[unknown] = np.where(self.regions.unsure[runs], np.nan, filled)
-            plane[infinite] = np.where(plane[infinite] > 0, high, low)
-        if self.beside:
-            planes = _continued(planes, self.limits)
-        planes[np.isnan(planes)] = self.outside
-        return planes[first - start : last - start]
+    plain = DerivedPlanes(samples, known, dtype=samples.dtype, numbered=True)
+    if not regions.unsure.any():
+        return Filled(plain, plain, None, "")
+    count = int(regions.size[regions.unsure].sum())
+    notes.append(
+        f"{count:,} of the unknown samples are in regions that touch both sides of the surface: "
+        "it is open there"
+    )
+    at = np.unravel_index(int(regions.start[regions.unsure][0]), census.shape)
+    value = getattr(samples, "value", None)
+    which = "" if value is None else f" (those that are exactly {value:g} are taken as such)"
+    why = (
+        f"{count:,} samples are unknown{which}, values[{', '.join(map(str, map(int, at)))}] the "
+        "first, in regions that touch samples on both sides of the surface, so whether they are "
+        "inside is unknown"
+    )
+    continued = partial(known, is_continued=True)
+    return Filled(
+        DerivedPlanes(samples, continued, 2 * LAYERS, samples.dtype, numbered=True),
+        plain,
+        DerivedPlanes(samples, unseen, dtype=bool, numbered=True),
+        why,
+    )
 
 
 def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
@@ -114,66 +125,22 @@ def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
     return planes
 
 
-class UnseenPlanes(_OfRegions):
-    """Which samples are unknown, with both sides beside their region, or none."""
-
-    def read(self, first: int, last: int) -> BoolArray:
-        """Return planes ``first`` to ``last`` (exclusive)."""
-        planes = np.isnan(self.source[first:last])
-        for i, unknown in enumerate(planes, first):
-            unknown[unknown] = self.regions.unsure[self.regions.runs_of(i, unknown)[unknown]]
-        return planes
-
-    def refusal(self) -> str:
-        """Return a sentence that says why no closed surface is known."""
-        unsure = self.regions.unsure
-        at = np.unravel_index(int(self.regions.start[unsure][0]), self.shape)
-        first = ", ".join(str(int(index)) for index in at)
-        value, count = getattr(self.source, "value", None), int(self.regions.size[unsure].sum())
-        which = "" if value is None else f" (those that are exactly {value:g} are taken as such)"
-        return (
-            f"{count:,} samples are unknown{which}, values[{first}] the first, in regions that "
-            "touch samples on both sides of the surface, so whether they are inside is unknown"
-        )
-
-
-class SeenPlanes(_OfRegions):
+class Seen(DerivedPlanes):
     """Samples that are NaN in some regions of a value, when they are read."""
 
     def __init__(
         self, source: SampleArray, regions: Regions, unseen: BoolArray, value: float
     ) -> None:
-        super().__init__(source, regions, np.float64)
-        self.unseen, self.value = unseen, value
+        def hide(planes: NDArray[Any], first: int) -> Floats:
+            planes = as_float64(planes)
+            for i, plane in enumerate(planes, first):
+                marked = regions.is_marked(plane)
+                hidden = unseen[regions.runs_of(i, marked)[marked]]
+                plane[marked] = np.where(hidden, np.nan, plane[marked])
+            return planes
 
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive)."""
-        planes = as_float64(self.source[first:last])
-        for i, plane in enumerate(planes, first):
-            marked = self.regions.is_marked(plane)
-            runs = self.regions.runs_of(i, marked)[marked]
-            plane[marked] = np.where(self.unseen[runs], np.nan, plane[marked])
-        return planes
-
-
-def filled(census: Census, notes: list[str]) -> KnownPlanes:
-    """Return samples of which the unknown ones are replaced, and say so in the notes."""
-    samples, numbers, regions = census.samples, census.numbers, census.unknown
-    low, high = finite_extremes(census)
-    nan = int(regions.size.sum())
-    outer = int(regions.size[regions.positive & ~regions.unsure].sum())
-    notes.append(
-        f"{nan + numbers.infinite:,} samples are unknown ({nan:,} NaN, of which {outer:,} lie on "
-        f"the positive side, and {numbers.infinite:,} infinite): they are taken as cut off at "
-        f"{low:.6g} and {high:.6g}"
-    )
-    below, above, _ = numbers.border
-    if regions.unsure.any():
-        notes.append(
-            f"{int(regions.size[regions.unsure].sum()):,} of the unknown samples are in regions "
-            "that touch both sides of the surface: it is open there"
-        )
-    return KnownPlanes(samples, regions, (low, high), low if below > above else high)
+        super().__init__(source, hide, numbered=True)
+        self.value = value
 
 
 def finite_extremes(census: Census) -> Extremes:
@@ -189,15 +156,18 @@ def finite_extremes(census: Census) -> Extremes:
 def _check_infinite(samples: SampleArray) -> None:
     """Raise GridError if infinite samples are beside the surface."""
     beside: set[tuple[int, int, int]] = set()
-    for i, slab in enumerate(with_the_one_before(samples)):
+    former: list[NDArray[Any]] = []
+    for i, plane in enumerate(samples):
+        slab = np.stack([*former, plane])
+        former = [plane]
         at = np.indices(slab.shape)
         at[0] += i + 1 - len(slab)
         for axis in range(3):
-            one, other = (np.moveaxis(slab, axis, 0)[side] for side in SIDES)
+            lines, places = np.moveaxis(slab, axis, 0), np.moveaxis(at, axis + 1, 1)
+            one, other = lines[1:], lines[:-1]
             crossed = ~(np.isnan(one) | np.isnan(other)) & ((one > 0) != (other > 0))
-            for values, side in zip((one, other), SIDES):
-                places = np.moveaxis(at, axis + 1, 1)[:, side][:, crossed & np.isinf(values)]
-                beside |= set(map(tuple, places.T.tolist()))
+            for values, where in ((one, places[:, 1:]), (other, places[:, :-1])):
+                beside |= set(map(tuple, where[:, crossed & np.isinf(values)].T.tolist()))
     if beside:
         i, j, k = min(beside)
         raise GridError(
@@ -218,14 +188,14 @@ def without_unseen(census: Census, notes: list[str]) -> Census:
         return census
     samples, all_known = census.samples, census.is_finite
     for value, steepest in _suspects(census.pairs, extremes):
-        regions = Regions.of(samples, partial(np.equal, value))
+        regions = Regions(samples, partial(np.equal, value))
         unseen = _unseen_runs(samples, regions, value, steepest, extremes)
         if unseen.any():
             notes.append(
                 f"{int(regions.size[unseen].sum()):,} samples are exactly {value:g}, where no "
                 "distance is: they are taken as unknown (write NaN where nothing was seen)"
             )
-            samples, all_known = SeenPlanes(samples, regions, unseen, value), False
+            samples, all_known = Seen(samples, regions, unseen, value), False
         elif all_known and value in extremes:
             _check_jumps(census, value, int(regions.size.sum()), JUMP * steepest)
     return census if samples is census.samples else Census(samples)
@@ -233,21 +203,19 @@ def without_unseen(census: Census, notes: list[str]) -> Census:
 
 def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
     """Return values that may stand for unseen samples, and the steepest change of the others."""
-    values, counts = np.unique(pairs[0], return_counts=True)
+    values, counts = np.unique(pairs[0][pairs[0] == pairs[1]], return_counts=True)
     often = values[counts >= ENOUGH][np.argsort(counts[counts >= ENOUGH])[-FREQUENT:]]
     changes = np.abs(pairs[1] - pairs[0])
-    ordered = np.sort(changes)
-    extreme = np.isin(pairs, extremes)
-    changes[extreme[0] & extreme[1]] = 0  # values that are cut off near the surface
+    changes[np.isin(pairs, extremes).all(0)] = 0  # values that are cut off near the surface
     suspects = []
     for value in sorted({0.0, *extremes, *often.tolist()}):
-        has = pairs == value
-        beside = np.sort(changes[has[0] != has[1]])[-LEAST_JUMPS:]
-        largest = beside[0] if len(beside) == LEAST_JUMPS else 0.0
-        is_plateau = value == 0 and (has[0] & has[1]).sum() >= ENOUGH
-        if not is_plateau and largest <= JUMP * _least_steep(pairs, ordered, has, extreme):
+        has, is_often = pairs == value, value not in (0, *extremes)
+        alike, beside = int((has[0] & has[1]).sum()), changes[has[0] != has[1]]
+        if is_often and alike < ALIKE * (alike + len(beside)):
             continue
-        if value and _is_a_side(pairs, value):
+        largest = np.sort(beside)[-LEAST_JUMPS] if len(beside) >= LEAST_JUMPS else 0.0
+        is_plateau = value == 0 and alike >= ENOUGH
+        if not (is_plateau or largest) or (value and _is_a_side(pairs, value)):
             continue
         steepest = _steepest(pairs, value, extremes)
         if value in extremes and _is_cut_near(pairs, value, steepest, extremes):
@@ -255,16 +223,6 @@ def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
         if is_plateau or largest > JUMP * steepest:
             suspects.append((float(value), steepest))
     return suspects
-
-
-def _least_steep(pairs: Floats, ordered: Floats, has: BoolArray, extreme: BoolArray) -> float:
-    """Return what ``_steepest`` exceeds, by all changes in order; 0 where that does not show."""
-    inner = pairs[~(has | extreme)]
-    if len(np.unique(inner[:MANY])) < LEAST_VALUES:
-        return 0.0
-    first, last = np.searchsorted(ordered, [0, np.ptp(inner)], "right")
-    rest = last - first - int((has[0] | has[1]).sum())  # if all others are steeper
-    return float(ordered[first + int(STEEPEST * (rest - 1))]) if rest > ENOUGH else 0.0
 
 
 def _is_a_side(pairs: Floats, value: float) -> bool:
@@ -294,8 +252,8 @@ def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
         return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
     # A field that levels off, or with far spacings along one axis, is steepest at the surface.
     across = change[is_inner.all(0) & ((pairs[0] > 0) != (pairs[1] > 0))]
-    steepest = float(np.quantile(changes, STEEPEST))
-    return max(steepest, float(np.quantile(across, STEEPEST))) if len(across) >= ENOUGH else steepest
+    groups = [changes, across] if len(across) >= ENOUGH else [changes]
+    return max(float(np.quantile(group, STEEPEST)) for group in groups)
 
 
 def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:

@@ -15,9 +15,8 @@ from ..errors import GridError, OptionError, seen
 from ..files.grids import read_array
 from ..grid.derived import extremes_of_masks
 from ..grid.field import NONE_EXACT, Field
-from ..grid.interpret import as_sample, labelled
-from ..grid.placement import as_samples, check_kind, check_spacing, is_cubic, placed
-from ..grid.refusals import named
+from ..grid.interpret import as_sample, labelled, named
+from ..grid.samples import as_samples, check_kind, check_spacing, is_cubic, placed
 from ..grid.sdf_grid import SdfGrid, with_fields
 from ..options import MASK, AxisOrder, Space, check_label, check_labels
 

@@ -17,7 +17,7 @@ from typing import Any
 from ..check.check import Certificate, check_mesh, read_for_check
 from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
-from ..grid.cubic import cubic_grid
+from ..grid.sdf_grid import cubic_grid
 from ..options import Options
 from ..surface.mesh import Mesh
 from .meshes import coarse_surface, packed_mesh

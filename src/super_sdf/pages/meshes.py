@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..arrays import CORNERS, FloatArray
 from ..check.check import FULL, Certificate
 from ..errors import check_modules
-from ..grid.placement import as_triple
+from ..grid.samples import as_triple
 from ..grid.sdf_grid import SdfGrid, with_fields
 from ..options import MARCHING
 from ..refine.band import neighbour_table, rescale

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray, IntArray
 from ..errors import OptionError
 from ..grid.field import NONE_EXACT, Field
-from ..grid.planes import SamplePlanes
+from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..options import EXACT, NOISY
 from ..threads import chunks_of

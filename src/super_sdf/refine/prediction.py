@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
 from ..grid.derived import local_slopes
-from ..grid.planes import SampleArray, in_spacings
+from ..grid.samples import SampleArray, in_spacings
 from ..network.decoder import Adapter, decode
 from ..progress import ShareCallback
 from .band import plane_blocks

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from ..arrays import CENTRE, BoolArray, FloatArray, IntArray
 from ..errors import NoSurfaceError
-from ..grid.cubic import on_samples, sampled_places
 from ..grid.field import Field
-from ..grid.planes import let_go, planes_at_once
-from ..grid.sdf_grid import SdfGrid
+from ..grid.samples import let_go, planes_at_once
+from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
 from ..options import MASK
 from ..threads import over_threads
 from .band import (

@@ -135,7 +135,7 @@ def check_can_close(grid: SdfGrid, *, cap: bool) -> None:
     """Raise GridError if a surface is to be closed, and samples that may hide it are unknown."""
     unseen = grid.field.unseen
     if unseen is not None and cap:
-        why = getattr(unseen, "refusal", lambda: "samples beside the surface are unknown")()
+        why = grid.field.why_open or "samples beside the surface are unknown"
         raise GridError(f"{why}; {WAY_OUT}")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ...grid.placement import UNNAMED, even_steps
+from ...grid.samples import UNNAMED, even_steps
 from ..volume import axes_direction, kept_axes, triple
 
 SPACE = "xyz"

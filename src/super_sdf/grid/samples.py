@@ -1,20 +1,31 @@
-"""Arrays of samples and where these lie: spacing and direction of the axes, names of axes.
+"""Arrays of samples that are read by planes, and where they lie: spacing, direction, coordinates.
 
 xarray is not imported: whoever has a ``DataArray`` has imported it.
 """
 
 from __future__ import annotations
 
+import mmap
 import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from math import prod
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ..arrays import Triple, without_device
+from ..arrays import FloatArray, Triple, without_device
 from ..errors import GridError, seen
 from ..threads import check_fits
-from .planes import LazyPlanes, SampleArray, SamplePlanes
+
+FAR = 1e6  # spacings
+BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
+LEAST_AT_ONCE = 4  # planes
+LARGE_FILE = 1 << 27  # bytes
+# Bytes taken at a time when planes are made of others, and per sample, measured.
+WORKING_BYTES, EACH = 1 << 26, 60
 
 # Spacings that differ by less than this ratio count as equal. Coarser axes are resampled to the
 # finest spacing, so a large ratio makes many samples of few.
@@ -22,6 +33,8 @@ EQUAL_SPACING, MOST_UNEQUAL = 1e-3, 50.0
 # Within these, areas, volumes and squared areas neither overflow nor underflow.
 LEAST_SPACING, MOST_SPACING = 1e-60, 1e60
 
+Index: TypeAlias = Sequence[int] | NDArray[Any]
+"""One index per axis."""
 Direction: TypeAlias = tuple[Triple, Triple, Triple]
 """A matrix, row by row; its columns are the world directions of the array's axes."""
 
@@ -32,6 +45,191 @@ DIGITS = 1e-9  # a matrix this near to the identity is it
 AXES = ("x", "y", "z")
 UNNAMED = ("dim_0", "dim_1", "dim_2")  # xarray's names of dimensions that got none
 EVEN = 1e-3  # of a step: how far coordinates may be from even ones, besides their rounding
+
+
+class SamplePlanes(ABC):
+    """A 3D array, (nx, ny, nz), whose planes along the first axis are made when they are needed.
+
+    ``name`` is what it is called in messages.
+    """
+
+    ndim = 3
+    beside = 0  # planes to either side on which those that are made depend
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    name: str = "the grid"
+
+    @abstractmethod
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
+
+    def crop(self, low: Index, high: Index) -> SampleArray:
+        """Return the samples from index ``low`` to before ``high``, read when they are needed."""
+        return CroppedPlanes(self, low, high)
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, which: int | slice) -> NDArray[Any]:
+        """Return one plane or a range of planes, as indexing an array would."""
+        if isinstance(which, slice):
+            first, last, step = which.indices(len(self))
+            return self.read(first, max(first, last)) if step == 1 else self.loaded[which]
+        number = range(len(self))[which]
+        plane: NDArray[Any] = self.read(number, number + 1)[0]
+        return plane
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        plane = self.shape[1] * self.shape[2] * self.dtype.itemsize
+        for block in in_blocks(self, max(BLOCK_BYTES // plane, 2 * self.beside, 1)):
+            yield from self[block]
+
+    @cached_property
+    def loaded(self) -> NDArray[Any]:
+        """The whole array, which stays in memory; OutOfMemoryError if it is too large."""
+        size = prod(self.shape) * self.dtype.itemsize
+        check_fits(size, f"{self.name}, whole,", "read it plane by plane (SdfGrid.planes)")
+        return self.read(0, len(self))
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.loaded, dtype) if copy else np.asarray(self.loaded, dtype)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the array itself: another process may not have what it is made from."""
+        return np.asarray, (self.loaded,)
+
+
+SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
+"""An array of samples in memory, or one whose planes are read or made when they are needed."""
+
+
+class LazyPlanes(SamplePlanes):
+    """An array of h5py, Zarr, Dask or the like, which is read by slices."""
+
+    def __init__(self, source: Any) -> None:
+        self.source, self.shape, self.dtype = source, tuple(source.shape), np.dtype(source.dtype)
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive)."""
+        return np.asarray(self.source[first:last])
+
+    def crop(self, low: Index, high: Index) -> SampleArray:
+        """Return the samples in a box, which alone is read."""
+        return np.asarray(self.source[_box(low, high)])
+
+
+class CroppedPlanes(SamplePlanes):
+    """The samples of another array in a box."""
+
+    def __init__(self, source: SamplePlanes, low: Index, high: Index) -> None:
+        self.source, self.box = source, _box(low, high)
+        self.shape, self.dtype = tuple(s.stop - s.start for s in self.box), source.dtype
+        self.beside = source.beside
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive)."""
+        start = self.box[0].start
+        return self.source.read(start + first, start + last)[:, self.box[1], self.box[2]]
+
+
+class DerivedPlanes(SamplePlanes):
+    """Planes that are made of those of another array, and of some beside them.
+
+    ``make`` takes some planes of ``source`` and returns as many. Values depend on ``beside``
+    samples to either side along each axis. If they depend on their place in the grid, ``make``
+    takes ``numbered`` planes: whole ones, and the number of the first.
+    """
+
+    def __init__(
+        self,
+        source: SampleArray,
+        make: Callable[..., NDArray[Any]],
+        beside: int = 0,
+        dtype: DTypeLike = np.float64,
+        *,
+        numbered: bool = False,
+    ) -> None:
+        self.source, self.make, self.beside, self.numbered = source, make, beside, numbered
+        self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
+
+    def crop(self, low: Index, high: Index) -> SampleArray:
+        """Return the samples in a box, made of those of the source in a box around it."""
+        if self.numbered:
+            return super().crop(low, high)
+        around = [max(n - self.beside, 0) for n in low]
+        beyond = [min(n + self.beside, count) for n, count in zip(high, self.shape)]
+        source = cropped(self.source, around, beyond)
+        made = DerivedPlanes(source, self.make, self.beside, self.dtype)
+        return CroppedPlanes(made, *([a - b for a, b in zip(ends, around)] for ends in (low, high)))
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive); some rows at a time, to save memory."""
+        low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
+        out = np.empty((last - first, *self.shape[1:]), self.dtype)
+        if last <= first:
+            return out
+        source, own = np.asarray(self.source[low:high]), slice(first - low, last - low)
+        if self.numbered:
+            return self.make(source, low)[own]
+        step = WORKING_BYTES // (len(source) * self.shape[2] * EACH)
+        if step < self.shape[1]:
+            step = max(step - 2 * self.beside, 2 * self.beside, 1)
+        for start in range(0, self.shape[1], step):
+            stop, low_row = min(start + step, self.shape[1]), max(start - self.beside, 0)
+            made = self.make(source[:, low_row : stop + self.beside])[own]
+            out[:, start:stop] = made[:, start - low_row : stop - low_row]
+        return out
+
+
+def cropped(samples: SampleArray, low: Index, high: Index) -> SampleArray:
+    """Return the samples from index ``low`` (3,) to before ``high``."""
+    if isinstance(samples, SamplePlanes):
+        return samples.crop(low, high)
+    return samples[_box(low, high)]
+
+
+def _box(low: Index, high: Index) -> tuple[slice, ...]:
+    return tuple(slice(int(first), int(last)) for first, last in zip(low, high))
+
+
+def changed(
+    samples: SampleArray,
+    change: Callable[[NDArray[Any]], NDArray[Any]],
+    dtype: DTypeLike = np.float64,
+) -> DerivedPlanes:
+    """Return samples changed one by one, each for itself; as float64 they are changed as such."""
+    if dtype is np.float64:
+        return DerivedPlanes(samples, lambda planes: change(planes.astype(np.float64)))
+    return DerivedPlanes(samples, change, dtype=dtype)
+
+
+def let_go(samples: SampleArray) -> None:
+    """Let the system take back the pages of a large mapped file: they count as held memory."""
+    while hasattr(samples, "source"):
+        samples = samples.source
+    mapped = getattr(samples, "_mmap", None)
+    if hasattr(mapped, "madvise") and len(mapped) > LARGE_FILE:
+        mapped.madvise(mmap.MADV_DONTNEED)
+
+
+def in_blocks(samples: SampleArray, step: int) -> list[slice]:
+    """Return ranges of ``step`` planes, the last one of what is left."""
+    return [slice(i, min(i + step, len(samples))) for i in range(0, len(samples), step)]
+
+
+def planes_at_once(samples: SampleArray) -> int:
+    """Return how many planes are best made at a time: not few, if each needs many beside it."""
+    return max(2 * getattr(samples, "beside", 0), LEAST_AT_ONCE)
+
+
+def spread_planes(first: int, last: int, most: int) -> list[int]:
+    """Return evenly spread planes from ``first`` to ``last`` (inclusive), a limited number."""
+    return sorted({int(i) for i in np.linspace(first, last, most)})
+
+
+def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
+    """Return values over a unit as float32; from ``FAR`` on their size does not matter."""
+    return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
 
 
 def as_triple(number: ArrayLike, name: str) -> Triple:
