@@ -87,7 +87,7 @@ def test_version_help_info_and_usage_errors(command):
     assert command() == (0, command("--help")[1], "")
     code, out, _ = command("info")
     assert code == 0 and out.startswith(f"super-sdf: {super_sdf.__version__}\n")
-    assert "model base\n" in out and "devices: cpu" in out
+    assert "models: base" in out and "devices: cpu" in out
     assert json.loads(command("info", "--json")[1])["models"]["base"]["format_version"] == 1
     assert command("upsample")[0] == 2
     none = "Error: there is no command"

@@ -20,7 +20,7 @@ from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_l
 from super_sdf import Mesh, SdfGrid, __version__, load_network
 from super_sdf.batch import cluster
 from super_sdf.batch.cluster import completed, connect
-from super_sdf.batch.pool import Death
+from super_sdf.batch.work import Death
 from super_sdf.errors import ClusterError, MeshError
 from super_sdf.options import Options
 from super_sdf.pipeline import mesh_grid

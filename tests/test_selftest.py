@@ -80,7 +80,7 @@ def test_a_network_file_that_cannot_be_read_is_a_line_and_the_others_are_shown(m
     (models / "base.onnx").write_bytes(b"text")
     fault = f"{models / 'base.onnx'} is no ONNX file that onnxruntime can run: "
     code, out, err = command("info")
-    assert (code, err) == (1, "") and f"model base\n  fault: {fault}" in out
-    assert "model fast\n  accuracy: " in out
+    assert (code, err) == (1, "") and f"network base: {fault}" in out
+    assert "models: base, fast\n" in out
     code, out, err = command("info", "--check", "--device", "cpu")
     assert (code, err) == (1, "") and f"\nfailed   network base on cpu: {fault}" in out

@@ -43,8 +43,6 @@ SHARP: Final = "sharp"
 FLOAT32: Final = "float32"
 INT8: Final = "int8"
 DEFAULT_QUALITY: Final = "base"
-DEFAULT_MESHER: Final = AUTO
-AUTO_PRECISION: Final = AUTO
 FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
 MESHERS: tuple[MesherName, ...] = get_args(MesherName)
 DEVICES: tuple[Device, ...] = get_args(Device)
@@ -239,87 +237,76 @@ class Options:
         "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.", metavar="K")
     _: KW_ONLY
     spacing: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
-        "World distance between neighbouring samples: one number, or X,Y,Z where it differs "
-        "between axes; distances are resampled to the finest then. Default: from the file, else "
-        "estimated from the values.", metavar="H")
+        "World distance between neighbouring samples: one number, or X,Y,Z. Default: from the "
+        "file, else estimated from the values.", metavar="H")
     origin: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
         "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.", metavar="X,Y,Z")
     direction: tuple[float, ...] | None = _option(None, GRID, "read list labels",
         numbers((9,), "nine numbers, row by row"),
-        "World directions of the axes x, y and z of the array: the columns of a rotation or "
-        "mirrored rotation, as nine numbers with commas, row by row. Files of other formats than "
-        "NumPy, TIFF, HDF5 and Zarr state it.", metavar="MATRIX")
+        "World directions of the array's axes: a rotation, maybe mirrored, as nine numbers row by "
+        "row. For NumPy, TIFF, HDF5 and Zarr; other files state it.", metavar="MATRIX")
     axes: AxisOrder | None = _option(None, GRID, "read list labels", one_of(get_args(AxisOrder)),
-        "Axis order of the array in a NumPy, TIFF, HDF5 or Zarr file. Default: the names of the "
-        "axes in the file, else xyz for NumPy, zyx for the others. Files of other formats state "
-        "it.")
+        "Axis order of an array in NumPy, TIFF, HDF5 or Zarr. Default: by the names of the axes, "
+        "else xyz for NumPy, zyx for the others.")
     space: Space | None = _option(None, GRID, "read list labels", one_of(get_args(Space)),
-        "Anatomical space of the mesh, for files that state theirs, as medical images do. Default: "
-        "that of the file, which .ply, .stl and .obj name in their header.")
+        "Anatomical space of the mesh, for files that state theirs. Default: that of the file.")
     inside: Inside = _option(AUTO, VALUES, "read list", one_of(get_args(Inside)),
         "Sign of the values inside the solid; auto takes the border of the grid as outside.")
     field: FieldKind = _option(AUTO, VALUES, "read list", one_of(FIELDS),
-        "What the values are: exact distances, truncated near the surface, a mask (inside or "
-        "outside, or its distance transform), scaled (a field of another slope than 1), or noisy "
-        "distances; auto goes by what the samples show.")
+        "What the values are: distances (exact, truncated, noisy), a mask or its distance "
+        "transform, or a scaled field (of another slope than 1); auto goes by the samples.")
     label: int | None = _option(None, VALUES, "read list", Kind(check_label, _parse_label),
         "Mesh the samples with the value N of a label image.", metavar="N")
     labels: str | tuple[int | str, ...] | None = _option(None, VALUES, "list labels",
         Kind(check_labels, _parse_labels),
-        "Mesh all labels of a label image but 0, or those listed, each with a closed mesh; "
-        "neighbours share their walls. A .glb or .3mf holds all as parts; of other formats each "
-        "label N has its own file, NAME-N.ply. A listed label that an image lacks is left out, "
-        "with a note.", metavar="all|N,N")
+        "Mesh all labels of a label image but 0, or those listed, with shared walls: as parts of "
+        "a .glb or .3mf, else each in its own file, NAME-N.ply.", metavar="all|N,N")
     level: float | None = _option(None, VALUES, "read list", number(),
-        "Mesh the surface at the value L of densities; what is above L is inside, unless --inside "
-        "is negative.", metavar="L")
+        "Mesh the surface at the value L of densities; above L is inside, unless --inside is "
+        "negative.", metavar="L")
     scale: float | None = _option(None, VALUES, "read list", number(ABOVE_0, ABOVE_0, above=0),
         "World units per unit of the values, if they have another unit than the spacing.",
         metavar="S")
     offset: float = _option(0.0, MESH, "list",
         number("a number, in world units", "a finite number, in world units"),
-        "Mesh the offset surface at distance D, in world units; a positive D grows the solid, "
-        "whichever sign is inside.", metavar="D")
-    cap: bool = _option(True, MESH, "list", FLAG,
-        "Where the solid runs out of the grid, close the surface along the border, which is the "
-        "default, or leave it open. A surface that ends where samples are unknown needs --open.",
-        off="open")
-    mesher: MesherName = _option(AUTO, MESH, "list", one_of(MESHERS),
-        "Mesher: marching is marching cubes, which cuts off edges and corners; sharp also puts "
-        "vertices on them; auto is sharp for distances, and marching for masks and noise.")
-    simplify: float | None = _option(None, MESH, "list", VOXELS,
-        "Simplify the mesh as far as it stays within ERROR of the unsimplified one, in voxels of "
-        "the grid (such as 0.02), measured both ways. A closed mesh stays closed. Needs the extra "
-        "simplify.", metavar="ERROR")
-    tolerance: float | None = _option(None, MESH, "list", WORLD,
-        "Simplify as with --simplify, but within D in world units, such as millimetres.",
+        "Mesh the offset surface at distance D, in world units; a positive D grows the solid.",
         metavar="D")
+    cap: bool = _option(True, MESH, "list", FLAG,
+        "Close the surface along the border of the grid (default), or leave it open there, as one "
+        "that ends at unknown samples must be.", off="open")
+    mesher: MesherName = _option(AUTO, MESH, "list", one_of(MESHERS),
+        "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
+        "them; auto is sharp for distances, marching for masks and noise.")
+    simplify: float | None = _option(None, MESH, "list", VOXELS,
+        "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
+        "Needs the extra simplify.", metavar="ERROR")
+    tolerance: float | None = _option(None, MESH, "list", WORLD,
+        "Simplify as with --simplify, but within D in world units.", metavar="D")
     triangles: int | None = _option(None, MESH, "list",
         number(WHOLE, "4 or more, as a closed mesh has", above=3, step=1),
-        "Simplify the mesh to at most N triangles, instead of --simplify. If the shape needs more, "
-        "a warning says how many are left.", metavar="N")
+        "Simplify the mesh to at most N triangles, instead of --simplify.", metavar="N")
     keep_volume: bool = _option(False, MESH, "list labels", FLAG,
-        "For masks and labels: move each surface along its normals, by a small part of a voxel, "
-        "until the volume of the mesh is that of its samples, each of which counts as a box.")
+        "Of masks and labels: move each surface by a small part of a voxel until its volume is "
+        "that of its samples, as boxes.")
     unit: Unit | None = _option(None, MESH, "list labels", one_of(LENGTHS),
-        "Unit of the world, which .3mf and .glb state, so that other programs show the true size. "
-        "Default: a .3mf says millimetres, a .glb metres. Coordinates stay as they are.")
+        "Unit of the world, which .3mf (default: millimetres) and .glb (metres) state. "
+        "Coordinates stay as they are.")
     quality: Quality | None = _option(None, WORK, "labels", one_of(QUALITIES),
-        "Network: fast is smaller and quicker than base, the default; best averages base over 4 "
-        "turns of the grid, and takes 4 times as long.")
+        "Network: fast is quicker than base, the default; best averages base over 4 turns of the "
+        "grid, and takes 4 times as long.")
     model: str | None = _option(None, WORK, "labels",
         Kind(lambda value, name: str(check_path(value, name))),
         "Use the network in this ONNX file instead of --quality.", metavar="FILE")
     precision: Precision = _option(AUTO, WORK, "labels", one_of(PRECISIONS),
-        "Arithmetic of the network: auto is int8 on the CPU if the network has it, otherwise "
-        "float32. On the CPU int8 takes about half as long.")
+        "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "
+        "it, else float32.")
     device: Device = _option(AUTO, WORK, "labels", one_of(DEVICES),
         "Where the network runs; auto uses CUDA if it works here, else the CPU.")
     threads: int = _option(0, WORK, "labels", THREADS,
         "CPU threads; 0 means one per core.", metavar="N")
     max_memory: int | None = _option(None, WORK, "labels", MEMORY._replace(parse=parse_size),
-        "Memory limit of the process, such as 1500M or 4G. Default: 60 % of the free memory. "
-        "Larger grids are refined in several boxes, whose meshes are joined.", metavar="SIZE")
+        "Memory limit of the process, such as 4G. Default: 60 % of the free memory. Larger grids "
+        "are refined in boxes, whose meshes are joined.", metavar="SIZE")
     # fmt: on
 
     def __post_init__(self) -> None:
@@ -368,14 +355,6 @@ READ, BATCH_LISTS, LABELS = (
     tuple(name for name, row in OPTIONS.items() if where in row.shows)
     for where in ("read", "list", "labels")
 )
-
-check_factor = OPTIONS["factor"].check
-check_distance = OPTIONS["offset"].check
-check_cap = OPTIONS["cap"].check
-check_mesher = OPTIONS["mesher"].check
-check_max_memory = OPTIONS["max_memory"].check
-check_space, check_unit = OPTIONS["space"].check, OPTIONS["unit"].check
-check_threads = OPTIONS["threads"].check
 
 
 def check_one(given: Mapping[str, Any]) -> None:

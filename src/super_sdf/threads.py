@@ -2,22 +2,18 @@
 
 Threads and memory are decided once at the start, and passed down. Pieces of work are independent of
 each other and may run at the same time; results come in order.
-
-On Linux the files of /proc and of control groups say how much memory is free and held, elsewhere
-psutil does. Control groups, those of a container, are nested; the tightest limit counts.
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from math import ceil, inf
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 from .errors import OptionError, OutOfMemoryError
 
@@ -30,22 +26,6 @@ MAX_INDEX = 2**31 - 1  # of vertices and nodes, as in mesh files; beyond, one wo
 
 SYSTEM, GROUPS, OWN = Path("/proc/meminfo"), Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 SHARE = 0.6  # of the memory that is free, the share that is taken unless a bound is given
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt, from malloc.h
-
-
-class Resources(NamedTuple):
-    """The threads that a process may use, and the bytes that it may hold; None: no bound."""
-
-    threads: int = 1
-    memory: int | None = None
-
-
-def allot_each(count: int, threads: int = 0, max_memory: int | None = None) -> Resources:
-    """Return the share of each of ``count`` processes in the threads and memory of this machine."""
-    bound = memory_bound(max_memory)
-    if bound is not None:
-        bound = max(1, bound - (held_memory() or 0)) // count
-    return Resources(threads or max(1, count_cores() // count), bound)
 
 
 def check_count(count: int, what: str) -> int:
@@ -56,11 +36,6 @@ def check_count(count: int, what: str) -> int:
             "smaller factor, or fewer samples"
         )
     return count
-
-
-def count_cores() -> int:
-    """Return the number of cores this process may use; in a container its quota, rounded up."""
-    return max(ceil(min(cores_of_system(), min(map(_cores_of, _groups("cpu")), default=inf))), 1)
 
 
 def cores_of_system() -> int:
@@ -90,24 +65,10 @@ def chunks_of(count: int, width: int) -> list[slice]:
     return [slice(first, min(first + step, count)) for first in range(0, count, step)]
 
 
-def map_chunks(
-    work: Callable[[slice], Result], count: int, width: int, threads: int = 1
-) -> list[Result]:
-    """Return ``work(rows)`` for chunks of ``count`` rows that need ``width`` temporaries each."""
-    return map_threads(work, chunks_of(count, width), worthwhile_threads(count * width, threads))
-
-
-def map_threads(
-    work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
-) -> list[Result]:
-    """Return ``work(piece)`` for each piece, in order, with up to ``threads`` threads."""
-    return list(over_threads(work, pieces, threads))
-
-
 def over_threads(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
 ) -> Iterator[Result]:
-    """Yield the same, so that not all need to be held."""
+    """Yield ``work(piece)`` for each piece, in order, with up to ``threads`` threads."""
     threads = min(threads, len(pieces))
     if threads < 2:
         yield from map(work, pieces)
@@ -116,26 +77,43 @@ def over_threads(
         yield from pool.map(work, pieces)
 
 
+def map_threads(
+    work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
+) -> list[Result]:
+    """Return the same as a list."""
+    return list(over_threads(work, pieces, threads))
+
+
+def map_chunks(
+    work: Callable[[slice], Result], count: int, width: int, threads: int = 1
+) -> list[Result]:
+    """Return ``work(rows)`` for chunks of ``count`` rows that need ``width`` temporaries each."""
+    return map_threads(work, chunks_of(count, width), worthwhile_threads(count * width, threads))
+
+
+def count_cores() -> int:
+    """Return the number of cores this process may use; in a container its quota, rounded up."""
+    return max(ceil(min([cores_of_system(), *map(_cores_of, _groups("cpu"))])), 1)
+
+
 def free_memory() -> int | None:
     """Return the bytes of memory that are free, None if the system does not tell.
 
     In a container with a memory limit, at most what is left of the limit.
     """
     try:
-        sizes = _read_sizes(SYSTEM)
+        free = _read_sizes(SYSTEM).get("MemAvailable")
     except OSError:
         return _by_psutil("free")
-    rooms = [sizes.get("MemAvailable"), *map(_left_in, _groups("memory"))]
-    return None if rooms[0] is None else min(room for room in rooms if room is not None)
+    return None if free is None else int(min([free, *map(_left_in, _groups("memory"))]))
 
 
 def held_memory(peak: bool = False, pid: int | str = "self") -> int | None:
     """Return the bytes of memory that a process holds, or its ``peak``; None if nothing tells."""
     try:
-        sizes = _read_sizes(Path(f"/proc/{pid}/status"))
+        return _read_sizes(Path(f"/proc/{pid}/status")).get("VmHWM" if peak else "VmRSS")
     except OSError:
         return None if peak else _by_psutil("rss", pid)
-    return sizes.get("VmHWM" if peak else "VmRSS")
 
 
 def memory_bound(max_memory: int | None = None) -> int | None:
@@ -147,6 +125,14 @@ def memory_bound(max_memory: int | None = None) -> int | None:
     if max_memory is not None or free is None:
         return max_memory
     return (held_memory() or 0) + int(SHARE * free)
+
+
+def allot_each(count: int, threads: int, max_memory: int | None) -> tuple[int, int | None]:
+    """Return the threads and the memory bound of each of ``count`` processes of this machine."""
+    bound = memory_bound(max_memory)
+    if bound is not None:
+        bound = max(1, bound - (held_memory() or 0)) // count
+    return threads or max(1, count_cores() // count), bound
 
 
 def check_fits(need: int, what: str, way_out: str) -> None:
@@ -169,23 +155,11 @@ def give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def reuse_freed() -> None:
-    """Let this process use freed memory again, as glibc's own settings do after a while.
-
-    Dask sets ``MALLOC_TRIM_THRESHOLD_`` for its workers: then all arrays of more than 128 kB come
-    from the system as fresh pages, and converting a grid takes half as much processor time again.
-    """
-    with suppress(OSError, AttributeError, TypeError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(M_MMAP_THRESHOLD, 32 << 20)
-        mallopt(M_TRIM_THRESHOLD, 64 << 20)
-
-
 def described_processor() -> dict[str, str]:
     """Return what Linux says of the first processor, by name; empty on other systems."""
     with suppress(OSError), open("/proc/cpuinfo", "rb", buffering=0) as file:
-        first, _, _ = file.read(1 << 13).decode("ascii", "replace").partition("\n\n")
-        pairs = (line.partition(":") for line in first.splitlines())
+        lines = file.read(1 << 13).decode("ascii", "replace").partition("\n\n")[0].splitlines()
+        pairs = (line.partition(":") for line in lines)
         return {name.strip(): value.strip() for name, _, value in pairs}
     return {}
 
@@ -211,46 +185,38 @@ def _by_psutil(what: str, pid: int | str = "self") -> int | None:
 def _groups(controller: str) -> Iterator[Path]:
     """Yield the folders of the control groups that this process is in, innermost first.
 
-    In a container the path of the group may not exist: what is mounted there is the group itself.
+    Groups, such as those of containers, are nested; the tightest limit counts. In a container the
+    path of the group may not exist: what is mounted there is the group itself.
     """
-    if sys.platform != "linux":
-        return
-    with suppress(OSError):
+    with suppress(OSError):  # not Linux
         for line in OWN.read_text().splitlines():
             _, names, path = line.split(":", 2)
-            if names and controller not in names.split(","):
-                continue
-            root = GROUPS / controller if names else GROUPS
-            inner = root / path.strip("/")
-            yield from (folder for folder in (inner, *inner.parents) if folder.is_relative_to(root))
+            if not names or controller in names.split(","):  # version 2, or 1
+                root = GROUPS / controller if names else GROUPS
+                inner = root / path.strip("/")
+                yield from (each for each in (inner, *inner.parents) if each.is_relative_to(root))
 
 
-def _left_in(group: Path) -> int | None:
-    """Return how many bytes a control group may still take, None without a limit.
-
-    The kernel counts cached files as used, but drops inactive ones when memory is short.
-    """
-    for limit_name, used_name, cache_name in (
+def _left_in(group: Path) -> float:
+    """Return how many bytes a control group may still take; inactive cached files are dropped."""
+    for limit, used, cache in (
         ("memory.max", "memory.current", "inactive_file"),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ):
         with suppress(OSError, ValueError):  # of the other version, or the limit is "max"
-            limit, used = (int((group / name).read_text()) for name in (limit_name, used_name))
-            statistics: dict[str, int] = {}
-            with suppress(OSError, ValueError):
-                lines = (group / "memory.stat").read_text().splitlines()
-                statistics = {key: int(number) for key, number in map(str.split, lines)}
-            return max(limit - max(used - statistics.get(cache_name, 0), 0), 0)
-    return None
+            most, taken = (int((group / name).read_text()) for name in (limit, used))
+            words = (group / "memory.stat").read_text().split()
+            return max(most - max(taken - int(words[words.index(cache) + 1]), 0), 0)
+    return inf
 
 
 def _cores_of(group: Path) -> float:
     """Return the cores' worth of time that a control group may use, infinity without a limit."""
     with suppress(OSError, ValueError):  # as above
-        quota, period = (group / "cpu.max").read_text().split()
-        return int(quota) / int(period)
+        quota, period = map(int, (group / "cpu.max").read_text().split())
+        return quota / period
     with suppress(OSError, ValueError):
-        quota, period = ((group / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
-        if int(quota) > 0:
-            return int(quota) / int(period)
+        names = "cpu.cfs_quota_us", "cpu.cfs_period_us"
+        quota, period = (int((group / name).read_text()) for name in names)
+        return quota / period if quota > 0 else inf
     return inf

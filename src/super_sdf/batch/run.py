@@ -27,7 +27,7 @@ from ..files.output import naming
 from ..network.network import find_model
 from ..network.onnx import available_devices
 from ..progress import Progress
-from ..threads import count_cores, free_memory, held_memory, memory_bound
+from ..threads import allot_each, count_cores, free_memory
 from .inputs import DONE, DONE_BEFORE, FAILED, FAILED_BEFORE, REFUSED, TO_DO, Job
 from .record import STAGE_NAME, Record, Row, file_state, fingerprint, is_unchanged, outputs_of
 from .work import Death, Settings, convert_job, work_in_processes
@@ -108,8 +108,7 @@ class Batch:
         count = count_workers(settings.workers, options.device, count, options.max_memory)
         threads, memory = options.threads, options.max_memory
         if count > 1:  # before the workers fill the memory
-            threads, memory = threads or max(1, count_cores() // count), memory_bound(memory)
-            memory = memory and max(1, memory - (held_memory() or 0)) // count
+            threads, memory = allot_each(count, threads, memory)
 
         def take() -> Job | None:
             is_over = not left or (settings.fail_fast and self.has_failed)

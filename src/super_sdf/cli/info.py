@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import platform
 import sys
 from collections.abc import Iterator
 from typing import Any
 
 import click
+import numpy as np
 
 from .. import __version__, errors
-from ..options import EXACT, FLOAT32, MARCHING, MASK, MESHERS, Device
-from . import common
-from .common import option, print_stdout
+from ..options import FLOAT32, MASK, MESHERS, Device
+from . import main
+from .main import SHARED, option, table_option
 
-EXAMPLES = """\b
+HELP = """Show versions, devices and the shipped networks.
+
+With GRID, show instead what that grid file states: shape, type, spacing, origin, and how it is
+stored; of an OpenVDB file, all its grids. With --check, test the installation: each network refines
+a ball on the CPU and on CUDA, and what is missing is listed with the command that installs it.
+
+\b
 Examples:
   super-sdf info --check
   super-sdf info --check --device cuda
@@ -24,77 +30,63 @@ Examples:
 OK, MISSING, FAILED = "ok", "missing", "failed"
 SAMPLES, CENTRE, RADIUS = 32, 15.63, 12.0  # of a ball, in voxels; the centre is on no sample
 MOST_OFF, MOST_OFF_OF_MASK = 0.05, 0.6  # voxels; a mask shows the surface to half a voxel
-
-# fmt: off
 TAKES = (
     click.argument("source", metavar="[GRID]", required=False),
     option("--check", is_flag=True, help="Test the installation; exit code 1 if a check fails."),
-    common.table_options("device",
-        device="With --check: cpu skips CUDA; cuda makes it a failure if CUDA does not work."),
-    common.shared("json"),
+    table_option("device", "With --check: cpu skips CUDA; cuda makes it a failure if CUDA fails."),
+    SHARED["json"],
 )
-# fmt: on
 
 
-@common.make_command(
-    "Show versions, devices and networks, check them, or describe a grid file.", EXAMPLES, *TAKES
-)
+@main.make_command("Show versions, devices and networks, or describe a grid file.", HELP, *TAKES)
 def command(source: str | None, check: bool, device: Device, as_json: bool) -> None:
-    """Show versions, devices, and the shipped networks with their metadata.
-
-    With GRID, show instead what that grid file states: shape, type, spacing, origin, and
-    how it is stored, such as the chunks of a Zarr array; of an OpenVDB file, all its grids.
-
-    With --check, test instead whether they work on this machine: each network refines a ball on the
-    CPU and on CUDA. What is missing is listed with the command that installs it.
-    """
+    """Print facts, or findings as they come."""
     if source is not None and check:
         raise errors.OptionError(f"{source} and --check: give only one of them")
+    facts: dict[str, Any]
     if check:
         findings = []
         for state, what, says in run_checks(device):
             findings.append({"state": state, "what": what, "says": says})
             if not as_json:
-                print_stdout(f"{state:<8} {what}: {says}")
+                main.print_stdout(f"{state:<8} {what}: {says}")
         failed = sum(finding["state"] == FAILED for finding in findings)
-        said = (
-            f"{failed} of {len(findings)} checks failed" if failed else "What is installed works."
-        )
-        facts: dict[str, Any] = {"works": not failed, "findings": findings}
-    else:
-        if source is not None:
-            from ..files.grids import describe_grid_file
+        said = f"{failed} of {len(findings)} checks failed" * bool(failed)
+        said = said or "What is installed works."
+        facts = {"works": not failed, "findings": findings}
+    elif source is not None:
+        from ..files.grids import describe_grid_file
 
-        facts = gather_facts() if source is None else describe_grid_file(source)
-        cards = facts.get("models", {}).values()
-        failed = "fault" in facts or any("fault" in card for card in cards)
+        facts, failed = describe_grid_file(source), False
         said = "\n".join(in_words(facts))
-    print_stdout(json.dumps(facts, indent=2) if as_json else said)
+    else:
+        facts = gather_facts()
+        cards = facts["models"]
+        faults = {f"network {n}": cards[n]["fault"] for n in cards if "fault" in cards[n]}
+        failed = bool(faults) or "fault" in facts
+        said = "\n".join(in_words({**facts, "models": list(cards), **faults}))
+    main.print_stdout(facts if as_json else said)
     if failed:
         sys.exit(1)
 
 
 def in_words(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield lines of facts: one each, one for each of several, or a heading with lines below."""
+    """Yield facts as lines: a line each, and one for each note and each grid of an OpenVDB file."""
     for key, value in facts.items():
-        name = key.replace("_", " ")
-        if isinstance(value, dict):
-            for of, inner in value.items():
-                yield f"{name.removesuffix('s')} {of}"
-                yield from (f"  {line}" for line in in_words(inner))
-        elif isinstance(value, (list, tuple)) and value and isinstance(value[0], dict):
-            for inner in value:  # the grids of a file of OpenVDB
-                said = [x for x in inner.values() if x]
-                words = (f"{x:,} active voxels" if isinstance(x, int) else str(x) for x in said)
-                yield f"{name.removesuffix('s')}: {', '.join(words)}"
-        elif key == "notes":
-            yield from (f"note: {note}" for note in value)
-        elif isinstance(value, (list, tuple)) and value:
-            words = (f"{x:.10g}" if isinstance(x, (int, float)) else str(x) for x in value)
-            yield f"{name}: {', '.join(words)}"
-        elif value not in ([], ()):
-            text = f"{value:,}" if isinstance(value, int) else str(value)
-            yield f"{name}: {'not stated' if value is None else text}"
+        values = value if isinstance(value, (list, tuple)) else [value]
+        if key == "notes" or (values and isinstance(values[0], dict)):
+            for each in values:
+                said = each.values() if isinstance(each, dict) else [each]
+                yield f"{key.removesuffix('s')}: {', '.join(in_word(x) for x in said if x)}"
+        elif values:
+            yield f"{key.replace('_', ' ')}: {', '.join(map(in_word, values))}"
+
+
+def in_word(value: Any) -> str:
+    """Return a value of a fact as text."""
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    return "not stated" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def gather_facts() -> dict[str, Any]:
@@ -142,16 +134,14 @@ def run_checks(device: Device) -> Iterator[tuple[str, str, str]]:
         for each in devices[:1] if name.endswith("-int8") else devices:
             yield check_network(name, each)
     for name, modules in errors.EXTRAS.items():
-        lacking, says = errors.missing_modules(modules), ", ".join(modules)
-        if lacking:
-            says = f"no {', '.join(lacking)}: {errors.how_to_install(name)}"
-        yield (MISSING if lacking else OK, f"extra {name}", says)
+        lacking = ", ".join(errors.missing_modules(modules))
+        missing = f"no {lacking}: {errors.how_to_install(name)}"
+        state, says = (MISSING, missing) if lacking else (OK, ", ".join(modules))
+        yield (state, f"extra {name}", says)
 
 
 def check_network(name: str, device: Device) -> tuple[str, str, str]:
     """Refine a ball with a shipped network on a device."""
-    import numpy as np
-
     from ..grid.sdf_grid import make_grid
     from ..network.network import load_network
     from ..pipeline import reconstruct
@@ -159,10 +149,10 @@ def check_network(name: str, device: Device) -> tuple[str, str, str]:
     values: Any = np.linalg.norm(np.indices((SAMPLES,) * 3) - CENTRE, axis=0) - RADIUS
     is_mask, what = name.startswith(MASK), f"network {name} on {device}"
     values, most = (values < 0, MOST_OFF_OF_MASK) if is_mask else (values, MOST_OFF)
-    grid = make_grid(values, spacing=1.0, origin=0.0, field=MASK if is_mask else EXACT)
+    grid = make_grid(values, spacing=1.0, origin=0.0, field=MASK if is_mask else "exact")
     try:
         network = load_network(name, device=device, precision=FLOAT32)  # its own file
-        found = reconstruct(grid, network, mesher=MARCHING).vertices
+        found = reconstruct(grid, network, mesher="marching").vertices
     except errors.SuperSdfError as error:
         return (FAILED, what, str(error))
     off = float(np.abs(np.linalg.norm(found - CENTRE, axis=1) - RADIUS).max())

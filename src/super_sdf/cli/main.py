@@ -1,4 +1,7 @@
-"""The group of commands, and how a command ends: exit code, one line on stderr, signals."""
+"""The group of commands, what commands share, and how a command ends.
+
+Options come from the table in ``options``; an error is one line on stderr and an exit code.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,28 @@ import json
 import os
 import signal
 import sys
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from importlib import import_module
+from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import click
 
 from .. import __version__
-from .common import CONTEXT, print_stderr, print_stdout
+from ..errors import OptionError, SuperSdfError, check_modules
+from ..options import EXCLUSIVE, GRID, MESH, OPTIONS, VALUES, WORK, Options, check_one
 
 COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
+CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+PIPE_CLOSED = 141  # exit code of programs whose reader has ended: 128 and SIGPIPE
+OUTPUT = "Output"
+FILE = click.Path(path_type=Path)
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+"""Adds options to a command."""
 
 
 class Commands(click.Group):
@@ -45,6 +59,162 @@ def cli(context: click.Context) -> None:
     """Turn coarse signed distance grids into fine meshes."""
     if context.invoked_subcommand is None:
         print_stdout(context.get_help())
+
+
+class Command(click.Command):
+    """A command whose help lists options under headings."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options, each under its heading."""
+        rows: dict[str, list[Any]] = {name: [] for name in (GRID, VALUES, MESH, WORK, OUTPUT)}
+        for param in self.get_params(ctx):
+            if isinstance(param, click.Option) and (record := param.get_help_record(ctx)):
+                rows[getattr(param, "group", OUTPUT)].append(record)
+        headings = [heading for heading, some in rows.items() if some]
+        for heading in headings:
+            with formatter.section(heading if len(headings) > 1 else "Options"):
+                formatter.write_dl(rows[heading])
+
+
+class GroupedOption(click.Option):
+    """An option with the heading under which help lists it."""
+
+    def __init__(self, *names: Any, group: str = OUTPUT, **more: Any) -> None:
+        super().__init__(*names, **more)
+        self.group = group
+
+
+def make_command(short: str, text: str, *takes: Decorator) -> Decorator:
+    """Return what makes a command of a function; examples in its text go below the options."""
+    text, _, examples = text.partition("\b")
+
+    def make(function: Callable[..., Any]) -> Command:
+        for take in reversed(takes):
+            function = take(function)
+        told = {"help": text, "epilog": f"\b{examples}", "short_help": short}
+        return click.command(None, Command, context_settings=CONTEXT, **told)(function)
+
+    return make
+
+
+def option(*names: str, **more: Any) -> Decorator:
+    """Return what adds an option that is not in the table to a command."""
+    return click.option(*names, cls=GroupedOption, **more)
+
+
+def table_option(name: str, text: str = "") -> Decorator:
+    """Return what adds an option of the table to a command, maybe with another help text."""
+    row, word = OPTIONS[name], f"--{name.replace('_', '-')}"
+
+    def parse(context: click.Context, param: click.Parameter, value: Any) -> Any:
+        try:
+            parsed = row.kind.parse(value) if isinstance(value, str) else value
+        except ValueError as error:
+            raise OptionError(f"{word} is {value!r}: {error}") from error
+        return row.check(parsed, word)
+
+    more: dict[str, Any] = {"is_flag": True}
+    if row.kind.choices:
+        more = {"type": click.Choice(row.kind.choices)}
+    elif not isinstance(row.default, bool):
+        more = {"type": click.UNPROCESSED, "callback": parse, "metavar": row.metavar}
+    shown = row.default is not None and not isinstance(row.default, bool)
+    more |= {"default": row.default, "show_default": shown, "group": row.group}
+    return option(f"{word}/--{row.off}" if row.off else word, help=text or row.help, **more)
+
+
+# fmt: off
+SHARED = {
+    "names": option("--names", type=FILE, metavar="TABLE", group=VALUES,
+        help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP "
+        "or FreeSurfer, CSV, or JSON such as nnU-Net's. --labels takes names then."),
+    "cluster": option("--cluster", metavar="ADDRESS", group=WORK,
+        help="Convert on the workers of the Dask scheduler at ADDRESS, each within --max-memory, "
+        "or with 'local' on Dask workers of this machine. Needs the extra cluster."),
+    "jobs": option("--jobs", type=click.IntRange(0), default=0, metavar="N", group=WORK,
+        help="Worker processes of a batch, or of --cluster local; 0 means one per core, or a "
+        "single one on CUDA."),
+    "check": option("--check", is_flag=True,
+        help="Check each mesh against its samples, as check does. Needs the extra report."),
+    "report": option("--report", type=FILE, metavar="PAGE.html",
+        help="Also write a page for the browser, with figures, warnings, a check and a 3-D view of "
+        "each mesh. The check needs the extra report."),
+    "force": option("--force", is_flag=True, help="Replace output files that exist."),
+    "json": option("--json", "as_json", is_flag=True, help="Print results as JSON."),
+    "quiet": option("-q", "--quiet", is_flag=True, help="Print errors only."),
+}
+# fmt: on
+"""Options of several commands that are not about a conversion."""
+
+
+def chosen_options(given: dict[str, Any]) -> Options:
+    """Return the options of a conversion, from all options of a command that may go with them."""
+    for names in EXCLUSIVE:
+        check_one({f"--{name}": given.get(name) for name in names})
+    chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
+    for name in chosen.goals():
+        check_modules(f"--{name}", "simplify")
+    if given.get("check"):
+        check_modules("--check", "report", ("igl",))
+    if (address := given.get("cluster")) is not None:
+        if not address.strip():
+            raise OptionError("--cluster is empty: give local or the address of a Dask scheduler")
+        if given["jobs"] and address != "local":
+            raise OptionError(f"--jobs {given['jobs']} and --cluster {address}: leave --jobs out")
+        if given.get("save_field"):
+            raise OptionError("--save-field needs the field in one place: leave out --cluster")
+        check_modules("--cluster", "cluster")
+    return chosen
+
+
+def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
+    """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
+    from ..files.output import check_apart, check_free
+
+    if page.suffix.lower() not in (".html", ".htm"):
+        raise OptionError(f"{page} is not a page: give {word} a file .html or .htm")
+    check_free(page, force=force)
+    check_apart(page, others)
+
+
+@contextmanager
+def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Draw a progress bar with the remaining time on stderr; None if stderr is no terminal."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
+        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
+
+
+def print_stderr(*lines: str) -> None:
+    """Print lines to stderr, if that can be written; line breaks of file names become spaces."""
+    try:
+        for line in lines:
+            click.echo(line.replace("\n", " "), err=True)
+    except OSError:
+        _discard(2)
+
+
+def print_stdout(text: str | dict[str, Any], kept: str = "") -> None:
+    """Print a result, a dictionary as JSON; ``kept`` says which output exists if that fails.
+
+    A reader that has seen enough, such as ``head``, is no error.
+    """
+    try:
+        click.echo(text if isinstance(text, str) else json.dumps(text, indent=2))
+    except OSError as error:
+        _discard(1)
+        if isinstance(error, BrokenPipeError):
+            raise click.exceptions.Exit(PIPE_CLOSED) from None
+        said = f"stdout cannot be written: {error.strerror or error}"
+        raise click.ClickException(f"{said}; {kept}" if kept else said) from error
+
+
+def _discard(number: int) -> None:
+    """Let what a stream still holds go nowhere: Python would complain about it at its end."""
+    with suppress(OSError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), number)
 
 
 def main() -> None:
@@ -78,17 +248,22 @@ def run() -> int:
     try:
         code = cli.main(standalone_mode=False)  # a number if a command ended early
         return code if isinstance(code, int) else 0
-    except OSError as error:  # while help is printed
-        return end(f"stdout cannot be written: {error.strerror or error}", 1)
     except (Exception, KeyboardInterrupt) as error:
         if heard:  # also what a library has made of the interrupt
             name = signal.Signals(heard[0]).name
             said = "interrupted" if name == "SIGINT" else f"ended by {name}"
-            cause = error.__cause__  # a command may say what it has kept
+            cause = error.__cause__ or error  # a command may say what it has kept
             kept = cause.args if isinstance(cause, KeyboardInterrupt) else ()
             return end(f"{said}: {kept[0]}" if kept else said, 128 + heard[0])
         if isinstance(error, click.ClickException):
             return end(error.format_message(), error.exit_code)
+        if isinstance(error, SuperSdfError):
+            return end(" ".join(str(error).splitlines()), 1 + isinstance(error, OptionError))
+        if isinstance(error, MemoryError):
+            return end("out of memory: use a smaller --factor or grid", 1)
+        if isinstance(error, OSError):  # the system refused something, such as a file handle
+            named = f"{error.filename}: " if error.filename else ""
+            return end(f"{named}{error.strerror or error}", 1)
         raise
     finally:
         for number in SIGNALS:
@@ -99,6 +274,6 @@ def end(line: str, code: int) -> int:
     """Print an error, with ``--json`` also as JSON to stdout; return the exit code."""
     if "--json" in sys.argv[1:]:
         with suppress(click.ClickException, click.exceptions.Exit):
-            print_stdout(json.dumps({"error": line}, indent=2))
+            print_stdout({"error": line})
     print_stderr(f"Error: {line}")
     return code

@@ -7,13 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import click
-from click.core import ParameterSource
 
 from ..errors import OptionError, check_modules
-from . import common
-from .common import option, print_stderr
+from . import main
+from .main import SHARED, option
 
-EXAMPLES = """\b
+HELP = """Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
+
+MESH is any mesh file that trimesh reads. OUT is a .npz file (keys values, spacing, origin); its
+values are in the units of the mesh and negative inside.
+
+\b
 Examples:
   super-sdf sample part.stl part.npz -n 64
   super-sdf sample part.stl part.npz --spacing 0.5 --padding 4
@@ -21,13 +25,13 @@ Examples:
 
 # fmt: off
 TAKES = (
-    click.argument("source", metavar="MESH", type=common.FILE),
-    click.argument("target", metavar="OUT", type=common.FILE),
+    click.argument("source", metavar="MESH", type=main.FILE),
+    click.argument("target", metavar="OUT", type=main.FILE),
     option("-n", "samples", type=int, help="Samples along the longest axis."),
     option("--spacing", type=float, metavar="H",
         help="World distance between samples, instead of -n."),
-    option("--padding", type=float, default=2.0, show_default=True,
-        help="Voxels between the bounding box of the mesh and the outermost samples."),
+    option("--padding", type=float, metavar="VOXELS",
+        help="Voxels between the bounding box of the mesh and the outermost samples. Default: 2."),
     option("--frame", type=click.Choice(["world", "unit"]), default="world", show_default=True,
         help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and "
         "centres it in a unit cube, sampled at n^3 voxel centres."),
@@ -35,18 +39,15 @@ TAKES = (
         help="Exact distances up to this many voxels from the surface, clamped beyond. Default: "
         "exact everywhere up to 256^3 samples, within 4 voxels in larger grids."),
     option("--allow-open", is_flag=True, help="Accept a mesh with holes; its inside is a guess."),
-    common.shared("force", "quiet"),
+    SHARED["force"],
+    SHARED["quiet"],
 )
 # fmt: on
 
 
-@common.make_command("Sample a closed mesh as a signed distance grid.", EXAMPLES, *TAKES)
+@main.make_command("Sample a closed mesh as a signed distance grid.", HELP, *TAKES)
 def command(source: Path, target: Path, **given: Any) -> None:
-    """Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
-
-    MESH is any mesh file that trimesh reads. OUT is a .npz file (keys values, spacing, origin);
-    its values are in the units of the mesh and negative inside.
-    """
+    """Check the numbers, load the mesh, sample it and write the grid."""
     check_modules("sample", "eval")
     from ..files.grids import check_grid_target, write_grid
     from ..files.output import check_apart
@@ -54,28 +55,24 @@ def command(source: Path, target: Path, **given: Any) -> None:
     from ..truth.solid import Solid, load_solid, normalise
 
     start, in_unit = time.perf_counter(), given["frame"] == "unit"
+    count, spacing = given["samples"], given["spacing"]
     check_grid_target(target, force=given["force"])
     check_apart(target, [source])
-    size = {"n": given["samples"], "spacing": given["spacing"]}
-    if (size["n"] is None) == (size["spacing"] is None):
+    if in_unit and (count is None or spacing is not None or given["padding"] is not None):
+        raise OptionError("--frame unit has a side of 1: give -n, no --spacing and no --padding")
+    if (count is None) == (spacing is None):
         raise OptionError("give either -n (samples along the longest axis) or --spacing")
-    if in_unit and size["n"] is None:
-        raise OptionError("--frame unit has a side of 1: give -n, not --spacing")
-    padded = click.get_current_context().get_parameter_source("padding")
-    if in_unit and padded is not ParameterSource.DEFAULT:
-        raise OptionError("--frame unit has a side of 1: it takes no --padding")
-    padding = 0 if in_unit else given["padding"]
-    check_numbers(**size, padding=padding, band=given["band"])
+    padding = 0.0 if in_unit else 2.0 if given["padding"] is None else given["padding"]
+    check_numbers(count, spacing, padding, given["band"])
     solid, notes = load_solid(source, allow_open=given["allow_open"])
     if in_unit:
-        solid, layout = Solid(normalise(solid.mesh)), unit_layout(size["n"])
+        solid, layout = Solid(normalise(solid.mesh)), unit_layout(count)
     else:
-        layout = fitted_layout(solid.mesh, **size, padding=padding)
-    with common.progress_bar("sampling", given["quiet"]) as progress:
+        layout = fitted_layout(solid.mesh, n=count, spacing=spacing, padding=padding)
+    with main.progress_bar("sampling", given["quiet"]) as progress:
         grid = sample_solid(solid, layout, band=given["band"], progress=progress)
     write_grid(grid, target, force=given["force"])
     if not given["quiet"]:
-        for note in (*notes, *grid.notes):
-            print_stderr(f"Note: {note}")
         shape, seconds = " x ".join(map(str, grid.shape)), time.perf_counter() - start
-        print_stderr(f"{target}: {shape} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s")
+        said = f"{target}: {shape} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s"
+        main.print_stderr(*(f"Note: {note}" for note in (*notes, *grid.notes)), said)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import ExitStack
 from typing import Any
 
@@ -11,10 +10,10 @@ import click
 from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
-from ..options import MESH_FORMATS, OPTIONS, Options
+from ..options import MESH_FORMATS, OPTIONS
 from ..progress import Stopwatch
-from . import common
-from .common import option, print_stderr, print_stdout
+from . import main
+from .main import SHARED, option, table_option
 
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
 
@@ -22,8 +21,8 @@ IN is a grid file: {list_formats()}. FILE:NAME names one of several arrays in a 
 file. An .npz file has the keys values, spacing, origin and direction.
 
 OUT is a mesh file: {", ".join(f".{name}" for name in MESH_FORMATS[:-1])} or .{MESH_FORMATS[-1]}.
-"""
-EXAMPLES = """\b
+
+\b
 Examples:
   super-sdf upsample part.npz part.ply
   super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
@@ -38,35 +37,39 @@ NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 TAKES = (
     click.argument("source", metavar="IN"),
     click.argument("target", metavar="OUT"),
-    common.table_options(*OPTIONS),
-    common.shared("names", "cluster", "jobs", "check"),
+    *map(table_option, OPTIONS),
+    *(SHARED[name] for name in ("names", "cluster", "jobs", "check")),
     option("--save-field", metavar="FIELD",
         help="Also write the refined field: .npz for the values near the surface, .vdb for a level "
-        "set of OpenVDB, .npy or .vti for the whole fine lattice. A .vti needs the extra vti."),
-    common.shared("report", "force", "json", "quiet"),
+        "set of OpenVDB, .npy or .vti (extra vti) for the whole fine lattice."),
+    *(SHARED[name] for name in ("report", "force", "json", "quiet")),
     option("-v", "--verbose", is_flag=True, help="Also print counts and the time per stage."),
 )
 # fmt: on
 
 
-@common.make_command("Refine a grid and write its surface as a mesh.", EXAMPLES, *TAKES, text=HELP)
+@main.make_command("Refine a grid and write its surface as a mesh.", HELP, *TAKES)
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
-    options, watch = common.chosen_options(given), Stopwatch()
-    check_outputs(source, target, options, given)
+    options, watch = main.chosen_options(given), Stopwatch()
+    if given["names"] and options.labels is None:
+        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
+    if given["report"]:
+        from ..files.regular import files_of
+
+        others = [*files_of(source), target, *[given["save_field"]] * bool(given["save_field"])]
+        main.check_page("--report", given["report"], others, force=given["force"])
     from ..network.network import digest_of_model, load_network
 
     network = load_network(**options.network())
     watch.lap("load network")
     done: Any
-    force = given["force"]
+    force, how = given["force"], dict[str, Any]()
     with ExitStack() as stack:
-        progress = stack.enter_context(common.progress_bar("upsampling", given["quiet"]))
-        where = source, target, network, options
+        how["progress"] = stack.enter_context(main.progress_bar("upsampling", given["quiet"]))
         if options.labels is None:
             from ..convert import convert
 
-            how: dict[str, Any] = {"save_field": given["save_field"]}
             if given["cluster"] is not None:
                 from ..batch.cluster import connect, tiles_on
 
@@ -74,13 +77,15 @@ def command(source: str, target: str, **given: Any) -> None:
                 client: Any = stack.enter_context(to)
                 least = TILES_PER_THREAD * sum(client.nthreads().values())
                 how |= {"map_tiles": tiles_on(client), "least_tiles": least}
-            done = convert(*where, progress=progress, force=force, **how)
+            how["save_field"] = given["save_field"]
+            done = convert(source, target, network, options, force=force, **how)
         else:
-            from ..labels.files import convert_labels
+            from ..labels.files import check_options, convert_labels
             from ..labels.names import read_names
 
-            names = read_names(given["names"]) if given["names"] else None
-            done = convert_labels(*where, progress=progress, names=names, force=force)
+            check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
+            how["names"] = read_names(given["names"]) if given["names"] else None
+            done = convert_labels(source, target, network, options, force=force, **how)
     watch.take(done.seconds)
     model, notes = options.network()["model"], [*done.remarks(), *network.notes]
     report = {
@@ -114,7 +119,7 @@ def command(source: str, target: str, **given: Any) -> None:
         watch.lap("page")
     report["seconds"] = watch.rounded()
     if given["as_json"]:
-        print_stdout(json.dumps(report, indent=2), f"{target} is written")
+        main.print_stdout(report, f"{target} is written")
     if given["quiet"]:
         return
     lines = [f"Note: {note}" for note in (*done.notes, *notes)]
@@ -126,55 +131,24 @@ def command(source: str, target: str, **given: Any) -> None:
     describe = describe_mesh if options.labels is None else describe_labels
     lines += describe(report, f"{sum(watch.seconds.values()):.1f} s")
     lines += [f"Check: {certificate.summary()}"] if certificate else []
-    lines += [f"Report: {given['report']}"] * bool(given["report"])
-    for line in lines:
-        print_stderr(line)
-
-
-def check_outputs(source: str, target: str, options: Options, given: dict[str, Any]) -> None:
-    """Raise an error for what can be seen to fail before the work."""
-    from ..files.regular import files_of
-
-    force, field = given["force"], given["save_field"]
-    if given["names"] and options.labels is None:
-        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
-    if options.labels is not None:
-        from ..labels.files import check_options
-
-        check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
-    else:
-        from ..files.meshes import check_target
-
-        check_target(target, force=force, unit=options.unit)
-    if field is not None:
-        from ..files.fields import check_field_target
-
-        check_field_target(field, force=force)
-    if given["report"]:
-        outputs = (target, field) if field else (target,)
-        common.check_page("--report", given["report"], [*files_of(source), *outputs], force=force)
-    if given["cluster"] is not None and field is not None:
-        raise OptionError("--save-field needs the whole field in one place: leave out --cluster")
-    if given["jobs"] and given["cluster"] is None:
-        raise OptionError(f"--jobs {given['jobs']} is for --cluster local: give that, or no --jobs")
+    main.print_stderr(*lines, *[f"Report: {given['report']}"] * bool(given["report"]))
 
 
 def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:
     """Return lines on a mesh, its field and how it was simplified."""
     few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
     low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in report["bounds"])
-    hint = "; far fewer triangles within 0.02 voxels of these: --simplify 0.02"
-    lines = [
-        f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "
-        f"{'closed' if report['closed'] else 'open'}, from {low} to {high}, {seconds}"
-        + hint
-        * (not few and triangles > MANY)
-    ]
+    closed = "closed" if report["closed"] else "open"
+    line = f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, {closed}"
+    line += f", from {low} to {high}, {seconds}"
+    if not few and triangles > MANY:
+        line += "; far fewer triangles within 0.02 voxels of these: --simplify 0.02"
+    lines = [line]
     if field:
         shape = " x ".join(map(str, field["shape"]))
-        place = [", ".join(f"{x:.12g}" for x in field[key]) for key in ("spacing", "origin")]
-        said = f"lattice {shape}, spacing {place[0]}, origin {place[1]}"
-        lines.append(f"{field['path']}: the refined field, {said}")
+        spacing, origin = (", ".join(f"{x:.12g}" for x in field[k]) for k in ("spacing", "origin"))
+        place = f"lattice {shape}, spacing {spacing}, origin {origin}"
+        lines.append(f"{field['path']}: the refined field, {place}")
     if few:
         off, unit = few["deviation"], report["asked"]["unit"] or "in world units"
         largest = max(off["largest"], off["largest_back"]) * few["voxel_size"]
@@ -190,10 +164,9 @@ def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:
 def describe_labels(report: dict[str, Any], seconds: str) -> list[str]:
     """Return a line on the mesh of each label."""
     lines = [
-        f"{row['output']}: {row['name']}, {row['vertices']:,} vertices, "
-        f"{row['triangles']:,} triangles, "
-        f"{row['components']:,} closed component{'s' * (row['components'] != 1)}, "
-        f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
+        f"{row['output']}: {row['name']}, {row['triangles']:,} triangles, {row['components']:,} "
+        f"closed component{'s' * (row['components'] != 1)}, volume {row['volume']:.6g}, of its "
+        f"samples {row['sample_volume']:.6g}"
         for row in report["labels"]
     ]
     return [*lines, f"{len(lines)} labels, {seconds}"]

@@ -9,10 +9,16 @@ from typing import Any
 import click
 
 from ..options import OPTIONS
-from . import common
-from .common import option, print_stderr
+from . import main
+from .main import SHARED, option, table_option
 
-EXAMPLES = """\b
+HELP = """Look at meshes, and at grids refined as by upsample, in the browser.
+
+MESH is any mesh file that trimesh reads. GRID is what upsample takes; its refined mesh is shown
+beside coarse marching cubes of the samples, with the residuals of its samples as colours (extra
+report). The page is one file, which needs no server; its address is printed.
+
+\b
 Examples:
   super-sdf view part.npz
   super-sdf view part.ply other.stl --out page.html --no-browser
@@ -21,44 +27,32 @@ Examples:
 # fmt: off
 TAKES = (
     click.argument("sources", metavar="MESH|GRID...", nargs=-1, required=True),
-    option(
-        "--out",
-        type=common.FILE,
-        metavar="PAGE.html",
-        help="File for the page. Default: one in the temporary folder that only you can read.",
-    ),
-    common.shared("force"),
+    option("--out", type=main.FILE, metavar="PAGE.html",
+        help="File for the page. Default: one in the temporary folder that only you can read."),
+    SHARED["force"],
     option("--no-browser", is_flag=True, help="Print the address and open no browser."),
-    common.table_options(*(name for name in OPTIONS if name != "labels")),
+    *(table_option(name) for name in OPTIONS if name != "labels"),
 )
 # fmt: on
 
 
-@common.make_command("Look at meshes and grids in the browser.", EXAMPLES, *TAKES)
+@main.make_command("Look at meshes and grids in the browser.", HELP, *TAKES)
 def command(
     sources: tuple[str, ...], out: Path | None, force: bool, no_browser: bool, **given: Any
 ) -> None:
-    """Look at meshes, and at grids refined as by upsample, in the browser.
-
-    MESH is any mesh file that trimesh reads. GRID is what upsample takes; its refined mesh is shown
-    beside coarse marching cubes of the samples, from one camera, with the residuals of its samples
-    as colours. The options below apply to grids.
-
-    The page is one file, which shows all of it without a server; its address is printed. Residuals
-    need the extra report.
-    """
+    """Write the page, print its address and open it."""
     from ..network.network import load_network
     from ..pages.html import viewed_page, write_page
 
     if out:
-        common.check_page("--out", out, sources, force=force)
-    options = common.chosen_options(given)
+        main.check_page("--out", out, sources, force=force)
+    options = main.chosen_options(given)
     text = viewed_page(sources, lambda: load_network(**options.network()), options)
     page = out or Path(mkdtemp(prefix="super-sdf-"), "view.html")  # only this user can read it
     write_page(text, page, force=force)
-    print_stderr(page.absolute().as_uri())
+    main.print_stderr(page.absolute().as_uri())
     if not no_browser:
         import webbrowser
 
         if not webbrowser.open(page.absolute().as_uri()):
-            print_stderr("Note: no browser can be started here: open that address in yours")
+            main.print_stderr("Note: no browser can be started here: open that address in yours")
