@@ -47,8 +47,9 @@ def balls(shape=(110, 20, 30), count=40, seed=0, h=1.0):
     """Return a union of balls, some of which run out of a long grid."""
     rng, ijk = np.random.default_rng(seed), np.indices(shape).astype(np.float64)
     centres, radii = rng.uniform(3, np.array(shape) - 4, (count, 3)), rng.uniform(1.5, 5, count)
-    away = [np.linalg.norm(ijk - c[:, None, None, None], axis=0) - r for c, r in zip(centres, radii)]
-    return SdfGrid.trusted((np.min(away, 0) * h).astype(np.float32), h, (1.0, 2.0, 3.0))
+    places = zip(centres[..., None, None, None], radii)
+    away = np.min([np.linalg.norm(ijk - c, axis=0) - r for c, r in places], axis=0)
+    return SdfGrid.trusted((away * h).astype(np.float32), h, (1.0, 2.0, 3.0))
 
 
 @pytest.mark.parametrize("count", [2, 3, 8])
@@ -207,9 +208,7 @@ def with_another_key(part):
 @pytest.mark.parametrize("cap", [True, False])
 def test_a_tampered_tile_is_an_error_that_names_it(monkeypatch, spoil, cap):
     monkeypatch.setattr(pipeline, "make_tile", partial(spoilt, spoil=spoil))
-    said = refusal(
-        MeshError, mesh_grid, balls(), CLOSE, Options(2, cap=cap), least_tiles=3
-    )
+    said = refusal(MeshError, mesh_grid, balls(), CLOSE, Options(2, cap=cap), least_tiles=3)
     assert said.startswith("the mesh is torn, ") and "in samples 0 to " in said
 
 

@@ -32,7 +32,7 @@ from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
-from .refine.survey import Band, BandSummary, BandTooLarge, no_surface, summarise, survey
+from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import choose_mesher, extract
 from .surface.mesh import Mesh, vertex_type
@@ -42,7 +42,7 @@ from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, pl
 
 def refine(
     grid: SdfGrid,
-    network: Decoder,
+    network: Decoder | Adapter,
     factor: int = 4,
     offset: float = 0.0,
     *,
@@ -276,9 +276,7 @@ def reconstruct(
     exact = None if function is None else as_function(function)
     grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
     network = given_or_loaded(network, quality, device=device, precision=precision, threads=threads)
-    chosen = Options(
-        factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory
-    )
+    chosen = Options(factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh
@@ -346,7 +344,7 @@ def mesh_grid(
     try:
         is_one = map_tiles is None and least_tiles == 1
         band = survey(lattice, offset, threads=threads, most=room.voxels() if is_one else -1)
-    except BandTooLarge:
+    except BandTooLargeError:
         band, whole = None, summarise(lattice, offset, threads)
         margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
         tiles = plan(shape, whole, margin, room, least_tiles)

@@ -1,9 +1,9 @@
 """A grid that is too large for the memory, or for one machine, as tiles: cut, and joined again.
 
-A tile is a box of samples with a margin as wide as all that a vertex depends on; it is refined as a
-grid of its own. The lattice of samples is parted by the tiles without their margins. A vertex
-belongs to the tile that has the node of its key (see ``surface.extract``), a triangle to that of its
-smallest key; the position of a vertex is that of its owner.
+A tile is a box of samples with a margin as wide as all that a vertex depends on, refined as a grid
+of its own. Without their margins the tiles part the grid. A vertex belongs to the tile that has the
+node of its key (see ``surface.extract``), a triangle to that of its smallest key; the position of a
+vertex is that of its owner.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Tile:
 
     def owns(self, voxel_ijk: NDArray[np.integer]) -> BoolArray:
         """Return which voxels (n, 3) belong to the tile, (n,)."""
-        inside: BoolArray = ((voxel_ijk >= self.inner_low) & (voxel_ijk < self.inner_high)).all(1)
-        return inside
+        inside = (voxel_ijk >= self.inner_low) & (voxel_ijk < self.inner_high)
+        return np.asarray(inside.all(1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,9 +119,7 @@ class Room:
         )
 
 
-def margin_of(
-    grid: SdfGrid, receptive_field: int | None, mesher: MesherName, factor: int
-) -> int:
+def margin_of(grid: SdfGrid, receptive_field: int | None, mesher: MesherName, factor: int) -> int:
     """Return how many samples to every side a tile's vertices and triangles depend on."""
     if receptive_field is None:
         raise OptionError(
@@ -277,7 +275,7 @@ def check_closed(
     if not cap:
         place = lattice.to_index(mesh.vertices[edges].reshape(-1, 3)).reshape(-1, 2, 3)
         border = (place < ON_BORDER - 0.5) | (place > np.array(lattice.shape) - 0.5 - ON_BORDER)
-        bad = edges[~border.all(1).any(1)]
+        bad = edges[~np.any(border.all(1), axis=1)]
     if len(bad):
         last = np.cumsum([count for _, count in names])
         some = np.unique(np.searchsorted(last, bad.ravel(), "right"))

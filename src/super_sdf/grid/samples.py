@@ -207,7 +207,7 @@ def let_go(samples: SampleArray) -> None:
     """Let the system take back the pages of a large mapped file: they count as held memory."""
     while hasattr(samples, "source"):
         samples = samples.source
-    mapped = getattr(samples, "_mmap", None)
+    mapped: Any = getattr(samples, "_mmap", None)
     if hasattr(mapped, "madvise") and len(mapped) > LARGE_FILE:
         mapped.madvise(mmap.MADV_DONTNEED)
 

@@ -9,10 +9,11 @@ surface, and was not cut off. If too many contradict others, the field is noisy,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError
@@ -147,10 +148,8 @@ def plane_blocks(
         yield start, min(start + step, end)
 
 
-def _flat_steps(
-    voxel_ijk: IntArray, shape: tuple[int, ...]
-) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], list[int]]:
-    """Return flat indices (V,) into the grid padded by one, and the 27 steps to the neighbours."""
+def _flat_steps(voxel_ijk: IntArray, shape: tuple[int, ...]) -> tuple[NDArray[np.int64], list[int]]:
+    """Return flat indices (V,) into the grid padded by one, and the 27 steps to neighbours."""
     strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1], np.int64)
     return (voxel_ijk + 1) @ strides, [int(step) for step in NEIGHBOURHOOD @ strides]
 
@@ -199,9 +198,8 @@ def is_filled_in(patches: FloatArray) -> BoolArray:
 def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
     """Return which voxels may contain a piece of the surface, (V,) bool.
 
-    If a voxel's patch can be distances (``lipschitz``, from ``is_lipschitz``), a sample farther
-    from the surface than the voxel's corners proves that the voxel holds none. Otherwise the sample
-    proves nothing, and the voxel is kept.
+    If a patch can be distances (``lipschitz``), a sample farther from the surface than the voxel's
+    corners proves that the voxel holds none. Otherwise it proves nothing.
     """
     near: BoolArray = np.abs(patches[:, CENTRE]) <= DECODE_LIMIT
     return near | ~lipschitz
@@ -217,7 +215,7 @@ def exact_samples(
     """
     sample = patches[:, CENTRE]
     exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE)
-    low, high = np.float32(limits)
+    low, high = map(np.float32, limits)
     at_limit = np.flatnonzero(exact & (sample == np.where(sample > 0, high, low)))
     for rows in chunks_of(len(at_limit), 27):
         some = at_limit[rows]
@@ -226,32 +224,41 @@ def exact_samples(
     return exact
 
 
-# Distances must reach far enough to both sides of an offset: a surface too near where they are
-# truncated, or where fill values begin, would come out in loose pieces.
-# Neighbouring samples of noisy distances differ by up to twice the spacing (4 half voxels); a
-# distance and a fill value differ by more, a jump. A small share of jumps is tolerated as outliers.
-MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
-# How far distances must reach beyond the offset, in half voxels, where they are truncated; and
-# where fill values begin, which would be taken for noise.
+# Distances must reach far enough beyond an offset, in half voxels, where they are truncated, and
+# where fill values begin: a surface too near these would come out in loose pieces. Neighbouring
+# samples of noisy distances differ by up to twice the spacing (4 half voxels); a distance and a
+# fill value differ by more, a jump. A small share of jumps is tolerated as outliers.
 CUT_OFF_MARGIN, FILL_MARGIN = HALF_BAND, 5.0
+MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
 # Tolerances in half voxels, so that the offset that the message suggests works: for rounding, and
 # because no sample lies exactly where fill values begin.
 ROUNDING, UNSAMPLED = 1e-3, 0.1
 
+Jumps: TypeAlias = tuple[int, int, float]
+"""Of the samples near an offset: how many jump to a neighbour, how many there are, and the farthest
+with a jump, in half voxels from the offset."""
 
-class Jumps(NamedTuple):
-    """Counts of the samples near an offset, and of those with a jump to a neighbour."""
 
-    edges: int
-    near: int
-    end: float  # the farthest with a jump, in half voxels from the offset; -inf if there is none
+def find_jumps(rescaled: FloatArray, own: slice) -> Jumps:
+    """Return the jumps upwards in planes (n, ny, nz), in half voxels.
+
+    Samples are counted in planes ``own``; those beside them only show whether there is a jump.
+    """
+    jumps = np.zeros(rescaled.shape, bool)
+    for axis in range(3):
+        values, found = np.moveaxis(rescaled, axis, 0), np.moveaxis(jumps, axis, 0)
+        step = values[1:] - values[:-1]
+        found[:-1] |= step > MIN_JUMP
+        found[1:] |= step < -MIN_JUMP
+    near = np.abs(rescaled[own]) < PATCH_LIMIT
+    found = jumps[own] & near
+    return int(found.sum()), int(near.sum()), float(rescaled[own][found].max(initial=-np.inf))
 
 
 def check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> None:
     """Raise GridError if the distances are truncated within 1.5 voxels of an offset.
 
-    ``patches`` (V, 27) are the samples round voxels of the band there. A distance never equals all
-    its neighbours.
+    ``patches`` (V, 27) are of the band there. A distance never equals all its neighbours.
     """
     centre = patches[:, CENTRE]
     cut_off = (patches == centre[:, None]).all(1) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
@@ -260,34 +267,15 @@ def check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> 
         raise _too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
 
 
-def find_jumps(rescaled: FloatArray, own: slice) -> tuple[Jumps, Jumps]:
-    """Return the jumps upwards and downwards in planes (n, ny, nz), in half voxels.
-
-    Samples are counted in planes ``own``; those beside them only show whether there is a jump.
-    """
-
-    def jumps_up(rescaled: FloatArray) -> Jumps:
-        jumps = np.zeros(rescaled.shape, bool)
-        for axis in range(3):
-            values, found = np.moveaxis(rescaled, axis, 0), np.moveaxis(jumps, axis, 0)
-            step = values[1:] - values[:-1]
-            found[:-1] |= step > MIN_JUMP
-            found[1:] |= step < -MIN_JUMP
-        near = np.abs(rescaled[own]) < PATCH_LIMIT
-        found = jumps[own] & near
-        end = float(rescaled[own][found].max(initial=-np.inf))
-        return Jumps(int(found.sum()), int(near.sum()), end)
-
-    return jumps_up(rescaled), jumps_up(-rescaled)
-
-
-def check_not_filled(found: list[tuple[Jumps, Jumps]], offset: float, voxel_size: float) -> None:
-    """Raise GridError if fill values begin within 2.5 voxels of an offset, by all planes' jumps."""
-    for side, parts in zip((1, -1), zip(*found)):
-        count, near = sum(part.edges for part in parts), sum(part.near for part in parts)
-        reach = max(part.end for part in parts)
-        if count > MAX_JUMP_SHARE * near and reach < FILL_MARGIN - UNSAMPLED:
-            end = offset + side * reach * voxel_size / 2
+def check_not_filled(
+    up: Sequence[Jumps], down: Sequence[Jumps], offset: float, voxel_size: float
+) -> None:
+    """Raise GridError if fill values begin within 2.5 voxels of an offset, by all jumps."""
+    for side, parts in ((1, up), (-1, down)):
+        counts, near, ends = zip(*parts)
+        jumps_enough = sum(counts) > MAX_JUMP_SHARE * sum(near)
+        if jumps_enough and max(ends) < FILL_MARGIN - UNSAMPLED:
+            end = offset + side * max(ends) * voxel_size / 2
             raise _too_near(offset, voxel_size, end, FILL_MARGIN, outwards=side > 0)
 
 

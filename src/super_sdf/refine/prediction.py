@@ -54,7 +54,7 @@ def predict(
     count = len(plane)
     parts = -(-count // AT_ONCE)
     if parts == 1 or network.receptive_field is None:
-        return decode(network, (band.patches, table, voxels), offsets, progress, threads)  # Eqs. 3 and 5
+        return decode(network, (band.patches, table, voxels), offsets, progress, threads)
     blocks = np.zeros((len(offsets), len(voxels) + 1), np.float32)
     ends = [-1, *plane[np.arange(1, parts) * count // parts].tolist(), band.shape[0]]
     for first, last in pairwise(sorted(set(ends))):  # the planes after the first, to the last

@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -321,7 +322,8 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     at a time, to save memory.
     """
     numbers, count = number_parts(parts, np.ones(27, np.int64))
-    left, correction = feet.values.copy(), np.zeros(numbers.shape, np.float32)
+    left, voxels = feet.values.copy(), numbers.shape[1]
+    correction = np.zeros((len(numbers), voxels), np.float32)
     before: tuple[int, FloatArray] | None = None  # the cells and means of the turn before
     for cells in [cells for cells, turns in MEANS.items() for _ in range(turns)]:
         sums = np.zeros((3, count))  # of weights, values and squares
@@ -338,7 +340,7 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
         before = cells, np.concatenate(means) if means else left[:0]
         del sums
         own = CORNER_PARTS if cells == 1 else slice(None)
-        for rows in chunks_of(correction.shape[1], 4 * len(correction)):
+        for rows in chunks_of(voxels, 4 * len(correction)):
             correction[:, rows] += prolong(before[1].take(numbers[own, rows]), cells, 2)
     return correction
 
@@ -359,13 +361,14 @@ def _nodes_round(
     return numbers.ravel().take(at).astype(np.intp), shares
 
 
-def _shrunk_mean(sums: NDArray[np.float64], some: slice) -> FloatArray:
+def _shrunk_mean(sums: NDArray[Any], some: slice) -> FloatArray:
     """Return means, (n,), by sums of weights, values and squares, shrunk if these disagree."""
     weight, total, squares = sums[:, some]
     mean = total / np.maximum(weight, 1e-9)
     variance = np.maximum(squares / np.maximum(weight, 1e-9) - mean**2, 0)
     agreement = mean**2 / np.maximum(mean**2 + VARIANCE_PENALTY * variance, 1e-12)
-    return (agreement * total / (weight + PRIOR_WEIGHT)).astype(np.float32)
+    mean = agreement * total / (weight + PRIOR_WEIGHT)
+    return np.asarray(mean, np.float32)
 
 
 def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:

@@ -57,7 +57,7 @@ class BandSummary:
         return not self.told or self.noisy / self.told > MAX_NOISY_SHARE
 
 
-class BandTooLarge(Exception):
+class BandTooLargeError(Exception):
     """A band has more voxels than fit in memory."""
 
 
@@ -101,7 +101,7 @@ class _Block(NamedTuple):
     number: NDArray[np.int64]  # of samples beyond the band that can be exact, in C order ...
     value: FloatArray  # ... and their values
     leaves: bool  # whether a sample on the grid's border is inside
-    jumps: tuple[Jumps, Jumps] | None  # with an offset
+    jumps: tuple[Jumps, Jumps] | None  # up and down, with an offset
 
 
 def survey(
@@ -114,17 +114,17 @@ def survey(
 ) -> Band:
     """Read a cubic grid once and return its band.
 
-    With ``whole`` the grid is a part of another one, of which that is the summary. BandTooLarge is
-    raised as soon as there are more than ``most`` voxels.
+    With ``whole`` the grid is a part of another one, of which that is the summary.
+    BandTooLargeError is raised as soon as there are more than ``most`` voxels.
     """
     blocks, count = list[_Block](), 0
     for block in _blocks(grid, offset, threads, is_checked=whole is None):
         blocks.append(block)
         count += len(block.voxel_ijk)
         if count > most:
-            raise BandTooLarge
+            raise BandTooLargeError
     if offset and whole is None:
-        _check_offset(blocks, grid, offset)
+        _check_offset([block.jumps for block in blocks if block.jumps], grid, offset)
     leaves = any(block.leaves for block in blocks) if whole is None else whole.leaves
     voxel_ijk, patches = (np.concatenate([block[n] for block in blocks]) for n in (0, 1))
     number, value = (np.concatenate([block[n] for block in blocks]) for n in (2, 3))
@@ -159,16 +159,16 @@ def summarise(grid: SdfGrid, offset: float = 0.0, threads: int = 1) -> BandSumma
     """Return what the band of a cubic grid says, without keeping it; the grid is read once."""
     side = -(-max(grid.shape) // CELLS)
     cells = np.zeros([-(-n // side) for n in grid.shape], np.int64)
-    blocks, parts = list[_Block](), list[BandSummary]()
+    jumps, parts = list[tuple[Jumps, Jumps]](), list[BandSummary]()
     for block in _blocks(grid, offset, threads):
         lipschitz, sampled = _tell_noise(grid, block.voxel_ijk, block.patches)
         told = lipschitz if sampled is None else lipschitz[sampled]
         parts.append(_summary(block.patches, told, block.leaves))
         place = np.ravel_multi_index(tuple((block.voxel_ijk // side).T), cells.shape)
         cells += np.bincount(place, minlength=cells.size).reshape(cells.shape)
-        blocks.append(block._replace(voxel_ijk=None, patches=None, number=None, value=None))
+        jumps += [block.jumps] if block.jumps else []
     if offset:
-        _check_offset(blocks, grid, offset)
+        _check_offset(jumps, grid, offset)
     return BandSummary(
         sum(part.told for part in parts),
         sum(part.noisy for part in parts),
@@ -220,7 +220,7 @@ def _blocks(
         sides = [rescaled[own, [0, -1]], rescaled[own, :, [0, -1]]]
         sides += [rescaled[0]] * (first == 0) + [rescaled[-1]] * (last == grid.shape[0])
         beyond = samples_beyond(inner, first * grid.shape[1] * grid.shape[2], limits)
-        jumps = find_jumps(rescaled, own) if is_checked else None
+        jumps = (find_jumps(rescaled, own), find_jumps(-rescaled, own)) if is_checked else None
         voxel_ijk, patches = _patches_of(rescaled, active, first - low)
         if is_checked:
             check_not_cut_off(patches, offset, grid.voxel_size)
@@ -251,12 +251,12 @@ def _patches_of(
     return (ijk[~filled], patches[~filled]) if filled.any() else (ijk, patches)
 
 
-def _check_offset(blocks: list[_Block], grid: SdfGrid, offset: float) -> None:
+def _check_offset(jumps: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
     """Raise GridError if no sample is near an offset, or fill values begin near it."""
-    jumps = [block.jumps for block in blocks if block.jumps]
-    if not any(up.near for up, _ in jumps):
+    up, down = zip(*jumps)
+    if not any(near for _, near, _ in up):
         raise no_surface(grid, offset)
-    check_not_filled(jumps, offset, grid.voxel_size)
+    check_not_filled(up, down, offset, grid.voxel_size)
 
 
 def _tell_noise(
