@@ -9,14 +9,17 @@ network gets the distances that the runtime makes of it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import permutations, product
+from math import prod
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from export.dataset import Sample, fill_shard, parser_of_options
+from super_sdf.arrays import NEIGHBOURHOOD, STRIDES, IntArray
 from super_sdf.grid import derived
-from super_sdf.network import contract, neighbourhood
+from super_sdf.network import contract
 from super_sdf.refine import band
 
 DISTANCES = "distances"  # of which some were noisy: what a card without an entry says
@@ -66,10 +69,22 @@ def prepare(sample: Sample) -> Prepared:
     return Prepared(*map(torch.from_numpy, arrays))
 
 
+def cube_symmetries() -> IntArray:
+    """Return the 48 rotations and reflections of the cube as matrices, (48, 3, 3) int32.
+
+    The first is the identity, the next three are half turns about the axes; the first eight keep
+    every axis on itself.
+    """
+    by_handedness = sorted(product((1, -1), repeat=3), key=lambda sign: -prod(sign))
+    signs = [np.diag(sign) for sign in by_handedness]
+    orders = [np.eye(3, dtype=np.int32)[list(order)] for order in permutations(range(3))]
+    return np.array([sign @ order for order in orders for sign in signs], np.int32)
+
+
 def turned(sample: Prepared, number: int) -> Prepared:
     """Turn and mirror a sample by one of the 48 symmetries of the cube."""
-    symmetry = neighbourhood.cube_symmetries()[number]
-    places = torch.from_numpy(neighbourhood.turned_places(symmetry)).to(sample.table)
+    symmetry = cube_symmetries()[number]
+    places = torch.from_numpy((NEIGHBOURHOOD @ symmetry + 1) @ STRIDES).to(sample.table)
     offsets = sample.offsets @ torch.from_numpy(symmetry.T).to(sample.offsets)
     patches, table = sample.patches[:, places], sample.table[:, places]
     return replace(sample, patches=patches, table=table, offsets=offsets)

@@ -17,9 +17,7 @@ from torch import Tensor
 from export.augment import USUAL, Prepared, Shares
 from export.dataset import CORNERS
 from export.network import Encoded, SuperSdfNet
-from super_sdf.network import neighbourhood
-
-CENTRE = neighbourhood.CENTRE
+from super_sdf.arrays import CENTRE, STRIDES
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,7 @@ def copies_of_queries(offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.n
         some = np.flatnonzero((np.abs(ends) >= chosen).all(1))
         step = ends[some] * chosen
         queries.append(some)
-        places.append(CENTRE + step @ neighbourhood.STRIDES)
+        places.append(CENTRE + step @ STRIDES)
         moved.append(offsets[some] - 2 * step)
     return np.concatenate(queries), np.concatenate(places), np.concatenate(moved)
 

@@ -26,10 +26,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from super_sdf.network import neighbourhood
+from super_sdf.arrays import CENTRE
 from super_sdf.refine import band
-
-CENTRE = neighbourhood.CENTRE
 
 
 @dataclass(frozen=True)

@@ -24,11 +24,11 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 
 from export.network import SuperSdfNet
-from super_sdf.network import neighbourhood
+from super_sdf.arrays import CENTRE
 from super_sdf.network import onnx as sessions
 from super_sdf.refine import band
 
-CENTRE, CHUNK_INPUT = neighbourhood.CENTRE, sessions.CHUNK_INPUT
+CHUNK_INPUT = sessions.CHUNK_INPUT
 CHUNK = 512  # voxels at a time; the runtime chooses its own, see ``cpu_chunk``
 EARLY = "_early"  # the block for voxels that go no deeper
 THRESHOLD = "gate.threshold"  # an input with a default, like the chunk

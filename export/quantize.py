@@ -37,7 +37,7 @@ from export.network import Block, SuperSdfNet
 from export.onnx_graph import EARLY, Writer, declared, rows_of
 from export.to_onnx import read_card, read_network, write_model
 from super_sdf import load_network
-from super_sdf.network import contract, device
+from super_sdf.network import contract
 from super_sdf.network import onnx as sessions
 
 LEVELS = 255  # of the inputs of a layer: uint8
@@ -280,7 +280,7 @@ def optimise(path: Path) -> None:
     model.producer_name, model.producer_version = source.producer_name, ""
     used = [one for one in model.opset_import if one.domain in ("", "com.microsoft")]
     card: dict[str, Any] = {entry.key: entry.value for entry in source.metadata_props}
-    card[device.OPTIMISED] = f"onnxruntime {ort.__version__}"
+    card[sessions.OPTIMISED] = f"onnxruntime {ort.__version__}"
     del model.opset_import[:]
     model.opset_import.extend(used)
     onnx.helper.set_model_props(model, card)

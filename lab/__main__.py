@@ -9,7 +9,7 @@ COMMANDS = {
     "evaluate": "measure the quality on your own meshes",
     "figures": "measure what README, the documents and the model cards quote",
     "documents": "write the measured figures into them",
-    "faults": "conversions and batches ended at random moments, also on a cluster, and full disks",
+    "faults": "end conversions and batches at random moments, and see what is left",
     "zoo": "grids as people have them, and the ways out that refusals name",
     "picture": "draw the pictures in README and of sharp edges",
     "fields": "random fields: are their meshes closed manifolds",

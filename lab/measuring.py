@@ -19,11 +19,10 @@ from super_sdf.network.decoder import Decoder
 from super_sdf.network.network import (
     KIND_MODELS,
     find_model,
-    float32_name,
     load_network,
     shipped_models,
 )
-from super_sdf.options import AUTO_PRECISION, DEFAULT_QUALITY
+from super_sdf.options import AUTO, DEFAULT_QUALITY
 from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.solid import Solid
 
@@ -56,14 +55,14 @@ class Task:
     setting: Setting
     methods: tuple[str, ...]  # in the order of measuring
     model: str = DEFAULT_QUALITY
-    precision: str = AUTO_PRECISION
+    precision: str = AUTO
     threads: int = 0  # of the network; 0: one per core
     turned: int | None = None  # seed by which the shape is turned at random
     triangles: tuple[tuple[str, int], ...] = ()  # of methods that were measured before
 
     def network(self, method: str) -> tuple[str, str]:
         model, _, precision = method.partition("@")[2].partition(":")
-        return (model, precision or AUTO_PRECISION) if model else (self.model, self.precision)
+        return (model, precision or AUTO) if model else (self.model, self.precision)
 
     def key(self, method: str) -> Measurement:
         """Return the key of a method's measurement: it is valid as long as nothing here changes."""
@@ -168,12 +167,12 @@ def digest_of_file(path: Path) -> str:
 
 
 @cache
-def digest_of_ours(model: str, precision: str = AUTO_PRECISION) -> str:
+def digest_of_ours(model: str, precision: str = AUTO) -> str:
     """Return a hash of a network's file, of those that replace it for a kind, and of the code."""
     network, symmetries = find_model(model, precision)
     digest = hashlib.sha256(str(symmetries).encode())
     shipped = shipped_models().items()
-    for_kinds = [path for name, path in shipped if float32_name(name) in KIND_MODELS]
+    for_kinds = [path for name, path in shipped if name.removesuffix("-int8") in KIND_MODELS]
     package = Path(super_sdf.__file__).parent
     files = sorted(package.rglob("*.py"))
     code = [p for p in files if p.relative_to(package).parts[0] not in NOT_THE_METHOD]

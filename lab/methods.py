@@ -18,8 +18,8 @@ from scipy import ndimage
 from super_sdf.arrays import FloatArray
 from super_sdf.errors import NoSurfaceError, OptionError
 from super_sdf.grid.sdf_grid import SdfGrid
-from super_sdf.network.decoder import Decoder
-from super_sdf.options import DEFAULT_MESHER, MARCHING, SHARP
+from super_sdf.network.decoder import Decoder, adapt
+from super_sdf.options import AUTO, MARCHING, SHARP
 from super_sdf.pipeline import extract_mesh, reconstruct, refine_band
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField, SampleSpheres
@@ -73,7 +73,7 @@ def bound_surface(case: Case, network: Decoder, *, mesher: str = MARCHING) -> Su
     return Surface(dense(case.truth.copy(), case.fine, case.low))
 
 
-def our_surface(case: Case, network: Decoder, *, mesher: str = DEFAULT_MESHER) -> Surface:
+def our_surface(case: Case, network: Decoder, *, mesher: str = AUTO) -> Surface:
     """Mesh the coarse grid with super-sdf, capped where the surface leaves the grid.
 
     Without a surface the mesh is empty.
@@ -95,7 +95,7 @@ def band_field(grid: SdfGrid, network: Decoder, factor: int) -> FloatArray:
     """
     band = survey(grid)
     band = replace(band, decoded=np.ones(len(band.voxel_ijk), bool))
-    fine = refine_band(band, network, factor)
+    fine = refine_band(band, adapt(network), factor)
     nodes = factor * fine.voxel_ijk[:, None] + block_ijk(factor)  # (V, Q, 3)
     field = np.full([factor * n + 1 for n in grid.shape], np.nan, np.float32)
     world = fine.values * np.float32(grid.voxel_size / 2)

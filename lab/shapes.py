@@ -20,7 +20,7 @@ from super_sdf.arrays import BoolArray, FloatArray, IntArray
 from super_sdf.errors import FileError, OptionError, seen
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
-from super_sdf.options import check_factor
+from super_sdf.options import OPTIONS
 from super_sdf.refine.band import find_band, rescale
 from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import sample_grid, unit_layout
@@ -47,7 +47,7 @@ class Setting:
     scale: float = 0.0  # longest side of the box over the grid's; 0: the grid's is the diagonal
 
     def check(self) -> None:
-        check_factor(self.factor)
+        OPTIONS["factor"].check(self.factor)
         if not 4 <= self.size <= LARGEST_SIZE:
             raise OptionError(f"size is {seen(self.size)}: give 4 to {LARGEST_SIZE:,} samples")
 

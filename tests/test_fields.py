@@ -150,9 +150,11 @@ WRONG = {
     "on the samples)": {"factor": 3},
     " is no refined field: its grid has the shape (0, 3, 3)": {"shape": [0, 3, 3]},
     " is no refined field: spacing is 0, 0, 0: it must be greater than 0": {"spacing": np.zeros(3)},
-    "[values] is damaged: it has the shape (264, 3, 3, 3), not (264, 5, 5, 5)": {"factor": 4},
+    "[values] is damaged: it has the shape (264, 3, 3, 3) for 264 voxels": {"factor": 4},
     "[offset] is float64 of shape (3,): it belongs to no refined field": {"offset": np.zeros(3)},
-    "[origin] is damaged: not all values are finite": {"origin": np.full(3, np.nan)},
+    " is no refined field: origin is array([nan, nan, nan]): it must be finite": {
+        "origin": np.full(3, np.nan)
+    },
     "[sample_voxels] is damaged: its voxels are not in order in the grid": {
         "sample_voxels": np.ones((2, 3), np.int32)
     },

@@ -8,10 +8,6 @@ from __future__ import annotations
 import gzip
 import itertools
 import os
-import re
-import shlex
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -59,13 +55,6 @@ pytestmark = pytest.mark.usefixtures("folder")
 def said_of(path: str, **options: Any) -> str:
     """Return the one line with which a file is refused."""
     return refusal(SuperSdfError, read_grid, path, **options)
-
-
-def run_line(said: str) -> None:
-    """Run the Python command in a message."""
-    line = re.search(r'python (-c "[^"]+")', said)
-    assert line
-    subprocess.run([sys.executable, *shlex.split(line[1])], check=True)
 
 
 # Places
@@ -218,7 +207,7 @@ def test_what_mrc_files_say_that_no_grid_has():
     check(read_grid("a.mrc", spacing=STEPS), STEPS)
     with mrcfile.open("a.mrc", "r+") as file:
         file.header.mapc = 3
-    assert "its axes mapc, mapr, maps are [3, 2, 3]" in said_of("a.mrc")
+    assert "its header is damaged" in said_of("a.mrc")
     volumes = np.zeros((2, 5, 6, 7), np.float32)
     mrcfile.write("stack.mrc", volumes, overwrite=True)
     assert "it is a stack of volumes of 5 sections: save one of them" in said_of("stack.mrc")
@@ -274,11 +263,11 @@ def test_netcdf_packed_with_units_a_time_and_named_axes():
     known = grid.values < 6.9
     places = grid.to_world(np.moveaxis(np.indices(grid.shape), 0, -1))
     assert np.abs(grid.values - part(places))[known].max() < 6e-4
-    array = array.assign_coords(z=array["z"] / 10)
-    for name, unit in {"x": "mm", "y": "mm", "z": "cm"}.items():
-        array[name].attrs["units"] = unit
+    for name in "xyz":
+        array[name].attrs["units"] = "cm"
     array.to_netcdf("b.nc")
     check(read_grid("b.nc"), STEPS)
+    assert read_grid("b.nc").notes[0] == "lengths are in the unit of its axes, cm"
     names = {"x": "east", "y": "north", "z": "height"}
     array = array_of("yxz").rename(names)
     for axis, name in names.items():
@@ -341,9 +330,9 @@ def test_missing_doubled_tilted_and_unplaced_slices_are_refused():
         return said_of(name)
 
     gap = said("gap", of=[image for k, image in enumerate(images) if k != 6])
-    assert "gap: IM004 and IM011 are 1.8 mm apart, others 0.9: add the slices that are" in gap
+    assert "gap: IM011 is 0.54 mm off from even steps of 0.96: put all slices of one" in gap
     save_slices("twice", images[3:5], "b")
-    assert "twice: IM021 and b000 are at one place: put the slices of one" in said("twice")
+    assert "off from even steps" in said("twice")
     one = said("one", of=images[:1])
     assert "one: IM000 is its only slice: give the folder of a series" in one
     assert find_format("one") is DICOM and is_grid("one")
@@ -351,8 +340,7 @@ def test_missing_doubled_tilted_and_unplaced_slices_are_refused():
     assert said_of(file) == f"{file} is a DICOM image: give the folder that holds its series"
     for k, image in enumerate(images):
         image.ImagePositionPatient[1] += 0.2 * k
-    aside = "its slices lie up to 3.2 mm beside one another, as with a tilted gantry: resample"
-    assert f"leaning: {aside}" in said("leaning")
+    assert "columns 2 and 3 are not at right angles" in said("leaning")
     images[4].PixelSpacing = [1, 1]
     assert "has another size, spacing or direction than" in said("mixed")
     del images[4].PixelSpacing
@@ -408,7 +396,7 @@ def test_an_image_of_several_frames():
     check(read_grid("frames"), STEPS, 6e-4)
 
 
-# Open3D, and what is converted first
+# Open3D
 
 
 def test_blocks_that_open3d_saved():
@@ -419,28 +407,11 @@ def test_blocks_that_open3d_saved():
     index = grid.to_index(said["places"].astype(float))
     assert np.abs(index - np.rint(index)).max() < 1e-4
     path = DATA / "open3d-blocks.npz"
-    with open_volume(path, find_format(path), "xyz", None) as (volume, _):
+    with open_volume(path, "xyz") as (volume, _):
         stored = volume.read()
     found = stored[tuple(np.rint(index).astype(int).T)]
     assert np.array_equal(found, np.where(said["weight"] > 0, said["tsdf"], np.nan), equal_nan=True)
     assert stored.shape == grid.shape and "samples are unknown" in grid.notes[0]
-
-
-def test_files_of_other_programs_are_refused_with_the_line_that_converts_them():
-    affine = affine_of(np.eye(3))
-    head = np.array([*SIZES, *affine[:3, 3], 0.5, 2.5], "<f4")
-    truncated = np.clip(sampled(affine) / 2.5, -1, 1).astype("<f4")
-    Path("tsdf.bin").write_bytes(head.tobytes() + truncated.T.tobytes())
-    said = said_of("tsdf.bin")
-    assert said.startswith("tsdf.bin states no format; of tsdf-fusion make .npz with python -c ")
-    run_line(said)
-    found = np.load("tsdf.npz")
-    places = np.moveaxis(np.indices(SIZES), 0, -1) * found["spacing"] + found["origin"]
-    assert np.abs(found["values"] - np.clip(part(places), -2.5, 2.5)).max() < 1e-5
-    assert read_grid("tsdf.npz").spacing == (0.5, 0.5, 0.5)
-    assert said_of("a/b.nvdb") == (
-        "a/b.nvdb is NanoVDB: make OpenVDB of it with OpenVDB's tool nanovdb_convert a/b.nvdb b.vdb"
-    )
 
 
 # Damage

@@ -10,7 +10,7 @@ import trimesh
 from conftest import refusal
 
 from super_sdf.errors import FileError
-from super_sdf.labels.names import LabelName, read_names
+from super_sdf.labels.files import LabelName, read_names
 
 TABLES = {
     "slicer.ctbl": "# Color table file\n0 Background 0 0 0 0\n1 liver 221 130 101 255\n"

@@ -12,12 +12,8 @@ import pytest
 import trimesh
 from conftest import trilinear
 
-from super_sdf import load_network, make_grid, reconstruct
+from super_sdf import load_network, make_grid, reconstruct, reconstruct_labels
 from super_sdf.errors import GridError, OptionError, OutOfMemoryError
-from super_sdf.labels import reconstruct as whole_run
-from super_sdf.labels.image import find_image
-from super_sdf.labels.reconstruct import reconstruct_labels
-from super_sdf.threads import held_memory
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +45,6 @@ def nested():
     return labels
 
 
-PLACE = {"spacing": 1, "origin": 0, "direction": None}
 NOISE = np.random.default_rng(0)
 IMAGES = {
     "noise": NOISE.integers(0, 4, (6, 7, 5)),
@@ -89,26 +84,9 @@ def test_meshes_are_closed_and_share_their_walls(name, factor):
         assert len(one & other) > 50
 
 
-@pytest.mark.parametrize("name", ["noise", "nested"])
-def test_ranges_of_planes_are_joined_to_the_same_meshes(name, network, monkeypatch):
-    labels = IMAGES[name]
-    meshes = reconstruct_labels(labels, network=network, spacing=1, factor=2)
-    for ranges in ([(0, 3), (3, len(labels))], [(n, n + 1) for n in range(len(labels))]):
-        monkeypatch.setattr(whole_run, "plan_ranges", lambda *_, found=ranges: found)
-        cut = reconstruct_labels(labels, network=network, spacing=1, factor=2)
-        for label, mesh in cut.items():
-            assert mesh.vertices.tobytes() == meshes[label].vertices.tobytes()
-            assert corners_of(mesh) == corners_of(meshes[label])
-
-
-def test_less_memory_makes_more_ranges_and_too_little_is_an_error():
-    image = find_image(np.tile(IMAGES["no ground"], (9, 1, 1)), "all", PLACE, None, None)
-    held = held_memory()
-    bounds = [held + size for size in (10**9, 8 * 10**6)]
-    few, many = (whole_run.plan_ranges(image, 4, 1, bound) for bound in bounds)
-    assert len(few) == 1 < len(many)
-    with pytest.raises(OutOfMemoryError, match=r"^factor 4 on 1,890 voxels at the walls of 8 "):
-        whole_run.plan_ranges(image, 4, 1, held + 10**5)
+def test_what_does_not_fit_in_memory_is_refused():
+    with pytest.raises(OutOfMemoryError, match=r"^8 labels in 210 samples, .* \(--max-memory\)$"):
+        reconstruct_labels(IMAGES["no ground"], network=trilinear, spacing=1, max_memory=10**6)
 
 
 def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
@@ -149,7 +127,7 @@ UNFIT = {
     "labels is 1.5: give a whole number, -2^63 to 2^64 - 1": (IMAGES["noise"], [1, 1.5]),
     "no sample has the label 5: the labels are 0, 1, 2, 3": (IMAGES["noise"], [1, 5]),
     "every sample has the label 0: there is no surface": (np.zeros((4, 4, 4), int), "all"),
-    f"a value is 1.5: labels are whole numbers; {AS_DENSITIES}": (IMAGES["noise"] / 2, "all"),
+    f"a value is 0.5: labels are whole numbers; {AS_DENSITIES}": (IMAGES["noise"] / 2, "all"),
     "the values are more than 1,000 different whole numbers: choose some of them (--labels 1,2,3) "
     "if they are labels, or a --level if they are densities": (
         np.arange(11**3).reshape(11, 11, 11),
@@ -193,7 +171,7 @@ def test_the_command_writes_a_file_for_each_label(image, command):
         assert row["output"] == path and row["closed"] and mesh.is_watertight
         assert row["triangles"] == len(mesh.faces) and row["vertices"] == len(mesh.vertices)
         assert row["volume"] == pytest.approx(mesh.volume, rel=1e-5) and mesh.volume > 0
-        assert f"{path}: label {row['label']}, {len(mesh.vertices):,} vertices, " in err
+        assert f"{path}: label {row['label']}, {len(mesh.faces):,} triangles, " in err
     low, high = mesh.bounds  # of label 12, a ball in a turned grid
     np.testing.assert_allclose((low + high) / 2, (3, -9, 23), atol=0.5)
 

@@ -1,18 +1,8 @@
-"""What control groups allow, by files that stand in, and a processor on which int8 is slow."""
+"""What control groups allow, by files that stand in."""
 
 import pytest
 
 from super_sdf import threads
-from super_sdf.network import network
-
-
-def test_auto_is_float32_where_int8_is_slower(monkeypatch):
-    for flags, want in {"avx avx2": "base-int8", "avx": "base", "": "base-int8"}.items():
-        monkeypatch.setattr(network, "described_processor", lambda said=flags: {"flags": said})
-        assert network.find_model("base")[0].stem == want
-        assert network.find_model("base", "int8")[0].stem == "base-int8"
-        assert network.find_model("base", "float32")[0].stem == "base"
-
 
 MB = 10**6
 FREE = 1024 * MB  # as the system says

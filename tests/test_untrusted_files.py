@@ -18,7 +18,7 @@ from conftest import ball, refusal
 from test_formats import affine_of, sampled, save_vti, text_sdf
 
 from super_sdf import read_grid
-from super_sdf.errors import GridError, SuperSdfError, seen
+from super_sdf.errors import GridError, SuperSdfError
 from super_sdf.files.readers.zarr import CODECS
 
 VALUES = sampled(affine_of(np.eye(3)))
@@ -69,14 +69,10 @@ def test_compressed_metaimage_is_whole_and_has_the_promised_size():
     for line in (f"CompressedDataSize = {len(packed)}", "Comment = no size"):
         grid = read_grid(mha("CompressedData = True", line, data=packed))
         assert np.array_equal(grid.values, VALUES)
-    promised = "a.mha is damaged: 32,640 bytes are promised, and its compressed data "
-    for data, said in {
-        packed[:-2]: "is torn after 32,640",
-        packed[: len(packed) // 2]: "is torn after ",
-        zlib.compress(RAW[:-4]): "ends after 32,636",
-        zlib.compress(RAW + bytes(10)): "ends after 32,650",
-    }.items():
-        assert said_of(mha("CompressedData = True", data=data)).startswith(promised + said)
+    said = "a.mha is damaged: 32,640 bytes are promised, and its compressed data is torn"
+    longer, shorter = zlib.compress(RAW + bytes(10)), zlib.compress(RAW[:-4])
+    for data in (packed[:-2], packed[: len(packed) // 2], shorter, longer):
+        assert said_of(mha("CompressedData = True", data=data)).startswith(said)
 
 
 @pytest.mark.parametrize("packing", ["raw", "text", "bzip2", "gzip"])
@@ -205,27 +201,14 @@ def edited(path, change):
     Path(path).write_text(json.dumps(found))
 
 
-def test_raw_data_of_hdf5_is_read_beside_the_file(values, tmp_path, monkeypatch):
+def test_numbers_of_hdf5_in_other_files_are_refused(values):
     raw = values.astype("<f4").tobytes()
-    Path("deep").mkdir()
-    Path("deep/a.raw").write_bytes(raw)
     Path("b.raw").write_bytes(raw)
-    for name in ("a.raw", "../b.raw", str(tmp_path / "b.raw")):
-        with h5py.File("deep/a.h5", "w") as file:
-            about = {"shape": values.shape, "dtype": "<f4"}
-            file.create_dataset("d", **about, external=[(name, 0, len(raw))])
-        if name == "a.raw":
-            assert np.array_equal(read("deep/a.h5"), values)
-            continue
-        assert said_of("deep/a.h5") == (
-            f"deep/a.h5 names the file {seen(name)}, which is not in its folder: put both into one "
-            "folder"
-        )
-    Path("deep/a.raw").unlink()
-    os.mkfifo("deep/a.raw")
-    with h5py.File("deep/a.h5", "w") as file:
-        file.create_dataset("d", **about, external=[("a.raw", 0, len(raw))])
-    assert said_of("deep/a.h5").endswith("deep/a.raw is a named pipe: give a file")
+    with h5py.File("a.h5", "w") as file:
+        about = {"shape": values.shape, "dtype": "<f4"}
+        file.create_dataset("d", **about, external=[("b.raw", 0, len(raw))])
+    said = "a.h5: the numbers of /d are in other files: save them in this one"
+    assert said_of("a.h5") == said
 
 
 def test_links_and_pipes_in_a_store(values):
@@ -304,7 +287,7 @@ def test_chunks_that_are_not_stored_are_counted(values, kind):
             assert np.array_equal(read(path, field="exact"), whole)
         else:
             assert said_of(path, GridError, spacing=1) == (
-                f"{path}: 12 of its 48 chunks are not stored and read as 0, which is the surface: "
+                f"{path}: 12 of its chunks are not stored and read as 0, which is the surface: "
                 "write them all, or give the array a fill value other than 0 (NaN for unknown)"
             )
 

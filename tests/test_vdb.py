@@ -13,7 +13,6 @@ from conftest import refusal
 
 from super_sdf import read_grid
 from super_sdf.errors import FileError, GridError
-from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
 from super_sdf.files.vdb_writer import ACTIVE_MASK, ZIP
 
@@ -22,7 +21,7 @@ DATA = Path(__file__).parent / "data"
 
 def voxels(path):
     """Return the values of a file, before anything is made of them, and where the first one is."""
-    with open_volume(path, find_format(path), "xyz", None) as (volume, _):
+    with open_volume(path, "xyz") as (volume, _):
         return volume.read(), np.array(volume.origin), volume.spacing[0]
 
 

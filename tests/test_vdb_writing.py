@@ -23,7 +23,6 @@ from super_sdf import (
     write_field,
 )
 from super_sdf.errors import OptionError
-from super_sdf.files.formats import find_format
 from super_sdf.files.grids import open_volume
 from super_sdf.files.vdb_writer import (
     INSIDE,
@@ -79,7 +78,7 @@ def level_set(field) -> tuple[np.ndarray, np.float32]:
 
 def held(path, grid: SdfGrid) -> tuple[np.ndarray, np.ndarray, dict]:
     """Return the values in a file, the voxel that is the first, and what is said of the grid."""
-    with open_volume(path, find_format(path), "xyz", None, describes=True) as (volume, _):
+    with open_volume(path, "xyz", describes=True) as (volume, _):
         values = volume.read()
         columns = np.array(grid.direction) * grid.spacing
         np.testing.assert_allclose(volume.direction * volume.spacing, columns, atol=1e-15)
@@ -153,7 +152,7 @@ def test_trees_of_many_nodes_have_the_right_side_everywhere(tmp_path):
     packed = [leaf_bytes(values.astype("f4"), np.abs(values) < 0.75) for values in leaves]
     count = sum(int((np.abs(values) < 0.75).sum()) for values in leaves)
     box = np.full(3, -8), np.array([4119, 319, 319])
-    tree = LevelSet(ball(), np.float32(0.75), sides, packed, count, box, bytes(16))
+    tree = LevelSet(ball(), np.float32(0.75), sides, packed, count, box)
     with open("a.vdb", "wb") as file:
         write_tree(file, tree)
     expected = np.full(sides.shape, 0.75, np.float32)

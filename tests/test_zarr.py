@@ -3,15 +3,13 @@
 import json
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import zarr
 from conftest import ball, refusal
 
 from super_sdf import read_grid
-from super_sdf.errors import FileError, GridError
-from super_sdf.grid.samples import SamplePlanes
+from super_sdf.errors import GridError
 
 SHAPE = (30, 26, 22)  # x, y, z
 MODEL = ("--quality", "fast", "--spacing", "1", "-q")
@@ -153,32 +151,3 @@ def test_info_of_a_file_prints_its_chunks(command, values):
     assert found["spacing"] == [1, 1, 1] and found["origin"] == [1, 2, 3]
     assert found["chunks"] == [8, 8, 8] and found["zarr format"] == 2
     assert found["notes"] == ["lengths are in the unit of its axes, micrometer"]
-
-
-@pytest.mark.parametrize("axes", ["xyz", "zyx"])
-@pytest.mark.parametrize("chunks", [(8, 8, 8), (22, 26, 30), (5, 7, 11)])
-def test_a_large_array_stays_in_its_file(monkeypatch, values, axes, chunks):
-    """The same samples, read layer by layer as planes are needed, and boxes on their own."""
-    monkeypatch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
-    monkeypatch.setattr("super_sdf.files.grids.LAYER_BYTES", 3000)
-    array = values if axes == "xyz" else values.T[::-1]
-    chunks = tuple(min(pair) for pair in zip(chunks, array.shape))
-    store("a.zarr", array, chunks=chunks)
-    with h5py.File("a.h5", "w") as file:
-        file.create_dataset("a", data=array, chunks=chunks)
-    for name in ("a.zarr", "a.h5"):
-        grid = read_grid(name, axes=axes, spacing=1)
-        assert isinstance(grid.samples, SamplePlanes)
-        want = values if axes == "xyz" else values[:, :, ::-1]
-        assert np.array_equal(grid.values, want)
-        for first, last in ((0, 1), (3, 12), (29, 30), (7, 7)):
-            assert np.array_equal(grid.samples[first:last], want[first:last])
-        box = grid.samples.crop((1, 2, 3), (28, 9, 20))
-        assert np.array_equal(box, want[1:28, 2:9, 3:20])
-
-
-def test_a_damaged_chunk_of_a_large_array_is_a_line(monkeypatch, values):
-    monkeypatch.setattr("super_sdf.files.grids.ROOM_SHARE", 0)
-    store("a.zarr", values.T)
-    Path("a.zarr/c/1/1/1").write_bytes(b"no chunk")
-    assert said_of("a.zarr", FileError, spacing=1).startswith("a.zarr cannot be read as Zarr: ")

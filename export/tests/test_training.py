@@ -14,7 +14,8 @@ from export.shapes.smooth import ellipsoid
 from export.store import Sampler, Store, chances
 from export.tests.conftest import SMALL
 from super_sdf import load_network
-from super_sdf.network import contract, neighbourhood
+from super_sdf.arrays import CENTRE, NEIGHBOURHOOD
+from super_sdf.network import contract
 from super_sdf.refine import nodes
 
 
@@ -64,13 +65,13 @@ def test_what_cannot_be_worked_with_is_refused_in_a_line(
 def test_targets_are_the_distance_at_the_query_points(prepared):
     """They differ from the sample by no more than they are away from it."""
     for sample in prepared:
-        sampled = sample.patches[sample.voxels, neighbourhood.CENTRE][:, None]
+        sampled = sample.patches[sample.voxels, CENTRE][:, None]
         assert ((sample.targets - sampled).abs() <= sample.offsets.norm(dim=1) + 4e-3).all()
 
 
 def test_a_turned_sample_of_a_plane_is_one_of_the_turned_plane(prepared):
     normal, sample = torch.tensor([0.5, -0.3, 0.8]), prepared[0]
-    places = torch.from_numpy(neighbourhood.NEIGHBOURHOOD).float()
+    places = torch.from_numpy(NEIGHBOURHOOD).float()
     plane = replace(
         sample,
         patches=(2 * places @ normal).repeat(len(sample.patches), 1),

@@ -15,11 +15,11 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .errors import SuperSdfError as SuperSdfError
+    from .files.fields import read_field as read_field
     from .files.fields import write_field as write_field
     from .files.grids import grid_from_image as grid_from_image
     from .files.grids import read_grid as read_grid
     from .files.meshes import write_mesh as write_mesh
-    from .files.sparse import read_field as read_field
     from .functions.function import DistanceFunction as DistanceFunction
     from .grid.sdf_grid import SdfGrid as SdfGrid
     from .grid.sdf_grid import make_grid as make_grid
@@ -35,10 +35,9 @@ if TYPE_CHECKING:
 
 MODULES = {
     "errors": "SuperSdfError",
-    "files.fields": "write_field",
+    "files.fields": "read_field write_field",
     "files.grids": "grid_from_image read_grid",
     "files.meshes": "write_mesh",
-    "files.sparse": "read_field",
     "functions.function": "DistanceFunction",
     "grid.sdf_grid": "SdfGrid make_grid",
     "labels.reconstruct": "reconstruct_labels",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from .arrays import Triple
 from .errors import check_modules
 from .files.grids import read_grid
-from .files.meshes import check_format_holds, check_target, local_origin_note, write_mesh
+from .files.meshes import check_target, write_mesh
 from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.samples import as_triple
@@ -109,7 +109,6 @@ def convert(
 
         check_has_volume(grid, options.offset, cap=options.cap)
     lattice = cubic_grid(grid, options.offset)
-    check_format_holds(target, lattice, options.factor)
     saving: Any = nullcontext()
     if save_field is not None:
         from .files.fields import check_field_fits, saving_field
@@ -160,7 +159,7 @@ def convert(
         capped=options.cap and made.leaves,
         warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
-        notes=(*lattice.notes, *no_edges, *local_origin_note(target, [mesh]), *off),
+        notes=(*lattice.notes, *no_edges, *off),
         seconds=watch.seconds,
         saved_field=file.report if file else None,
     )

@@ -14,18 +14,19 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import OptionTypeError, OutOfMemoryError, seen
+from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .functions.function import Function, as_function, sampled
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
-from .network.network import given_or_loaded, network_for
-from .options import MesherName, Options
+from .network.network import load_network, network_for
+from .options import OPTIONS, MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
@@ -159,7 +160,8 @@ def upsample(
     check_grid(grid)
     options.check_network(network)
     options.check_progress(progress)
-    factor, offset = options.check_factor(factor), options.check_distance(offset)
+    asked = Options(factor, offset=offset)  # checks them
+    factor, offset = asked.factor, asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
@@ -174,7 +176,7 @@ def extract_mesh(
     field: FineField,
     grid: SdfGrid | None = None,
     *,
-    mesher: options.MesherName = options.DEFAULT_MESHER,
+    mesher: options.MesherName = options.AUTO,
     cap: bool = True,
     function: Function | None = None,
 ) -> Mesh:
@@ -203,7 +205,7 @@ def extract_mesh(
     check_grid(grid)
     samples = field.spheres
     chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
-    cap = options.check_cap(cap) and field.grid is not None
+    cap = OPTIONS["cap"].check(cap) and field.grid is not None
     check_can_close(grid, cap=cap)
     mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
     if function is None:
@@ -224,7 +226,7 @@ def reconstruct(
     quality: options.Quality | str | Path | None = None,
     offset: float = 0.0,
     cap: bool = True,
-    mesher: options.MesherName = options.DEFAULT_MESHER,
+    mesher: options.MesherName = options.AUTO,
     max_memory: int | None = None,
     progress: Progress | None = None,
     device: options.Device | None = None,
@@ -274,8 +276,14 @@ def reconstruct(
         If not even small tiles of the grid fit in the memory.
     """
     exact = None if function is None else as_function(function)
-    grid = sampled(grid, exact, bounds, spacing, options.check_distance(offset))
-    network = given_or_loaded(network, quality, device=device, precision=precision, threads=threads)
+    grid = sampled(grid, exact, bounds, spacing, OPTIONS["offset"].check(offset))
+    where = {"model": quality, "device": device, "precision": precision, "threads": threads}
+    asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
+    if network is None:
+        network = load_network(**asked)
+    elif asked:
+        name = next(iter(asked)).replace("model", "quality")
+        raise OptionError(f"a network and {name} are given: give only one of them")
     chosen = Options(factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Mapping
 Progress = Callable[[int, int], None]
 """Called with (done, total), in thousandths of the work; ``done`` never falls and ends at total.
 
-While the network runs it is called several times a second with an estimate from the elapsed time.
 If it raises an exception, the work stops with that exception.
 """
 

@@ -155,15 +155,6 @@ def give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def described_processor() -> dict[str, str]:
-    """Return what Linux says of the first processor, by name; empty on other systems."""
-    with suppress(OSError), open("/proc/cpuinfo", "rb", buffering=0) as file:
-        lines = file.read(1 << 13).decode("ascii", "replace").partition("\n\n")[0].splitlines()
-        pairs = (line.partition(":") for line in lines)
-        return {name.strip(): value.strip() for name, _, value in pairs}
-    return {}
-
-
 def _read_sizes(path: Path) -> dict[str, int]:
     """Return the sizes in a file of /proc, in bytes, by name."""
     fields = (line.split(":", 1) for line in path.read_text().splitlines())

@@ -20,7 +20,7 @@ from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
 from ..grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
-from ..options import LENGTHS, MASK, Options, check_distance, check_max_memory
+from ..options import LENGTHS, MASK, Options
 from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh
 from ..threads import give_back, held_memory, in_words, memory_bound, useful_threads
@@ -207,7 +207,7 @@ def check_mesh(
     not fit in memory.
     """
     band, offset = band_of(grid, options), options.offset
-    bound, triangles = memory_bound(check_max_memory(options.max_memory)), len(mesh.faces)
+    bound, triangles = memory_bound(options.max_memory), len(mesh.faces)
     need = triangles * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
     need += held_memory() or 0
     if bound is not None and need > bound:
@@ -227,7 +227,7 @@ def check_mesh(
 
 def band_of(grid: SdfGrid, options: Options = AS_GIVEN) -> Band:
     """Return the band of a grid on its cubic lattice; NoSurfaceError if it has none."""
-    offset = check_distance(options.offset)
+    offset = options.offset
     band = survey(cubic_grid(grid, offset), offset, threads=useful_threads(0))
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)

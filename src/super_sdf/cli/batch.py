@@ -70,8 +70,7 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     from ..batch.record import folder_lock
     from ..batch.run import Batch, Settings
     from ..files.regular import files_of
-    from ..labels.files import check_options
-    from ..labels.names import read_names
+    from ..labels.files import check_options, read_names
 
     names = read_names(given["names"]) if given["names"] else None
     jobs = find_jobs(sources, f".{given['kind']}", options, names)

@@ -91,9 +91,8 @@ def in_word(value: Any) -> str:
 
 def gather_facts() -> dict[str, Any]:
     """Return versions, devices and the networks' cards, or under ``fault`` why one cannot load."""
-    from ..network.device import available_devices
     from ..network.network import NO_NETWORKS, load_network, shipped_models
-    from ..network.onnx import ort
+    from ..network.onnx import VERSION, available_devices
 
     models: dict[str, Any] = {}
     for name in shipped_models():
@@ -104,7 +103,7 @@ def gather_facts() -> dict[str, Any]:
     return {
         "super-sdf": __version__,
         "python": platform.python_version(),
-        "onnxruntime": ort.__version__,
+        "onnxruntime": VERSION.removeprefix("onnxruntime "),
         "devices": available_devices(),
         "meshers": MESHERS,
         "models": models,
@@ -114,17 +113,17 @@ def gather_facts() -> dict[str, Any]:
 
 def run_checks(device: Device) -> Iterator[tuple[str, str, str]]:
     """Yield state, name and words of each check; CUDA is needed if onnxruntime is built for it."""
-    from ..network.device import available_devices, check_cuda, describe_gpu, onnxruntime_version
     from ..network.network import NO_NETWORKS, shipped_models
+    from ..network.onnx import VERSION, available_devices, check_cuda
 
     versions = f"super-sdf {__version__}, Python {platform.python_version()}"
-    yield (OK, "versions", f"{versions}, {onnxruntime_version()}")
+    yield (OK, "versions", f"{versions}, {VERSION}")
     devices: list[Device] = ["cpu"]
     if device != "cpu":
         try:
             check_cuda()
             devices.append("cuda")
-            yield (OK, "cuda", describe_gpu() or "its libraries are there")
+            yield (OK, "cuda", "its libraries are there")
         except errors.DeviceError as error:
             needed = device == "cuda" or "cuda" in available_devices()
             yield (FAILED if needed else MISSING, "cuda", str(error))

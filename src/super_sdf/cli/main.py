@@ -31,7 +31,7 @@ PIPE_CLOSED = 141  # exit code of programs whose reader has ended: 128 and SIGPI
 OUTPUT = "Output"
 FILE = click.Path(path_type=Path)
 
-Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+Decorator = Callable[[Any], Any]
 """Adds options to a command."""
 
 

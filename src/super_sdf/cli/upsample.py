@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from contextlib import ExitStack
 from typing import Any
 
@@ -59,7 +60,7 @@ def command(source: str, target: str, **given: Any) -> None:
 
         others = [*files_of(source), target, *[given["save_field"]] * bool(given["save_field"])]
         main.check_page("--report", given["report"], others, force=given["force"])
-    from ..network.network import digest_of_model, load_network
+    from ..network.network import load_network
 
     network = load_network(**options.network())
     watch.lap("load network")
@@ -80,8 +81,7 @@ def command(source: str, target: str, **given: Any) -> None:
             how["save_field"] = given["save_field"]
             done = convert(source, target, network, options, force=force, **how)
         else:
-            from ..labels.files import check_options, convert_labels
-            from ..labels.names import read_names
+            from ..labels.files import check_options, convert_labels, read_names
 
             check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
             how["names"] = read_names(given["names"]) if given["names"] else None
@@ -94,7 +94,7 @@ def command(source: str, target: str, **given: Any) -> None:
         "version": __version__,
         "asked": options.digest(),
         "model": model,
-        "network": digest_of_model(model, network.precision),
+        "network": hashlib.sha256(network.path.read_bytes()).hexdigest(),
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),

@@ -1,8 +1,15 @@
-"""Writing refined fields: ``.npz``, ``.vdb``, ``.npy`` and ``.vti``, complete or not at all."""
+"""Refined fields to ``.npz``, ``.vdb``, ``.npy`` and ``.vti``, complete or not at all; and back.
+
+docs/reference/files.md describes the keys of the sparse ``.npz``. Its values are in world units and
+exact: as float32 if the spacing is a power of two, since the field's own are float32 in half
+voxels, else as float64.
+"""
 
 from __future__ import annotations
 
+import math
 import struct
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -12,15 +19,80 @@ from typing import Any
 
 import numpy as np
 from numpy.lib import format as npy
+from numpy.typing import NDArray
 
-from ..errors import OptionError, OptionTypeError, seen
-from ..options import check_path
-from ..refine.field import FineField, fine_grid, lattice_planes, lattice_shape
-from ..surface.cap import check_all_seen
+from ..arrays import FloatArray
+from ..errors import FileError, OptionError, OptionTypeError, SuperSdfError, seen
+from ..grid.field import Field
+from ..grid.samples import SamplePlanes
+from ..grid.sdf_grid import SdfGrid
+from ..options import OPTIONS, check_path
+from ..refine.band import neighbour_table
+from ..refine.field import FineField, SampleSpheres, fine_grid, lattice_planes, lattice_shape
+from ..refine.nodes import copies_agree, share_parts
+from ..surface.cap import check_all_seen, find_border_inside
 from ..threads import check_fits
 from .output import check_free, naming, replacing
-from .sparse import write_sparse
+from .regular import check_regular_file
 from .vdb_writer import write_level_set
+
+VERSION = 1
+CHUNK = 1 << 20  # values at a time
+# Which kinds of numbers each array has, and its shape, where None is any length.
+ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    "version": ("iu", ()),
+    "shape": ("iu", (3,)),
+    "factor": ("iu", ()),
+    "spacing": ("f", (3,)),
+    "origin": ("f", (3,)),
+    "direction": ("f", (3, 3)),
+    "offset": ("f", ()),
+    "leaves": ("b", ()),
+    "values": ("f", (None, None, None, None)),
+    "voxels": ("i", (None, 3)),
+    "sample_voxels": ("i", (None, 3)),
+    "sample_distances": ("f", (None,)),
+    "border_inside": ("i", (None, 3)),
+}
+
+
+def write_sparse(field: FineField, path: Path) -> None:
+    """Write a field to an ``.npz`` file, its values block by block."""
+    grid, side, count = field.placed, field.factor + 1, len(field.voxel_ijk)
+    # float32 is exact where world units only change exponents
+    is_power = math.frexp(grid.voxel_size)[0] == 0.5 and 1e-20 < grid.voxel_size < 1e20
+    exact, none = np.dtype("<f4" if is_power else "<f8"), np.empty((0, 3), np.int32)
+    samples, distances = none, np.empty(0)
+    if field.spheres is not None:
+        samples = field.spheres.voxel_ijk
+        distances = field.in_world_units(field.spheres.distance)
+    arrays: dict[str, Any] = {
+        "version": VERSION,
+        "shape": field.shape,
+        "factor": field.factor,
+        "spacing": grid.spacing,
+        "origin": grid.origin,
+        "direction": grid.direction,
+        "offset": field.offset,
+        "leaves": field.leaves,
+        "values": None,  # in chunks
+        "voxels": field.voxel_ijk,
+        "sample_voxels": samples,
+        "sample_distances": distances.astype(exact),
+        "border_inside": find_border_inside(field) if field.leaves else none,
+    }
+    header = {"descr": exact.str, "fortran_order": False, "shape": (count, side, side, side)}
+    step = max(CHUNK // side**3, 1)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                if array is not None:
+                    npy.write_array(member, np.asarray(array))
+                    continue
+                npy.write_array_header_1_0(member, header)
+                for first in range(0, count, step):
+                    blocks = field.block_distances(slice(first, min(first + step, count)))
+                    member.write(blocks.astype(exact).tobytes())
 
 
 def write_npy(field: FineField, path: Path) -> None:
@@ -139,3 +211,132 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     check_field_fits(path, lattice_shape(field.placed.shape, field.factor))
     with saving_field(path, force=force) as file:
         file.write(field)
+
+
+class NoSamples(SamplePlanes):
+    """Stands for the coarse samples of a field that was read from a file, which has none."""
+
+    dtype = np.dtype(np.float32)
+
+    def __init__(self, shape: tuple[int, ...], name: str) -> None:
+        self.shape, self.name = shape, name
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Raise FileError: there is nothing to read."""
+        said = f"{self.name} holds the refined field without the coarse samples"
+        raise FileError(f"{said}: read those from their own file")
+
+
+def read_field(path: str | Path) -> FineField:
+    """Read a refined field from a ``.npz`` file that ``--save-field`` or ``write_field`` wrote.
+
+    ``extract_mesh`` makes the same mesh of it, byte for byte. Its ``grid`` has shape, spacing and
+    origin, but no samples.
+
+    Parameters
+    ----------
+    path : path
+        The file; docs/reference/files.md describes its keys.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, damaged, truncated, or holds something else.
+    OutOfMemoryError
+        If the field does not fit in memory.
+    OptionError
+        If the suffix is not .npz.
+    """
+    path = check_path(path, "path")
+    if path.suffix.lower() != ".npz":
+        raise OptionError(f"{path} is no sparse field: give .npz")
+    check_regular_file(path)
+    try:
+        return _field_of(_read_arrays(path), path)
+    except (FileError, MemoryError):
+        raise
+    except SuperSdfError as error:  # a factor or a place that cannot be
+        raise FileError(f"{path} is no refined field: {error}") from None
+    except Exception as error:  # zipfile and NumPy raise over ten kinds of error on damaged files
+        reason = str(error).splitlines() or [type(error).__name__]
+        raise FileError(f"{path} cannot be read as a refined field: {reason[0]}") from None
+
+
+def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file by their keys, which have the kinds and shapes of ``ARRAYS``."""
+    arrays: dict[str, NDArray[Any]] = {}
+    with zipfile.ZipFile(path) as archive:
+        sizes = {each.filename.removesuffix(".npy"): each.file_size for each in archive.infolist()}
+        missing = [key for key in ARRAYS if key not in sizes]
+        if missing:
+            raise FileError(f"{path} is no refined field: it has no key {missing[0]!r}")
+        need = 3 * sum(sizes[key] for key in ARRAYS)
+        check_fits(need, f"{path}, as a field,", "read it on a larger machine")
+        for key, (kinds, shape) in ARRAYS.items():
+            with archive.open(f"{key}.npy") as member:
+                array = npy.read_array(member, allow_pickle=False)
+            if key == "version" and array != VERSION:
+                said = f"has format version {array}, this program reads {VERSION}"
+                raise FileError(f"{path} {said}: use a newer one")
+            is_like = all(want in (None, n) for want, n in zip(shape, array.shape))
+            if array.dtype.kind not in kinds or array.ndim != len(shape) or not is_like:
+                said = f"{array.dtype} of shape {array.shape}"
+                raise FileError(f"{path}[{key}] is {said}: it belongs to no refined field")
+            arrays[key] = array
+    return arrays
+
+
+def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
+    """Return the field of arrays, which are checked: a mesh of others would have holes."""
+    factor, shape = OPTIONS["factor"].check(int(arrays["factor"])), tuple(map(int, arrays["shape"]))
+    if min(shape) < 2:
+        raise FileError(f"{path} is no refined field: its grid has the shape {shape}")
+    grid = SdfGrid.trusted(
+        NoSamples(shape, str(path)),
+        *(arrays["spacing"], arrays["origin"]),
+        direction=arrays["direction"],
+        extremes=(-math.inf, math.inf),
+        field=Field(on_lattice=True),  # it is on the lattice of the field already
+    )
+    for key in ("voxels", "sample_voxels", "border_inside"):
+        number = arrays[key].astype(np.int64) @ (shape[1] * shape[2], shape[2], 1)
+        if (arrays[key] < 0).any() or (arrays[key] >= shape).any() or (np.diff(number) <= 0).any():
+            raise FileError(f"{path}[{key}] is damaged: its voxels are not in order in the grid")
+        arrays[key] = np.ascontiguousarray(arrays[key], np.int32)
+    voxels, values, border = (arrays[key] for key in ("voxels", "values", "border_inside"))
+    samples, distances = arrays["sample_voxels"], arrays["sample_distances"]
+    parts, side = share_parts(neighbour_table(voxels, shape)), factor + 1
+    at_border = ((border == 0) | (border == np.array(shape) - 1)).any(1)
+    numbers = (np.ravel_multi_index(tuple(ijk.T), shape) for ijk in (border, voxels))
+    is_whole = values.shape == (len(voxels), side, side, side) and len(voxels) > 0
+    half = _in_half_voxels(values.reshape(len(voxels), -1), grid) if is_whole else values
+    blocks = np.ascontiguousarray(half.T)
+    for key, is_sound, fault in (
+        ("values", is_whole, f"it has the shape {values.shape} for {len(voxels)} voxels"),
+        ("sample_distances", len(samples) == len(distances), f"{len(samples):,} are wanted"),
+        ("values", np.isfinite(blocks).all(), "not all values are finite"),
+        (
+            "border_inside",
+            at_border.all() and not np.isin(*numbers).any(),
+            "not all are border voxels without a block",
+        ),
+    ):
+        if not is_sound:
+            raise FileError(f"{path}[{key}] is damaged: {fault}")
+    if not copies_agree(blocks, parts, factor):
+        raise FileError(f"{path}[values] is damaged: blocks differ at nodes that they share")
+    three = (shape[0], shape[1], shape[2])
+    return FineField(
+        *(three, factor, voxels, blocks, parts),
+        spheres=SampleSpheres(three, samples, _in_half_voxels(distances, grid)),
+        grid=grid,
+        offset=float(arrays["offset"]),
+        leaves=bool(arrays["leaves"]),
+        border_inside=border,
+    )
+
+
+def _in_half_voxels(world: NDArray[Any], grid: SdfGrid) -> FloatArray:
+    """Return distances in world units in half voxels: the float32 numbers that were written."""
+    half: FloatArray = np.divide(world, grid.voxel_size / 2, dtype=np.float64).astype(np.float32)
+    return half

@@ -21,11 +21,6 @@ WAYS_OUT = {
     ".nvdb": "is NanoVDB: make OpenVDB of it with OpenVDB's tool nanovdb_convert {0} {1}.vdb",
     ".dcm": "is a DICOM image: give the folder that holds its series",
     ".img": "holds the samples of an Analyze file: give its header {1}.hdr",
-    ".bin": (
-        'states no format; of tsdf-fusion make .npz with python -c "import numpy as n; a = '
-        "n.fromfile('{0}', '<f4'); s = a[2::-1].astype(int); n.savez('{1}.npz', values=(a[7] * "
-        'a[8:]).reshape(s).T, origin=a[3:6], spacing=a[6])"'
-    ),
 }
 
 
@@ -46,7 +41,7 @@ FORMATS = (
     GridFormat("npy", "NumPy", (".npy",), "numpy", axes="xyz"),
     GridFormat("npz", "NumPy", (".npz",), "numpy", axes="xyz"),
     GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nibabel", "nifti"),
-    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd", "nrrd", has_members=True),
+    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd", "nrrd"),
     GridFormat("metaimage", "MetaImage", (".mha", ".mhd"), "simpleitk", "metaimage"),
     GridFormat("vti", "VTK image data", (".vti",), "vtk", "vti", has_members=True),
     GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tifffile", "tiff", "zyx"),
@@ -140,10 +135,9 @@ def choose_axes(format_: GridFormat, given: str | None, direction: object = None
     """
     if given is not None:
         OPTIONS["axes"].check(given)
-    for what, value in (("axes is {!r}", given), ("direction is given", direction)):
-        if value is not None and format_.axes is None:
-            said = f"{what.format(value)}, but {format_.name} files state their axes"
-            raise OptionError(f"{said}: leave it out")
+    if format_.axes is None and (given is not None or direction is not None):
+        what = f"axes is {given!r}" if given is not None else "direction is given"
+        raise OptionError(f"{what}, but {format_.name} files state their axes: leave it out")
     return given or format_.axes or "xyz"
 
 

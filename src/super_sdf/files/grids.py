@@ -9,30 +9,28 @@ import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from importlib import import_module
 from math import prod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
-from ..grid.samples import Index, SamplePlanes, check_kind
+from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import AxisOrder, Options, Space, Values, check_path
 from ..threads import held_memory, memory_bound
-from .formats import GridFormat, check_library, choose_axes, find_format, split_member
+from .formats import check_library, choose_axes, find_format, split_member
 from .output import check_free, replacing
 from .regular import check_grid_file
-from .volume import Placement, Request, Volume, find_placement, place_in_world
+from .volume import Request, Volume, axes_direction, find_placement, place_in_world
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-LAYER_BYTES = 1 << 23  # of planes that are read together, if chunks are smaller
-ROOM_SHARE = 0.25  # of the memory that is left: larger arrays in chunks stay in their file
-
+ROOM_SHARE = 0.25  # of the memory that is left: a larger .npy stays mapped in any order of axes
 
 
 def read_grid(
@@ -49,8 +47,7 @@ def read_grid(
     """Read a grid from a file of any format in ``formats.FORMATS``: see docs/guides/formats.md.
 
     An ``.npy`` file is mapped into memory, unless its axes are in another order. Other files are
-    loaded, but for HDF5 and Zarr if an array takes more than a quarter of the memory that is left:
-    then planes are read when they are needed.
+    loaded.
 
     Parameters
     ----------
@@ -96,92 +93,39 @@ def read_array(
     max_memory: int | None,
 ) -> dict[str, Any]:
     """Return values, place (unless ``given``), space and notes: see ``read_grid``."""
-    path = check_path(path, "path")
-    format_ = find_format(path)
-    order = choose_axes(format_, axes, given["direction"])
-    left = memory_left(max_memory)
-    with open_volume(path, format_, order, left) as (volume, request):
+    path, direction = check_path(path, "path"), given["direction"]
+    order = choose_axes(find_format(path), axes, direction)
+    with open_volume(path, order, memory_left(max_memory)) as (volume, request):
         volume = volume.in_space(space, str(path))
-        if given["direction"] is not None:
-            volume = volume.turned(order)
+        if direction is not None:  # of x, y and z
+            volume = replace(volume, direction=axes_direction(volume.axes or order))
         arrays = _taken(volume, request, given)
     return arrays | {"notes": volume.notes, "space": volume.space}
 
 
 @contextmanager
 def open_volume(
-    path: Path, format_: GridFormat, axes: str, left: int | None, *, describes: bool = False
+    path: Path, axes: str, left: int | None = None, *, describes: bool = False
 ) -> Iterator[tuple[Volume, Request]]:
-    """Yield the volume in a file, and what was asked for; a library's error becomes one line.
+    """Yield the volume in a file, and what was asked for.
 
-    ``left`` is how many bytes of memory it may take, None if unknown. ``describes`` says that no
-    sample will be read.
+    Whatever a library raises in the block becomes a FileError of one line, and what it says
+    meanwhile is dropped. ``left`` is how many bytes of memory it may take, None if unknown;
+    ``describes`` says that no sample will be read.
     """
-    file, member = split_member(path)
+    format_, (file, member) = find_format(path), split_member(path)
     check_grid_file(path)
     check_library(format_)
-    with one_line_errors(path, format_), ExitStack() as files:
-        readers = import_module(f".readers.{format_.module}", __package__)
-        read = getattr(readers, f"read_{format_.key}")
-        request = Request(file, member, axes, files, left, describes)
-        yield read(request), request
-
-
-def memory_left(max_memory: int | None = None) -> int | None:
-    """Return how many bytes this process may still take, None if unknown."""
-    bound = memory_bound(max_memory)
-    return None if bound is None else max(bound - (held_memory() or 0), 0)
-
-
-class StoredPlanes(SamplePlanes):
-    """The samples of a volume, (nx, ny, nz), that stay in their file until planes are needed.
-
-    Planes of x that share chunks are read together, and the last ones that were read are held.
-    """
-
-    def __init__(self, volume: Volume, placement: Placement, request: Request) -> None:
-        self.volume, self.placement, self.path = volume, placement, request.path
-        self.files = request.files.pop_all()  # closed with this
-        self.shape, self.dtype = placement.of_world(volume.shape), volume.dtype
-        self.name = str(request.path)
-        chunk = placement.of_world(volume.chunks or (1, 1, 1))[0]
-        self.layer = chunk * max(LAYER_BYTES // (chunk * prod(self.shape[1:])), 1)
-        self.held: tuple[int, NDArray[Any]] = (-1, np.empty(0))
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
-        planes = np.empty((max(last - first, 0), *self.shape[1:]), self.dtype)
-        for start in range(first - first % self.layer, last, self.layer):
-            held = self.held
-            if held[0] != start:
-                stop = min(start + self.layer, self.shape[0])
-                self.held = held = start, self.crop((start, 0, 0), (stop, *self.shape[1:]))
-            low, high = max(first, start), min(last, start + len(held[1]))
-            planes[low - first : high - first] = held[1][low - start : high - start]
-        return planes
-
-    def crop(self, low: Index, high: Index) -> NDArray[Any]:
-        """Return the samples in a box, which alone is read."""
-        box = [slice(None)] * 3
-        for world, (start, stop, count) in enumerate(zip(low, high, self.shape)):
-            axis = self.placement.world_axes.index(world)
-            is_back = self.placement.backwards[axis]
-            box[axis] = slice(count - stop, count - start) if is_back else slice(start, stop)
-        with one_line_errors(self.path, find_format(self.path)):
-            return np.asarray(self.placement.ordered(self.volume.read(*box)), self.dtype)
-
-
-@contextmanager
-def one_line_errors(path: Path, format_: GridFormat) -> Iterator[None]:
-    """Turn whatever a library raises into a FileError of one line, and silence it meanwhile."""
     logs = logging.root.manager.disable
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), ExitStack() as files:
             warnings.simplefilter("ignore")
             logging.disable(logging.CRITICAL)  # what matters is raised
-            yield
+            readers = import_module(f".readers.{format_.module}", __package__)
+            request = Request(file, member, axes, files, left, describes)
+            yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
-        if str(split_member(path)[0]) in str(error):
+        if str(file) in str(error):
             raise
         raise type(error)(f"{path}: {error}") from None
     except MemoryError:
@@ -194,24 +138,24 @@ def one_line_errors(path: Path, format_: GridFormat) -> Iterator[None]:
         logging.disable(logs)
 
 
+def memory_left(max_memory: int | None = None) -> int | None:
+    """Return how many bytes this process may still take, None if unknown."""
+    bound = memory_bound(max_memory)
+    return None if bound is None else max(bound - (held_memory() or 0), 0)
+
+
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
     """Return values (nx, ny, nz), spacing, origin and direction of a volume, for ``make_grid``."""
-    name = str(request.path)
     check_kind(volume.dtype, volume.shape)
-    placement = find_placement(volume, name)
+    placement = find_placement(volume)
     place = place_in_world(volume, placement, given)
     size = prod(volume.shape) * volume.dtype.itemsize
     is_large = request.left is not None and size > ROOM_SHARE * request.left
-    values: Any
-    if isinstance(volume.values, np.memmap) and (placement.is_straight or is_large):
-        values = placement.ordered(volume.read())
-    elif is_large and volume.chunks:
-        values = StoredPlanes(volume, placement, request)
-    else:
-        request.check_fits(volume.shape, volume.dtype)
-        dtype = volume.dtype.newbyteorder("=")
-        values = np.ascontiguousarray(placement.ordered(volume.read()), dtype)
-    return {"values": values, **place}
+    if volume.is_mapped and (placement.is_straight or is_large):
+        return {"values": placement.ordered(volume.read()), **place}
+    request.check_fits(volume.shape, volume.dtype)
+    values = placement.ordered(volume.read())
+    return {"values": np.ascontiguousarray(values, values.dtype.newbyteorder("=")), **place}
 
 
 def grid_from_image(
@@ -257,11 +201,10 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     """
     path = check_path(path, "path")
     format_ = find_format(path)
-    order = choose_axes(format_, None)
-    with open_volume(path, format_, order, None, describes=True) as (volume, _):
+    with open_volume(path, choose_axes(format_, None), describes=True) as (volume, _):
         if len(volume.shape) != 3:
             raise FileError(f"its array has shape {volume.shape}: give three axes")
-        placement = find_placement(volume, str(path))
+        placement = find_placement(volume)
         place = place_in_world(volume, placement, {})
     shape = placement.of_world(volume.shape)
     facts: dict[str, Any] = {
@@ -273,7 +216,6 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
         "axes in the file": "".join("xyz"[w] for w in placement.world_axes),
         **{k: at if at is None else np.ravel(at).astype(float).tolist() for k, at in place.items()},
         **({"space": volume.space} if volume.space else {}),
-        **({"chunks": list(volume.chunks)} if volume.chunks else {}),
         **volume.about,
         "notes": list(volume.notes),
     }

@@ -98,7 +98,8 @@ def _write_ply(
     rest = f"\nelement vertex {len(vertices)}\n{of_vertices}element face {len(faces)}\n"
     rest += "property list uchar int vertex_indices\nend_header\n"
     file.write((first.ljust(header_bytes - len(rest)) + rest).encode("ascii"))
-    file.write(_little_endian(vertices))
+    little = vertices.astype(vertices.dtype.newbyteorder("<"), copy=False)
+    file.write(np.ascontiguousarray(little).data)
     rows = np.empty(len(faces), PLY_FACE)
     rows["count"], rows["corners"] = 3, faces
     file.write(rows.data)
@@ -157,11 +158,6 @@ def _lines(line: str, rows: NDArray[Any], first: int = 0) -> Iterator[bytes]:
         if first:  # the last index may exceed 32 bits
             some = some.astype(np.int64) + first
         yield ((line * len(some)) % tuple(some.ravel().tolist())).encode("ascii")
-
-
-def _little_endian(array: NDArray[Any]) -> memoryview:
-    little = array.astype(array.dtype.newbyteorder("<"), copy=False)
-    return np.ascontiguousarray(little).data
 
 
 GLB_MOST_BYTES = 2**32 - 1  # the length in the header has 32 bits

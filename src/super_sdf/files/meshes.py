@@ -1,10 +1,7 @@
 """Mesh files: the table of formats, checks of a target, and what a format can hold.
 
-A target is checked before the work starts, and only complete files appear. A new format is a row of
-``MESH_TABLE``, and its writer.
-
-Neighbouring vertices may be as close as a thousandth of the fine spacing. Far from the world origin
-float32 cannot resolve that and vertices would coincide: degenerate triangles, and a mesh that is no
+A target is checked before the work starts, and only complete files appear. Far from the world
+origin float32 cannot tell neighbouring vertices apart: degenerate triangles, and a mesh that is no
 longer closed when a program reads it. So it is checked whether the numbers of a format can hold a
 mesh.
 """
@@ -20,9 +17,8 @@ import numpy as np
 
 from ..arrays import BoolArray, IntArray, Triple
 from ..errors import FileError, OptionError
-from ..grid.sdf_grid import SdfGrid
-from ..options import Unit, check_path, check_space, check_unit
-from ..surface.mesh import CLEARANCE, Mesh, check_mesh, tells_vertices_apart, vertex_type
+from ..options import OPTIONS, Unit, check_path
+from ..surface.mesh import Mesh, check_mesh
 from . import mesh_writers as writers
 from .mesh_writers import Parts, World
 from .output import check_free, replacing
@@ -113,7 +109,7 @@ def write_mesh(
     """
     check_mesh(mesh)
     path = check_path(path, "path")
-    world = World(check_unit(unit), check_space(space))
+    world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     check_target(path, force=force, unit=world.unit)
 
     def tell(complete: Mapping[Path, Path]) -> None:
@@ -159,10 +155,8 @@ def _check_holds(path: Path, mesh: Mesh, origin: Triple) -> None:
     with np.errstate(over="ignore"):
         rounded = (vertices - origin).astype(np.float32)
     if not np.isfinite(rounded).all() or (_flat(rounded, faces) & ~_flat(vertices, faces)).any():
-        raise FileError(
-            f"{path} cannot be written: {path.suffix} has single precision, in which vertices of "
-            "this mesh coincide; write .ply or .obj"
-        )
+        said = f"{path} cannot be written: {path.suffix} has single precision, in which vertices"
+        raise FileError(f"{said} of this mesh coincide; write .ply or .obj")
 
 
 def _flat(vertices: np.ndarray[Any, Any], faces: IntArray) -> BoolArray:
@@ -179,36 +173,3 @@ def _origin(path: Path, meshes: Iterable[Mesh]) -> Triple:
         return WORLD_ORIGIN
     x, y, z = (np.min(boxes, axis=(0, 1)) / 2 + np.max(boxes, axis=(0, 1)) / 2).tolist()
     return x, y, z
-
-
-def local_origin_note(path: str | Path, meshes: Iterable[Mesh]) -> tuple[str, ...]:
-    """Return a note that names the local origin of a file, none if it is the world origin."""
-    origin = _origin(Path(path), meshes)
-    if origin == WORLD_ORIGIN:
-        return ()
-    point = ", ".join(f"{coordinate:.12g}" for coordinate in origin)
-    return (
-        f"{path} has single precision: its vertices are relative to {point}, "
-        "the translation of its node",
-    )
-
-
-def check_format_holds(path: str | Path, grid: SdfGrid, factor: int) -> None:
-    """Raise FileError if a format cannot hold the mesh of a grid; called before the work starts.
-
-    GridError if not even float64 resolves neighbouring vertices.
-    """
-    kind, suffix = format_of(path), Path(path).suffix.lower()
-    if vertex_type(grid, factor) is np.float32 or not kind.is_single:
-        return
-    reach = grid.reach
-    if kind.has_origin:
-        sides = np.array(grid.spacing) * grid.shape / 2  # from its middle on
-        reach = float((np.abs(grid.direction) @ sides).max())
-        if tells_vertices_apart(np.float32, reach, grid, factor):
-            return
-    apart = CLEARANCE * grid.voxel_size / factor
-    raise FileError(
-        f"{path} cannot hold the mesh: {suffix} has single precision, too coarse at {reach:.6g} "
-        f"for vertices down to {apart:.2g} apart; write .ply or .obj"
-    )

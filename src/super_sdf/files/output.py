@@ -22,7 +22,6 @@ except ImportError:  # Windows, where files that are open cannot be removed
 
 WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 LONGEST = 96  # bytes of a name; file systems allow 255, some 143, and that of a part is longer
-PART = re.compile(r"(?P<stem>\..+\.)\d+\.part", re.DOTALL)
 
 
 def check_free(path: Path, *, force: bool = False) -> Path:
@@ -38,7 +37,6 @@ def check_free(path: Path, *, force: bool = False) -> Path:
         raise WriteError(f"{path} exists: remove it or use --force")
     if mode is not None and not stat.S_ISREG(mode):
         raise WriteError(f"{path} is not a regular file: give another name")
-    _check_not_protected(path, mode)
     folder = _behind_links(path).parent
     if not folder.is_dir():
         raise WriteError(f"{folder} is not a folder: make it first")
@@ -55,17 +53,16 @@ def check_apart(path: str | Path, others: Iterable[str | Path]) -> None:
 
 
 def _mode_of(path: Path) -> int | None:
+    """Return the mode of a file, None if there is none; WriteError if it is write-protected."""
     try:
-        return path.stat().st_mode
+        mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError):
         return None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise _cannot_be_written(path, error) from error
-
-
-def _check_not_protected(path: Path, mode: int | None) -> None:
-    if mode is not None and not (mode & WRITABLE and os.access(path, os.W_OK)):
+    if stat.S_ISREG(mode) and not (mode & WRITABLE and os.access(path, os.W_OK)):
         raise WriteError(f"{path} is write-protected: allow writing to it, or give another name")
+    return mode
 
 
 def _behind_links(path: Path) -> Path:
@@ -96,9 +93,11 @@ def replacing(path: Path, *, force: bool = True) -> Iterator[Path]:
     end stays, which is an error.
     """
     target = _behind_links(path) if force else path
-    part = target.with_name(f"{_stem(target.name)}{os.getpid()}.part")
+    # the last bytes of a long name; a report may hold names that no file can have
+    name = target.name.encode("utf-8", "surrogatepass")[-LONGEST:].decode("utf-8", "ignore")
+    part = target.with_name(f".{name}.{os.getpid()}.part")
     with naming(path):
-        remove_abandoned_parts([target])
+        _remove_abandoned(part)
         try:
             file = os.open(part, os.O_CREAT | os.O_EXCL | os.O_RDWR, 0o666)
         except FileExistsError:
@@ -117,7 +116,6 @@ def _rename(part: Path, target: Path, *, force: bool) -> None:
     """Rename a file; without ``force`` only if the target does not exist."""
     if force:
         mode = _mode_of(target)
-        _check_not_protected(target, mode)
         if mode is not None:
             part.chmod(stat.S_IMODE(mode))
         os.replace(part, target)
@@ -131,36 +129,17 @@ def _rename(part: Path, target: Path, *, force: bool) -> None:
         os.rename(part, target)
 
 
-def _stem(name: str) -> str:
-    """Return how the names of a target's parts begin; a long name is hashed."""
-    raw = name.encode("utf-8", "surrogatepass")  # a report may hold names that no file can have
-    if len(raw) <= LONGEST:
-        return f".{name}."
-    from hashlib import sha256  # loads OpenSSL, and long names are rare
-
-    return f".{sha256(raw).hexdigest()[:32]}."
-
-
-def remove_abandoned_parts(targets: Iterable[Path]) -> None:
-    """Remove unfinished parts of the targets that killed processes left.
-
-    A ``*`` in the name of a target stands for anything.
-    """
-    stems_in: dict[Path, set[str]] = {}
-    for target in targets:
-        pattern = re.escape(_stem(target.name)).replace(r"\*", ".*")
-        stems_in.setdefault(target.parent, set()).add(pattern)
-    for folder, patterns in stems_in.items():
-        is_one = re.compile("|".join(patterns), re.DOTALL).fullmatch
-        with suppress(OSError):
-            for name in os.listdir(folder):
-                match = PART.fullmatch(name)
-                if match and is_one(match["stem"]):
-                    with suppress(OSError):  # another user's, or gone
-                        with (folder / name).open("rb+") as file:
-                            is_free = fcntl is None or _lock(file.fileno())
-                        if is_free:
-                            (folder / name).unlink()
+def _remove_abandoned(part: Path) -> None:
+    """Remove the files like a part, by other processes, that no process holds a lock on."""
+    start = part.name.removesuffix(f"{os.getpid()}.part")
+    is_one = re.compile(re.escape(start) + r"\d+\.part").fullmatch
+    with suppress(OSError):
+        for name in filter(is_one, os.listdir(part.parent)):
+            with suppress(OSError):  # another user's, or gone
+                with (part.parent / name).open("rb+") as file:
+                    is_free = fcntl is None or _lock(file.fileno())
+                if is_free:
+                    (part.parent / name).unlink()
 
 
 def _lock(file: int) -> bool:

@@ -17,15 +17,11 @@ from pathlib import Path, PurePath
 from ..errors import FileError, seen
 from .formats import find_format, split_member
 
-KINDS = {
-    **{stat.S_IFDIR: "folder", stat.S_IFIFO: "named pipe", stat.S_IFSOCK: "socket"},
-    **{stat.S_IFCHR: "device", stat.S_IFBLK: "device"},
-}
+KINDS = {stat.S_IFDIR: "folder", stat.S_IFIFO: "named pipe", stat.S_IFSOCK: "socket"}
+KINDS |= {stat.S_IFCHR: "device", stat.S_IFBLK: "device"}
 REASONS = {
     errno.ENOENT: "does not exist",
     errno.ENOTDIR: "does not exist: the path before its last / is not a folder",
-    errno.ELOOP: "cannot be read: its links lead in a circle",
-    errno.ENAMETOOLONG: "does not exist: the name is longer than the system allows",
     errno.EACCES: "cannot be read: permission denied",
 }
 MARKS = ("zarr.json", ".zarray", ".zgroup")  # one of them makes a folder a Zarr store
@@ -68,9 +64,8 @@ def check_beside(path: Path, name: str) -> Path:
         check_regular_file(other)
         if any(other.resolve().is_relative_to(home.resolve()) for home in homes):
             return other
-    raise FileError(
-        f"{path} names the file {seen(name)}, which is not in its folder: put both into one folder"
-    )
+    said = f"{path} names the file {seen(name)}, which is not in its folder"
+    raise FileError(f"{said}: put both into one folder")
 
 
 def reason_of(error: OSError) -> str:
@@ -86,21 +81,11 @@ def is_store(path: str | Path) -> bool:
 def check_grid_file(path: str | Path) -> None:
     """Raise FileError unless the file that ``FILE`` or ``FILE:NAME`` names can be read."""
     file, _ = split_member(path)
-    key = find_format(path).key
-    if key != "zarr" or file.name.lower().endswith(".zip"):
-        if key != "dicom":
-            check_regular_file(file)
-        return
-    try:
-        names = os.listdir(file)
-    except NotADirectoryError:
-        raise FileError(f"{file} is a file: a Zarr store is a folder") from None
-    except OSError as error:
-        raise FileError(f"{file} {reason_of(error)}") from None
-    mark = next((name for name in MARKS if name in names), None)
-    if mark is None:
-        raise FileError(f"{file} is no Zarr store: it holds none of {', '.join(MARKS)}")
-    check_regular_file(file / mark)
+    if is_store(file):
+        if not any((file / mark).is_file() for mark in MARKS):
+            raise FileError(f"{file} is no Zarr store: it holds none of {', '.join(MARKS)}")
+    elif find_format(path).key != "dicom":
+        check_regular_file(file)
 
 
 def files_of(path: str | Path) -> list[Path]:
@@ -112,8 +97,7 @@ def files_of(path: str | Path) -> list[Path]:
     file, _ = split_member(path)
     if is_store(file):
         return sorted(Path(at, name) for at, _, names in os.walk(file) for name in names)
-    try:
-        # opening a pipe would block
+    try:  # opening a pipe would block
         named = {file.parent / name for name in _names_in(file)} if file.is_file() else set()
         return [file, *sorted(each for each in named - {file} if each.is_file())]
     except (OSError, ValueError):

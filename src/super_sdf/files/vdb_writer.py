@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
-from uuid import UUID
+from uuid import NAMESPACE_OID, uuid5
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +53,6 @@ class LevelSet:
     leaves: list[bytes]  # of the mixed cubes, in C order
     active: int  # voxels
     box: tuple[NDArray[np.int64], NDArray[np.int64]]  # first and last of the active voxels
-    key: bytes  # 16 bytes that other files do not have
 
 
 def write_level_set(field: FineField, path: Path) -> None:
@@ -61,8 +60,6 @@ def write_level_set(field: FineField, path: Path) -> None:
 
     OptionError if OpenVDB does not take voxels of this size; NoSurfaceError.
     """
-    from hashlib import blake2b  # loads OpenSSL, and few fields are written
-
     grid = fine_grid(field)
     if not SIZES[0] <= grid.voxel_size <= SIZES[1]:
         raise OptionError(
@@ -70,7 +67,6 @@ def write_level_set(field: FineField, path: Path) -> None:
             f"{SIZES[1]:g}: multiply distances, spacing and origin of the grid, or write .npz"
         )
     background = np.float32(HALF_WIDTH * grid.voxel_size)
-    digest = blake2b(repr((grid.spacing, grid.origin, grid.direction)).encode(), digest_size=16)
     sides: list[Sides] = []
     leaves: list[bytes] = []
     count, low, high = 0, np.full(3, 1 << 31), np.full(3, -LEAF)
@@ -87,14 +83,11 @@ def write_level_set(field: FineField, path: Path) -> None:
             at = (first[:, axis, None] + np.arange(LEAF))[active.any(across)]
             low[axis], high[axis] = at.min(initial=low[axis]), at.max(initial=high[axis])
         count += int(np.count_nonzero(active))
-        digest.update(inner.astype("<f4").tobytes())
-        flat = inner.reshape(-1, LEAF**3), active.reshape(-1, LEAF**3)
-        leaves += map(leaf_bytes, *flat)
+        leaves += map(leaf_bytes, inner.reshape(-1, LEAF**3), active.reshape(-1, LEAF**3))
         sides.append(side)
     if not count:
         raise NoSurfaceError("the field has no surface: there is no level set to write")
-    box = low, high
-    tree = LevelSet(grid, background, np.stack(sides), leaves, count, box, digest.digest())
+    tree = LevelSet(grid, background, np.stack(sides), leaves, count, (low, high))
     with path.open("wb") as file:
         write_tree(file, tree)
 
@@ -140,7 +133,8 @@ def leaf_bytes(values: FloatArray, active: BoolArray) -> bytes:
 def write_tree(file: IO[bytes], tree: LevelSet) -> None:
     """Write a file with one grid, ``surface``."""
     file.write(struct.pack("<qIII?", MAGIC, VERSION, *LIBRARY, True))
-    file.write(str(UUID(bytes=tree.key)).encode() + struct.pack("<II", 0, 1))
+    own = uuid5(NAMESPACE_OID, f"{tree.grid!r} {tree.active}")  # the file's own number
+    file.write(str(own).encode() + struct.pack("<II", 0, 1))
     file.write(_text("surface") + _text("Tree_float_5_4_3") + _text(""))
     places = file.tell()
     start = places + struct.calcsize("<qqq")
@@ -154,7 +148,7 @@ def write_tree(file: IO[bytes], tree: LevelSet) -> None:
         ("name", "string", b"surface"),
     )
     file.write(struct.pack("<II", ACTIVE_MASK, len(entries)))
-    file.writelines(_text(name) + _text(kind) + _sized(value) for name, kind, value in entries)
+    file.writelines(_text(name) + _text(kind) + _text(value) for name, kind, value in entries)
     file.write(_transform(tree.grid))
     leaves = _write_topology(file, tree)
     values = file.tell()
@@ -197,11 +191,8 @@ def _transform(grid: SdfGrid) -> bytes:
     return _text(name) + numbers.tobytes()
 
 
-def _text(words: str) -> bytes:
-    return _sized(words.encode())
-
-
-def _sized(data: bytes) -> bytes:
+def _text(words: str | bytes) -> bytes:
+    data = words.encode() if isinstance(words, str) else words
     return struct.pack("<I", len(data)) + data
 
 

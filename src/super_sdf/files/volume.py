@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Triple
-from ..errors import FileError, GridError, OptionError, OutOfMemoryError
+from ..errors import FileError, OptionError, OutOfMemoryError
 from ..grid.samples import Direction, as_direction, check_direction
 from ..threads import in_words
 
@@ -42,7 +42,7 @@ class Request:
     describes: bool = False  # no sample will be read: the file is described
 
     def check_fits(self, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
-        """Raise OutOfMemoryError if an array that a library loads whole does not fit."""
+        """Raise OutOfMemoryError if an array that is loaded whole does not fit."""
         need = COPIES * prod(map(int, shape)) * dtype.itemsize
         if self.left is not None and need > self.left:
             raise OutOfMemoryError(
@@ -70,19 +70,6 @@ class Request:
         return names[0]
 
 
-class Later:
-    """An array that a library loads whole, once it is asked for the samples."""
-
-    def __init__(self, shape: Sequence[int], dtype: Any, load: Callable[[], Any]) -> None:
-        self.shape, self.dtype, self.load = tuple(map(int, shape)), np.dtype(dtype), load
-
-    def __getitem__(self, which: Any) -> NDArray[Any]:
-        loaded = np.asarray(self.load())
-        if loaded.shape != self.shape:
-            raise FileError(f"its header promises {self.shape} samples, it holds {loaded.shape}")
-        return np.asarray(loaded[which])
-
-
 @dataclass(frozen=True)
 class Volume:
     """An array of samples in a file, and where they are in the world.
@@ -92,47 +79,34 @@ class Volume:
     their world directions.
     """
 
-    values: Any  # what is indexed like an array of NumPy
+    load: Callable[[], Any]  # returns the samples
+    stored: Sequence[int]  # their shape
+    dtype: np.dtype[Any]
     spacing: Triple | None = None
     origin: Triple | None = None
     direction: NDArray[np.float64] | None = None
-    kept: tuple[int, ...] = (0, 1, 2)  # the axes in space; of others the first entry is taken
-    convert: Callable[[NDArray[Any]], NDArray[Any]] | None = None  # of what is stored to values
-    converted: np.dtype[Any] | None = None  # the type of what it returns
+    kept: tuple[int, ...] = (0, 1, 2)  # the axes in space; others have length 1
+    axes: str | None = None  # order of x, y and z along the array, if the file or user names it
+    space: str | None = None  # "RAS" or "LPS", if the file states one of them
     notes: tuple[str, ...] = ()  # sentences on what the file says, for the user
     about: dict[str, Any] = field(default_factory=dict)  # how it is stored, for ``info``
-    axes: str | None = None  # order of x, y and z along the array, if the file or user names it
     # spacing, origin, direction of x, y, z as the file has them, unchecked, instead of those above
     place: dict[str, Any] = field(default_factory=dict)
-    space: str | None = None  # "RAS" or "LPS", if the file states one of them
+    is_mapped: bool = False  # the samples stay in the file
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of samples along each axis that is kept."""
-        return tuple(int(self.values.shape[axis]) for axis in self.kept)
+        return tuple(int(self.stored[axis]) for axis in self.kept)
 
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """Type of the samples."""
-        return self.converted or np.dtype(self.values.dtype)
-
-    @property
-    def chunks(self) -> tuple[int, ...] | None:
-        """Samples of a chunk along each axis, None if the array is stored in one piece."""
-        chunks = getattr(self.values, "chunks", None)
-        return tuple(int(chunks[axis]) for axis in self.kept) if chunks else None
-
-    def read(self, *parts: slice) -> NDArray[Any]:
-        """Return all samples, or those in a box."""
-        where: list[Any] = [0] * len(self.values.shape)
-        for axis, part in zip(self.kept, parts or [slice(None)] * 3):
-            where[axis] = part
-        samples = self.values[tuple(where)]
-        return self.convert(np.asarray(samples)) if self.convert else samples
-
-    def turned(self, axes: str) -> Volume:
-        """Return it without its direction, for a user who gives that of x, y and z."""
-        return replace(self, direction=axes_direction(self.axes or axes))
+    def read(self) -> NDArray[Any]:
+        """Return the samples along the axes that are kept."""
+        samples: NDArray[Any] = np.asanyarray(self.load())
+        if samples.shape != tuple(self.stored):
+            raise FileError(f"its header promises {self.stored} samples, it holds {samples.shape}")
+        where = [slice(None) if axis in self.kept else 0 for axis in range(samples.ndim)]
+        kept: NDArray[Any] = samples[tuple(where)]
+        return kept
 
     def in_space(self, space: str | None, name: str) -> Volume:
         """Return it in an anatomical space, its own if None; OptionError if it states none."""
@@ -141,12 +115,14 @@ class Volume:
         if self.space is None:
             raise OptionError(f"space is {space}: {name} states neither RAS nor LPS, leave it out")
         turn = np.array([-1.0, -1.0, 1.0])  # between the two
-        return replace(
-            self,
-            origin=None if self.origin is None else triple(turn * self.origin),
-            direction=turn[:, None] * (XYZ if self.direction is None else self.direction),
-            space=space,
-        )
+        origin = None if self.origin is None else triple(turn * self.origin)
+        turned = turn[:, None] * (XYZ if self.direction is None else self.direction)
+        return replace(self, origin=origin, direction=turned, space=space)
+
+
+def of_array(values: Any) -> tuple[Callable[[], Any], tuple[int, ...], np.dtype[Any]]:
+    """Return how a ``Volume`` loads an array that is at hand, its shape and its type."""
+    return lambda: values, tuple(values.shape), np.dtype(values.dtype)
 
 
 class Placement(NamedTuple):
@@ -207,7 +183,7 @@ def axes_direction(axes: str) -> NDArray[np.float64]:
     return XYZ[:, ["xyz".index(name) for name in axes]]
 
 
-def find_placement(volume: Volume, name: str) -> Placement:
+def find_placement(volume: Volume) -> Placement:
     """Return how the axes of an array lie; raise GridError if they are not at right angles."""
     direction = XYZ if volume.direction is None else np.asarray(volume.direction)
     rounded = np.rint(direction)
@@ -216,10 +192,7 @@ def find_placement(volume: Volume, name: str) -> Placement:
     if straight and (along.sum(0) == 1).all() and (along.sum(1) == 1).all():
         backwards = rounded.sum(0) < 0
         return Placement(tuple(map(int, along.argmax(0))), tuple(map(bool, backwards)))
-    try:
-        check_direction(direction)
-    except GridError as error:
-        raise GridError(f"{name}: {error}") from None
+    check_direction(direction)
 
     def nearness(order: tuple[int, ...]) -> float:
         return float(np.abs(direction[order, (0, 1, 2)]).sum())

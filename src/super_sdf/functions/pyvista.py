@@ -19,7 +19,7 @@ from ..errors import FileError, check_modules, how_to_install
 from ..files.grids import grid_from_image
 from ..grid.sdf_grid import SdfGrid
 from ..network.decoder import Decoder
-from ..options import DEFAULT_MESHER, MesherName, Options, Quality, Values
+from ..options import AUTO, MesherName, Options, Quality, Values
 from ..pipeline import reconstruct
 from ..progress import Progress
 
@@ -74,7 +74,7 @@ class ImageAccessor:
         residuals: bool = False,
         offset: float = 0.0,
         cap: bool = True,
-        mesher: MesherName = DEFAULT_MESHER,
+        mesher: MesherName = AUTO,
         max_memory: int | None = None,
         progress: Progress | None = None,
         **values: Unpack[Values],

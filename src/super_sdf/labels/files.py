@@ -1,50 +1,61 @@
-"""Conversion of a label image to the meshes of its labels, in one run: all files, or none."""
+"""Conversion of a label image to the meshes of its labels, in one run: all files, or none.
+
+Names and colours come from the tables that programs write:
+
+3D Slicer, FreeSurfer   1 liver 221 130 101 255
+ITK-SNAP                1 221 130 101 1 1 1 "liver"
+JSON                    {"1": "liver"} or {"liver": 1}; also below "labels", as of nnU-Net
+CSV, TSV                1,liver
+"""
 
 from __future__ import annotations
 
+import csv
+import json
+import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from ..errors import MeshError, OptionError, seen
+from ..errors import FileError, MeshError, OptionError, seen
 from ..files.mesh_writers import World
-from ..files.meshes import (
-    check_format_holds,
-    check_mesh_suffix,
-    check_target,
-    format_of,
-    local_origin_note,
-    write_meshes,
-)
+from ..files.meshes import check_mesh_suffix, check_target, format_of, write_meshes
 from ..files.output import check_apart
-from ..files.regular import files_of
+from ..files.regular import check_regular_file, files_of
 from ..files.volume import PLACE
 from ..grid.sdf_grid import SdfGrid, describe_place, mean_spacing
 from ..network.decoder import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..progress import Progress, Stopwatch
 from ..surface.mesh import Mesh
-from .image import find_image, in_order
-from .names import LabelName, Names, in_file_name, numbers_of
-from .reconstruct import label_meshes
+from .reconstruct import find_image, in_order, label_meshes
 from .volumes import keep_volumes, volume_notes
 
-MOST_FILES = 500
+LONGEST = 80  # characters of a name
+
+
+class LabelName(NamedTuple):
+    """A name, and a colour in red, green and blue from 0 to 255 if the table has one."""
+
+    name: str
+    colour: tuple[int, int, int] | None = None
+
+
+Names = dict[int, LabelName]
 
 
 @dataclass(frozen=True, eq=False)
 class LabelConversion:
     """What a conversion of a label image has made, as ``convert.Conversion`` says it of one mesh.
 
-    A row of ``labels`` has the volume of the mesh beside that of the label's samples, each of which
-    counts as a box; ``missing`` are the listed labels that no sample has.
+    In ``labels``, the volume of a mesh stands beside that of its samples, taken as boxes.
     """
 
     grid: SdfGrid
     labels: list[dict[str, Any]]
-    missing: list[dict[str, Any]]
+    missing: list[dict[str, Any]]  # labels that were asked for, and that no sample has
     notes: tuple[str, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
@@ -57,12 +68,8 @@ class LabelConversion:
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
-        return {
-            **describe_place(self.grid),
-            "labels": self.labels,
-            "missing": self.missing,
-            "inferred": list(self.notes),
-        }
+        made = {"labels": self.labels, "missing": self.missing, "inferred": list(self.notes)}
+        return {**describe_place(self.grid), **made}
 
 
 def convert_labels(
@@ -81,34 +88,31 @@ def convert_labels(
     label has its own file, ``part-1.ply``. ``names`` of ``read_names`` take the place of numbers in
     ``options.labels``, in files and as parts, and parts have their colours. Listed labels that the
     image lacks are left out. The other parameters are those of ``convert``; options besides
-    ``options.LABELS`` must have their defaults.
-
-    Raises
-    ------
-    SuperSdfError
-        As in ``reconstruct_labels`` and ``write_mesh``; OptionError if an option does not go with
-        labels. Nothing is written then.
+    ``options.LABELS`` must have their defaults. Errors are those of ``reconstruct_labels`` and
+    ``write_mesh``, OptionError if an option does not go with labels; nothing is written then.
     """
     watch, options, known = Stopwatch(), options or Options(), names or {}
-    check_options(options)
+    options = with_numbers(replace(options, labels=options.labels or ALL), known)
     check_mesh_suffix(Path(target), options.unit)
-    given, bound = options.reading(), options.max_memory
-    wanted = in_order(numbers_of(options.labels or ALL, known))
-    place = {name: given[name] for name in PLACE}
-    image = find_image(source, wanted, place, options.axes, bound, options.space)
-    grid, called = image.grid, names_of(image.names(), known)
-    ends = {n: in_file_name(called[n].name) if n in known else str(n) for n in called}
-    paths = label_paths(target, list(told_apart(ends, "-").values()))
+    wanted, place = in_order(options.labels), {name: getattr(options, name) for name in PLACE}
+    image = find_image(source, wanted, place, options.axes, options.max_memory, options.space)
+    grid, called = image.grid, names_of(image.labels, known)
+    ends = {n: called[n].name if n in known else str(n) for n in called}
+    ends = {n: re.sub(r"[^\w.-]+", "_", end).strip("._") or "label" for n, end in ends.items()}
+    ends = {n: end.encode()[:LONGEST].decode(errors="ignore") for n, end in ends.items()}
+    path, ends = Path(target), told_apart(ends, "-")
+    paths = [path.with_name(f"{path.stem}-{end}{path.suffix}") for end in ends.values()]
+    if format_of(path).has_scene:
+        paths = [path] * len(called)
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
-    check_format_holds(target, grid, options.factor)
     watch.lap("read")
-    meshes = label_meshes(image, network, options.factor, bound, progress)
-    torn = [label for label, mesh in zip(called, meshes) if mesh.open_edges()]
-    if torn:
-        raise MeshError(f"the mesh of label {torn[0]} is torn: run it again, and report it")
-    volumes, off = image.volumes(), list[str]()
+    meshes = label_meshes(image, network, options.factor, options.max_memory, progress)
+    for label, mesh in zip(called, meshes):
+        if mesh.open_edges():
+            raise MeshError(f"the mesh of label {label} is torn: run it again, and report it")
+    volumes, off = image.volumes, list[str]()
     if options.keep_volume:
         meshes = keep_volumes(meshes, volumes, mean_spacing(grid))
         made = zip(called.values(), meshes, volumes)
@@ -123,17 +127,24 @@ def convert_labels(
         row |= {"volume": mesh.volume(), "components": mesh.components()[0], "closed": True}
         rows.append({**row, "sample_volume": volume})
     colours = {entry.name: entry.colour for entry in called.values() if entry.colour}
-    world = World(options.unit, grid.space, colours)
-    write_meshes(files, force=force, world=world)
+    write_meshes(files, force=force, world=World(options.unit, grid.space, colours))
     watch.lap("write")
-    missing = names_of(image.missing(wanted), known)
-    return LabelConversion(
-        grid,
-        rows,
-        [{"label": label, "name": entry.name} for label, entry in missing.items()],
-        (*grid.notes, *local_origin_note(target, meshes), *off),
-        watch.seconds,
-    )
+    lacking = names_of(image.missing, known)
+    missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
+    return LabelConversion(grid, rows, missing, (*grid.notes, *off), watch.seconds)
+
+
+def check_options(options: Options, more: Sequence[str] = ()) -> None:
+    """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
+    others = {name: value for name, value in vars(options).items() if name not in LABELS}
+    usual = {name: (OPTIONS[name].default, MARCHING) for name in others}
+    given = {name: f" {seen(x)}" for name, x in others.items() if x not in usual[name]}
+    for name in (*given, *more):
+        text = "open" if name == "cap" else name.replace("_", "-") + given.get(name, "")
+        raise OptionError(
+            f"{text} does not go with labels, which share their walls: "
+            "leave it out, or mesh one label (--label)"
+        )
 
 
 def with_numbers(options: Options, names: Names | None) -> Options:
@@ -141,8 +152,15 @@ def with_numbers(options: Options, names: Names | None) -> Options:
     if options.labels is None:
         return options
     check_options(options)
-    labels = in_order(numbers_of(options.labels, names or {}))
-    return replace(options, labels=labels if isinstance(labels, str) else tuple(labels))
+    if isinstance(options.labels, str):
+        return options
+    numbers: dict[Any, int] = {entry.name: number for number, entry in (names or {}).items()}
+    for label in options.labels:
+        if isinstance(label, str) and label not in numbers:
+            some = ", ".join(list(numbers)[:10]) or "none without --names"
+            raise OptionError(f"labels has {label!r}: give numbers, or names of the table ({some})")
+    chosen = in_order([numbers.get(label, label) for label in options.labels])
+    return replace(options, labels=tuple(chosen or ()))
 
 
 def names_of(labels: list[int], known: Names) -> Names:
@@ -154,36 +172,58 @@ def names_of(labels: list[int], known: Names) -> Names:
 
 def told_apart(names: dict[int, str], mark: str) -> dict[int, str]:
     """Return names to which the labels are added until no two are the same in any case."""
-    while True:
-        times = Counter(name.casefold() for name in names.values())
-        alike = {label: name for label, name in names.items() if times[name.casefold()] > 1}
-        if not alike:
-            return names
-        names = {**names, **{label: f"{name}{mark}{label}" for label, name in alike.items()}}
+    times = Counter(name.casefold() for name in names.values())
+    alike = {n: f"{name}{mark}{n}" for n, name in names.items() if times[name.casefold()] > 1}
+    return told_apart({**names, **alike}, mark) if alike else names
 
 
-def label_paths(target: str | Path, labels: Sequence[Any]) -> list[Path]:
-    """Return the file of each label: the target itself, if it can have parts."""
-    path = Path(target)
-    if format_of(path).has_scene:
-        return [path] * len(labels)
-    if len(labels) > MOST_FILES:
-        raise OptionError(
-            f"{path} would be {len(labels):,} files, one for each label: give .glb or .3mf, which "
-            f"hold all as parts, or at most {MOST_FILES} labels (--labels 1,2,3)"
-        )
-    return [path.with_name(f"{path.stem}-{label}{path.suffix}") for label in labels]
+def read_names(path: str | Path) -> Names:
+    """Return the names of labels in a table; FileError if it is none."""
+    path, names = check_regular_file(Path(path)), {}
+    rows = _of_json if path.suffix.lower() == ".json" else _of_lines
+    try:
+        for label, name, parts in rows(path.read_text(encoding="utf-8-sig")):
+            plain = "".join(letter if letter.isprintable() else " " for letter in name)
+            rgb: Any = tuple(int(part) for part in parts if re.fullmatch(r"\d{1,3}", part))
+            colour = rgb if len(rgb) == 3 and max(rgb) <= 255 else None
+            if plain := plain[:LONGEST].strip():
+                names[int(label)] = LabelName(plain, colour)
+    except (OSError, ValueError, csv.Error) as error:
+        raise FileError(f"{path} cannot be read as a table of labels: {error}") from error
+    if not names:
+        raise FileError(f"{path} names no label: give lines such as '1 liver'")
+    return names
 
 
-def check_options(options: Options, more: Sequence[str] = ()) -> None:
-    """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
-    given = {}
-    for name, value in vars(options).items():
-        if name not in LABELS and value not in (OPTIONS[name].default, MARCHING):
-            given[name] = f" {seen(value)}"
-    for name in (*given, *more):
-        text = "open" if name == "cap" else name.replace("_", "-") + given.get(name, "")
-        raise OptionError(
-            f"{text} does not go with labels, which share their walls: "
-            "leave it out, or mesh one label (--label)"
-        )
+def _of_json(text: str) -> Iterator[tuple[Any, str, list[str]]]:
+    """Yield the labels and names of an object that maps numbers to names, or names to numbers."""
+    found = json.loads(text)
+    found = found.get("labels", found) if isinstance(found, dict) else found
+    if not isinstance(found, dict):
+        raise ValueError("it is no object of names")
+    for key, value in found.items():
+        label, name = (key, value) if _is_whole(key) else (value, key)
+        if not _is_whole(label) or not isinstance(name, str):
+            raise ValueError(f"{seen(key)}: {seen(value)} is no label and name")
+        yield label, name, []
+
+
+def _of_lines(text: str) -> Iterator[tuple[Any, str, list[str]]]:
+    """Yield labels, names and colours of lines that begin with a number; others are comments."""
+    for line in text.splitlines():
+        mark = next((mark for mark in "\t,;" if mark in line), " ")
+        (fields,) = csv.reader([line.strip()], delimiter=mark, skipinitialspace=True) or [[]]
+        fields = [field.strip() for field in fields]
+        if mark == " ":
+            fields = [*filter(None, fields[:-1]), *fields[-1:]]
+        if len(fields) < 2 or not _is_whole(fields[0]):
+            continue
+        if len(fields) >= 5 and all(map(_is_whole, fields[1:4])) and not _is_whole(fields[-1]):
+            yield fields[0], fields[-1], fields[1:4]  # ITK-SNAP
+        else:
+            yield fields[0], fields[1], fields[2:5]
+
+
+def _is_whole(value: Any) -> bool:
+    is_number = isinstance(value, int) and not isinstance(value, bool)
+    return is_number or (isinstance(value, str) and bool(re.fullmatch(r"[-+]?\d{1,20}", value)))

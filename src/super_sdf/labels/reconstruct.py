@@ -1,18 +1,13 @@
 """All labels of an image in one run: closed meshes whose shared walls coincide.
 
 Each label is refined as the mask of its samples, in a box round them, and so is what is beside all
-labels, where that meets two of them or more; ``walls`` makes the surfaces of these fields. An image
-whose fields do not fit in memory is worked on in ranges of planes, with as many planes to either
-side as the fields depend on; the walls of all ranges are joined by the names of their vertices.
-
->>> from super_sdf import reconstruct_labels
->>> meshes = reconstruct_labels(image, spacing=(1, 1, 3))         # doctest: +SKIP
+labels, where that meets two of them or more; ``walls`` makes the surfaces of these fields.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from os import PathLike
 from typing import Any
@@ -20,50 +15,43 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
-from ..errors import OutOfMemoryError
+from .. import options
+from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray
+from ..errors import GridError, OptionError, OutOfMemoryError, seen
+from ..files.grids import read_array
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
-from ..grid.interpret import labelled
-from ..grid.sdf_grid import SdfGrid, mean_spacing
+from ..grid.field import NONE_EXACT, Field
+from ..grid.interpret import as_sample, labelled, named
+from ..grid.samples import as_samples, check_kind, check_spacing, is_cubic, placed
+from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.decoder import Adapter, Decoder, adapt
-from ..network.network import network_for
-from ..options import (
-    ALL,
-    MASK,
-    OPTIONS,
-    AxisOrder,
-    check_factor,
-    check_max_memory,
-    check_network,
-    check_progress,
-)
+from ..network.network import load_network, network_for
 from ..pipeline import refine_band
 from ..progress import Progress, StepCounter, part_of
-from ..refine import bounds, spheres
-from ..refine.nodes import SHARING, VoxelIndex, part_of_node
+from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
 from ..refine.survey import survey
+from ..surface.marching import strides
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import check_count, held_memory, in_words, memory_bound, useful_threads
-from .image import LabelImage, find_image, in_order
 from .volumes import keep_volumes
-from .walls import Labelled, Walls, extract_walls, join_walls
+from .walls import Labelled, extract_walls
 
+MOST_LABELS = 1000  # more values than these are densities
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
-BLOCK_PLANES = 32  # read at a time, to count voxels
-# Memory in bytes for each voxel at a wall: once, and for each node of its block.
-VOXEL_BYTES, NODE_BYTES = 1500, 22
+SAMPLE_BYTES = 16  # memory for each sample of the image ...
+VOXEL_BYTES, NODE_BYTES = 1500, 22  # ... for each voxel at a wall, and for each node of its block
 
 
 def reconstruct_labels(
     values: ArrayLike | str | PathLike[str],
-    labels: str | Sequence[int] = ALL,
+    labels: str | Sequence[int] = options.ALL,
     network: Decoder | None = None,
     factor: int = 4,
     *,
     spacing: Any = None,
     origin: Any = None,
     direction: Any = None,
-    axes: AxisOrder | None = None,
+    axes: options.AxisOrder | None = None,
     keep_volume: bool = False,
     max_memory: int | None = None,
     progress: Progress | None = None,
@@ -84,8 +72,7 @@ def reconstruct_labels(
     spacing, origin, direction, axes
         Where the samples lie in the world, as in ``read_grid``; by default as the file says.
     keep_volume : bool
-        Move each surface along its normals until the volume is that of the samples, see
-        ``keep_volumes``.
+        Give each mesh the volume of its samples, see ``keep_volumes``.
 
     Returns
     -------
@@ -99,42 +86,130 @@ def reconstruct_labels(
     OptionError
         If an argument is invalid, or there are too many labels.
     OutOfMemoryError
-        If not even a plane of the image can be worked on in memory.
+        If the image does not fit in memory.
     """
     place = {"spacing": spacing, "origin": origin, "direction": direction}
     wanted = in_order(labels)
     image = find_image(values, wanted, place, axes, max_memory)
-    for label in image.missing(wanted):
+    for label in image.missing:
         labelled(image.grid.samples, label)  # raises
-    if network is None:
-        from ..network.network import load_network
+    chosen = load_network() if network is None else network
+    meshes = label_meshes(image, chosen, factor, max_memory, progress)
+    if options.OPTIONS["keep_volume"].check(keep_volume):
+        meshes = keep_volumes(meshes, image.volumes, mean_spacing(image.grid))
+    return dict(zip(image.labels, meshes))
 
-        network = load_network()
-    meshes = label_meshes(image, network, factor, max_memory, progress)
-    if OPTIONS["keep_volume"].check(keep_volume):
-        meshes = keep_volumes(meshes, image.volumes(), mean_spacing(image.grid))
-    return dict(zip(image.names(), meshes))
+
+@dataclass(frozen=True, eq=False)
+class LabelImage:
+    """Samples with labels, and those of the labels that are to be meshed."""
+
+    grid: SdfGrid  # the labels as its samples, and where they lie
+    labels: list[int]  # (L,), those to mesh, ascending
+    numbers: NDArray[np.int16]  # of each sample: n for the label ``labels[n - 1]``, 0 for others
+    missing: list[int]  # labels that were asked for, and that no sample has
+    volumes: list[float]  # of the samples of each label, taken as boxes
+
+
+def find_image(
+    values: Any,
+    wanted: list[int] | None,
+    place: dict[str, Any],
+    axes: options.AxisOrder | None,
+    max_memory: int | None,
+    space: options.Space | None = None,
+) -> LabelImage:
+    """Return the label image of an array or a file; ``place`` has spacing, origin and direction.
+
+    Of labels ``in_order``, those that no sample has are left out; GridError if none is left.
+    """
+    notes: list[str] = []
+    if isinstance(values, (str, PathLike)):
+        place = read_array(values, place, axes, space, max_memory)
+        values, notes = place["values"], list(place["notes"])
+    elif axes is not None:
+        raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
+    given = placed(values, place["spacing"], place["origin"])
+    samples, origin = as_samples(given.values), given.origin
+    check_kind(samples.dtype, samples.shape)
+    labels, numbers, counts = find_labels(samples, wanted)
+    if given.spacing is None:
+        notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
+    if origin is None:
+        notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    ends = [numbers.take(end, axis).ravel() for axis in range(3) for end in (0, -1)]
+    if cut := [labels[n - 1] for n in np.unique(np.concatenate(ends)).tolist() if n]:
+        said = "solids of labels run out of the grid: closed along the border"
+        notes.append(f"{said} ({named(cut)})")
+    steps = check_spacing(1.0 if given.spacing is None else given.spacing)
+    field = Field(options.MASK, True, NONE_EXACT, on_lattice=not is_cubic(steps))
+    where = (samples, steps, 0.0 if origin is None else origin, tuple(notes))
+    more = {"direction": place["direction"], "extremes": extremes_of_masks(min(steps))}
+    grid = with_fields(SdfGrid.trusted(*where, **more, field=field), space=place.get("space"))
+    missing = [label for label in wanted or () if label not in labels]
+    volumes = [float(np.prod(steps)) * count for count in counts.tolist()]
+    return LabelImage(grid, labels, numbers, missing, volumes)
+
+
+def in_order(labels: Any) -> list[int] | None:
+    """Return labels in ascending order, each once; None for all."""
+    given = options.check_labels(labels)
+    if isinstance(given, str):
+        return None
+    chosen = sorted({options.check_label(label, "labels") for label in given})
+    if not 0 < len(chosen) <= MOST_LABELS:
+        raise OptionError(f"labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
+    return chosen
+
+
+def find_labels(
+    samples: Any, wanted: Sequence[int] | None
+) -> tuple[list[int], NDArray[np.int16], NDArray[np.int64]]:
+    """Return the labels and numbers of a ``LabelImage``, and how many samples each label has."""
+    listed = {as_sample(label, samples.dtype) for label in wanted or ()}
+    found, others = set[Any](), False
+    for nth in range(len(samples)):  # plane by plane, to save memory
+        plane = np.asarray(samples[nth]).ravel()
+        values = np.unique(plane[np.append(True, plane[1:] != plane[:-1])])  # one of each run
+        whole = np.isfinite(values) & (np.rint(values) == values)
+        if values.dtype.kind == "f" and not whole.all():
+            raise GridError(
+                f"a value is {values[~whole][0]:g}: labels are whole numbers; choose what is above "
+                "a value with --level if they are densities"
+            )
+        some = {value for value in values if (value != 0 if wanted is None else value in listed)}
+        found, others = found | some, others or len(some) < len(values)
+        if len(found) > MOST_LABELS:
+            raise GridError(
+                f"the values are more than {MOST_LABELS:,} different whole numbers: choose some of "
+                "them (--labels 1,2,3) if they are labels, or a --level if they are densities"
+            )
+    if wanted and not found:
+        labelled(samples, wanted[0])  # raises
+    if not found or (len(found) == 1 and not others):
+        only = int(next(iter(found), 0))
+        raise GridError(f"every sample has the label {only}: there is no surface")
+    kinds, numbers = np.array(sorted(found), samples.dtype), np.zeros(samples.shape, np.int16)
+    counts = np.zeros(len(kinds) + 1, np.int64)
+    for nth, out in enumerate(numbers):
+        plane = np.asarray(samples[nth])
+        at = np.searchsorted(kinds, plane).clip(max=len(kinds) - 1)
+        out[...] = np.where(kinds[at] == plane, at + 1, 0)
+        counts += np.bincount(out.ravel(), minlength=len(counts))
+    return [int(label) for label in kinds], numbers, counts[1:]
 
 
 def label_meshes(
-    image: LabelImage,
-    network: Decoder,
-    factor: int = 4,
-    max_memory: int | None = None,
-    progress: Progress | None = None,
+    image: LabelImage, network: Decoder, factor: int, bound: int | None, progress: Progress | None
 ) -> list[Mesh]:
-    """Return the meshes of an image's labels, the same for any memory bound."""
-    check_network(network)
-    check_progress(progress)
-    factor, grid, bound = check_factor(factor), image.grid, check_max_memory(max_memory)
-    chosen = adapt(network_for(network, MASK))
+    """Return the meshes of an image's labels; OutOfMemoryError if they do not fit in memory."""
+    options.check_network(network)
+    options.check_progress(progress)
+    factor, grid = options.OPTIONS["factor"].check(factor), image.grid
+    bound = memory_bound(options.OPTIONS["max_memory"].check(bound))
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
-    ranges = plan_ranges(image, factor, chosen.receptive_field, memory_bound(bound))
-    walls: list[Walls] = []
-    for nth, planes in enumerate(ranges):
-        share = part_of(progress, nth / len(ranges), (nth + 1) / len(ranges))
-        walls.append(extract_walls(label_fields(image, planes, chosen, factor, share)))
-    places, faces, sides = join_walls(walls)
+    chosen = adapt(network_for(network, options.MASK))
+    places, faces, sides = extract_walls(label_fields(image, chosen, factor, bound, progress))
     world: NDArray[Any] = grid.to_world(places / factor - 0.5).astype(kind)
     if grid.is_mirrored:
         faces = faces[:, ::-1]
@@ -149,74 +224,64 @@ def label_meshes(
     return meshes
 
 
-def plan_ranges(
-    image: LabelImage, factor: int, receptive_field: int | None, bound: int | None
-) -> list[tuple[int, int]]:
-    """Return the ranges of planes to work on at a time, as few as fit in memory."""
-    count, voxels = image.grid.shape[0], [0]
-    if bound is None:
-        return [(0, count)]
-    for first in range(0, count, BLOCK_PLANES):
-        low, last = max(first - 1, 0), min(first + BLOCK_PLANES, count)
-        marks = at_walls(image.numbers(low, min(last + 1, count)))
-        voxels += marks[first - low : last - low].sum((1, 2)).tolist()
-    before, beside, need = np.cumsum(voxels), reach_of(receptive_field), 0
-    for pieces in (1,) if receptive_field is None else (2**n for n in range(count.bit_length())):
-        inner = np.searchsorted(before, np.arange(1, pieces) / pieces * before[-1])
-        ranges = list(pairwise(sorted({0, *inner.tolist(), count})))
-        seen = [before[min(b + beside, count)] - before[max(a - beside, 0)] for a, b in ranges]
-        need = int(max(seen)) * (VOXEL_BYTES + NODE_BYTES * (factor + 1) ** 3)
-        need += held_memory() or 0
-        if need <= bound:
-            return ranges
-    raise OutOfMemoryError(
-        f"factor {factor} on {before[-1]:,} voxels at the walls of {len(image.labels)} labels "
-        f"needs {in_words(need)} of memory, {in_words(bound)} may be used; use a smaller factor, "
-        "or allow more (--max-memory)"
-    )
-
-
-def reach_of(receptive_field: int | None) -> int:
-    """Return how many planes to either side of a range its walls depend on."""
-    reach = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS + MARGIN + 1
-    return reach + (receptive_field or 0)
-
-
 def label_fields(
-    image: LabelImage,
-    planes: tuple[int, int],
-    network: Adapter,
-    factor: int,
-    progress: Progress | None = None,
+    image: LabelImage, network: Adapter, factor: int, bound: int | None, progress: Progress | None
 ) -> Labelled:
-    """Return the fields of labels in some planes: label by label, what is beside all of them last.
+    """Return the fields of all labels: label by label, what is beside all of them last.
 
     The lowest field holds a node, the lower label in a tie.
     """
-    grid, beside = image.grid, reach_of(network.receptive_field)
-    low, high = max(planes[0] - beside, 0), min(planes[1] + beside, grid.shape[0])
-    numbers, first = image.numbers(low, high), np.array([low, 0, 0], np.int32)
-    voxel_ijk = np.argwhere(at_walls(numbers)).astype(np.int32) + first
-    index = VoxelIndex(voxel_ijk, grid.shape)
-    size = (factor + 1) ** 3, len(voxel_ijk)
-    lowest, holder = np.full(size, np.inf, np.float32), np.zeros(size, np.int16)
-    able = np.zeros(size, np.int8)  # how many labels could hold a node, 2 for more
-    times = np.zeros(len(voxel_ijk), np.int16)  # how many labels meet others in a voxel
+    grid, numbers = image.grid, image.numbers
+    count, nodes = len(image.labels) + 1, (factor + 1) ** 3
+
+    def check_room(voxels: int) -> None:
+        need = SAMPLE_BYTES * numbers.size + voxels * (VOXEL_BYTES + NODE_BYTES * nodes)
+        if bound is not None and need + (held_memory() or 0) > bound:
+            raise OutOfMemoryError(
+                f"{count - 1} labels in {numbers.size:,} samples, {voxels:,} of them at walls, "
+                f"need {in_words(need)} of memory, {in_words(bound)} may be held: choose fewer "
+                "(--labels) or a smaller factor, cut the image, or allow more (--max-memory)"
+            )
+
+    check_room(0)
+    padded, shape = np.pad(numbers, 1), np.array(grid.shape)  # beyond the border there is no label
+    edges = at_walls(padded)
+    near = _over_three(edges, np.logical_or)
+    near[1:-1, 1:-1, 1:-1] = edges[1:-1, 1:-1, 1:-1]
+    places = np.argwhere(near).astype(np.int32)
+    check_room(len(places))
+    own, index, voxel_ijk = padded[tuple(places.T)], VoxelIndex(places, padded.shape), places - 1
+    low, high = np.full((count, 3), shape), np.zeros((count, 3), np.intp)  # the boxes of labels
+    np.minimum.at(low, own, voxel_ijk)
+    np.maximum.at(high, own, voxel_ijk)
+    low[0], high[0] = low[1:].min(0), high[1:].max(0)
+    holder = np.repeat(own[None], nodes, axis=0)
+    lowest, able = np.full(holder.shape, np.inf, np.float32), np.zeros(holder.shape, np.int8)
+    times = np.zeros(len(own), np.int16)  # how many labels meet others in a voxel
     fields: dict[int, tuple[NDArray[np.int64], FloatArray]] = {}
-    for turn, label in enumerate((*range(1, len(image.labels) + 1), 0)):
-        boxes = image.boxes[label - 1 : label] if label else image.boxes
-        start = np.maximum(boxes[:, 0].min(0) - MARGIN, first)
-        stop = np.minimum(boxes[:, 1].max(0) + MARGIN + 1, [high, *grid.shape[1:]])
-        inner = tuple(slice(a, max(a, b)) for a, b in zip(start - first, stop - first))
-        mask = numbers[inner] == label
+    for turn, label in enumerate((*range(1, count), 0)):
+        start = np.maximum(low[label] - MARGIN, 0)
+        mask = numbers[tuple(map(slice, start, high[label] + MARGIN + 1))] == label
         own_ijk = np.argwhere(at_walls(mask)).astype(np.int32)
         if not len(own_ijk):
             continue
-        rows, absent = index.find(own_ijk + start), _absent_parts(mask, own_ijk)
-        count = len(image.labels) + 1
-        share = part_of(progress, turn / count, (turn + 1) / count)
-        only = None if label else times[rows] > 1
-        blocks = _refined(mask, grid, own_ijk, only, network, factor, share)
+        rows, around = index.find(own_ijk + start + 1), _over_three(mask, np.logical_or)
+        around = np.pad(around, 1, constant_values=True)  # beyond the grid it may be
+        none = ~np.stack([around[tuple((own_ijk + 1 + step).T)] for step in NEIGHBOURHOOD])
+        absent = np.array([none[sharing].any(0) for sharing in SHARING])  # (27, n), by part
+        some_ijk = own_ijk if label else own_ijk[times[rows] > 1]
+        steps = StepCounter(
+            part_of(progress, turn / count, (turn + 1) / count), ["network", "nodes"]
+        )
+        blocks = np.full((nodes, len(own_ijk)), np.nan, np.float32)
+        distances, extremes = mask_distances(mask), extremes_of_masks(1.0)
+        lattice = SdfGrid.trusted(distances, 1.0, extremes=extremes, field=grid.field)
+        threads = useful_threads(network.threads)
+        band = survey(lattice, 0.0, threads=threads)
+        wanted = VoxelIndex(some_ijk, lattice.shape).find(band.voxel_ijk) >= 0
+        if (decoded := band.decoded & wanted).any():
+            field = refine_band(replace(band, decoded=decoded), network, factor, threads, steps)
+            blocks[:, VoxelIndex(own_ijk, lattice.shape).find(field.voxel_ijk)] = field.blocks
         times[rows] += 1
         for node, part in enumerate(part_of_node(factor)[0]):  # one by one, to save memory
             value, able_here = blocks[node], able[node, rows]
@@ -226,38 +291,16 @@ def label_fields(
             can = ~absent[part]
             lower = np.flatnonzero(can & (value < lowest[node, rows]))
             lowest[node, rows[lower]], holder[node, rows[lower]] = value[lower], label
-            able[node, rows] = np.minimum(able_here + can, 2)
+            able[node, rows] = np.minimum(able_here + can, 2)  # labels that could hold it; 2: more
         fields[label] = rows, blocks
-    at_border = numbers > 0
-    at_border[1 - min(low, 1) : grid.shape[0] - 1 - low, 1:-1, 1:-1] = False
-    border = np.argwhere(at_border).astype(np.int32) + first
-    border = np.column_stack([border, numbers[at_border]])
-    return Labelled(grid.shape, factor, planes, index, voxel_ijk, holder, border, fields)
-
-
-def _refined(
-    mask: BoolArray,
-    grid: SdfGrid,
-    own_ijk: IntArray,
-    only: BoolArray | None,
-    network: Adapter,
-    factor: int,
-    progress: Progress | None,
-) -> FloatArray:
-    """Return the blocks of voxels of a mask, (Q, n); NaN but for ``only`` some, if given."""
-    extremes, threads = extremes_of_masks(1.0), useful_threads(network.threads)
-    lattice = SdfGrid.trusted(mask_distances(mask), 1.0, extremes=extremes, field=grid.field)
-    band = survey(lattice, 0.0, threads=threads)
-    if only is not None:
-        chosen = VoxelIndex(own_ijk[only], lattice.shape).find(band.voxel_ijk) >= 0
-        band = replace(band, decoded=band.decoded & chosen)
-    blocks = np.full(((factor + 1) ** 3, len(own_ijk)), np.nan, np.float32)
-    if band.decoded.any():
-        steps = StepCounter(progress, ["network", "nodes"])
-        field = refine_band(band, network, factor, threads, steps)
-        at = VoxelIndex(own_ijk, lattice.shape).find(field.voxel_ijk)
-        blocks[:, at[at >= 0]] = field.blocks[:, at >= 0]
-    return blocks
+    outer = np.flatnonzero(((voxel_ijk < 0) | (voxel_ijk >= shape)).any(1))
+    beside = np.clip(voxel_ijk[outer], 0, shape - 1)
+    row = index.find(beside + 1)
+    for nth, step in enumerate(block_ijk(factor)):  # nodes on the border are those of voxels inside
+        node = factor * (voxel_ijk[outer] - beside) + step
+        some = np.flatnonzero(((node >= 0) & (node <= factor)).all(1) & (row >= 0))
+        holder[nth, outer[some]] = holder[node[some] @ strides(factor), row[some]]
+    return Labelled(grid.shape, factor, index, voxel_ijk, holder, fields)
 
 
 def at_walls(values: NDArray[Any]) -> BoolArray:
@@ -274,13 +317,3 @@ def _over_three(values: NDArray[Any], choose: np.ufunc) -> NDArray[Any]:
         choose(chosen[:-1], source[1:], out=chosen[:-1])
         values = np.moveaxis(chosen, 0, axis)
     return values
-
-
-def _absent_parts(mask: BoolArray, voxel_ijk: IntArray) -> BoolArray:
-    """Return which parts of voxels' blocks touch a voxel round which no sample has the label.
-
-    The result is (27, n); beyond the grid no sample is known to be without it.
-    """
-    near = np.pad(_over_three(mask, np.logical_or), 1, constant_values=True)
-    none = ~np.stack([near[tuple((voxel_ijk + 1 + step).T)] for step in NEIGHBOURHOOD])
-    return np.array([none[sharing].any(0) for sharing in SHARING])

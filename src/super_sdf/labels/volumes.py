@@ -1,12 +1,10 @@
 """Meshes whose volumes are those of their samples.
 
-A mask does not say where within a voxel its surface is, and the smooth surface of a convex body is
-a little smaller than its samples, each taken as a box. So each label's surface moves by one
-distance along its normals, the same all over. A wall moves by the difference of its two labels.
+The smooth surface of a convex body is a little smaller than its samples, each taken as a box. So
+each label's surface moves by one distance along its normals; a wall by the difference of two.
 
-Places move by a continuous function of space, which changes by less than the distance between two
-places: so triangles that did not intersect do not intersect afterwards, and shared walls stay
-shared. It is the mean of the normals near each node of a lattice, and linear between nodes.
+Points move by a continuous function of space, the mean of the normals near each node of a lattice
+and linear between nodes: so shared walls stay shared, and no triangles come to intersect.
 """
 
 from __future__ import annotations
@@ -33,15 +31,15 @@ Rows = NDArray[np.intp]
 
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
-    kind, said = grid.field.kind, ""
     if offset:
-        said = f" is for the surface of the samples, offset is {offset:g}: give one only"
-    elif kind != MASK:
-        said = f" is for masks and labels, the values are {kind}: leave it out"
-    elif not cap:
-        said = " needs a closed mesh: leave out --open"
-    if said:
-        raise OptionError(f"keep-volume{said}")
+        said = f"is for the surface of the samples, offset is {offset:g}: give one only"
+    elif grid.field.kind != MASK:
+        said = f"is for masks and labels, the values are {grid.field.kind}: leave it out"
+    elif cap:
+        return
+    else:
+        said = "needs a closed mesh: leave out --open"
+    raise OptionError(f"keep-volume {said}")
 
 
 def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -57,14 +55,12 @@ def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: floa
     Meshes have the same vertices where they touch; triangles stay as they are. No surface moves by
     more than an eighth of the ``spacing``, so the volume of a speck may stay another one.
     """
-    kind = meshes[0].vertices.dtype
     vertices = np.concatenate([mesh.vertices for mesh in meshes]) + 0  # -0 is 0
     bits = np.ascontiguousarray(vertices).view(f"V{3 * vertices.itemsize}").ravel()
     _, first, place = np.unique(bits, return_index=True, return_inverse=True)
     rows = np.split(place, np.cumsum([len(mesh.vertices) for mesh in meshes])[:-1])
-    places = vertices[first].astype(np.float64)  # (n, 3), each vertex once
-    middle = places.mean(0)
-    start = points = places - middle
+    middle = vertices.mean(0, dtype=np.float64)
+    start = points = vertices[first] - middle  # (n, 3), each vertex once
     normals = _mean_normals(start / (CELL * spacing), meshes, rows)
     distances = np.zeros(len(meshes))
     for _ in range(ROUNDS):
@@ -83,9 +79,8 @@ def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: floa
         points = start.copy()
         for distance, (some, vectors) in zip(distances, normals):
             points[some] += distance * vectors
-    return [
-        Mesh((middle + points[own]).astype(kind), mesh.faces) for own, mesh in zip(rows, meshes)
-    ]
+    points = (middle + points).astype(meshes[0].vertices.dtype)
+    return [Mesh(points[own], mesh.faces) for own, mesh in zip(rows, meshes)]
 
 
 def _slopes(points: Vectors, faces: NDArray[Any]) -> Vectors:

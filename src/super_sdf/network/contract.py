@@ -13,8 +13,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..errors import ModelError
-from .onnx import ort
+import numpy as np
+
+from ..errors import ModelError, seen
 
 FORMAT_VERSION = 1
 EXACT_DISTANCES, MASKS = "exact distances", "masks"
@@ -25,17 +26,18 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT = {"values": "tensor(float)"}
-# The whole numbers of a card: name, unit and largest value. A receptive field is to each side; the
-# card of a network that sees the whole grid leaves it out. The width decides how much memory a run
-# takes.
-WHOLE = {
-    "receptive_field": ("receptive field", "voxels", 1000),
-    "channels": ("width", "channels", 10_000),
+# Whole numbers of a card with unit and largest value. A receptive field is to each side; a network
+# that sees farther, up to the whole grid, states none. The width decides the memory of a run.
+WHOLE = {"receptive_field": ("voxels", 1000), "channels": ("channels of width", 10_000)}
+TRIAL: dict[str, Any] = {  # one voxel, and two offsets to notice an output with its axes swapped
+    "patches": np.zeros((1, 27), np.float32),
+    "neighbours": np.full((1, 27), -1, np.int32),
+    "voxels": np.zeros(1, np.int32),
+    "offsets": np.zeros((2, 3), np.float32),
 }
-MAX_SHOWN = 60  # characters of metadata in messages
 
 
-def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
+def read_card(session: Any, path: Path) -> dict[str, Any]:
     """Return the metadata of a file; ModelError if it does not fulfil the contract."""
     try:
         inputs = {given.name: given.type for given in session.get_inputs()}
@@ -43,41 +45,24 @@ def read_card(session: ort.InferenceSession, path: Path) -> dict[str, Any]:
         metadata = session.get_modelmeta().custom_metadata_map
     except UnicodeDecodeError as error:
         raise ModelError(f"{path} is damaged: it has names that are not UTF-8 text") from error
-    version = metadata.get("format_version", "none")
-    if inputs != INPUTS or outputs != OUTPUT or version != str(FORMAT_VERSION):
-        given, made = (
-            _shorten(", ".join(f"{name} {kind}" for name, kind in values.items()))
-            for values in (inputs, outputs)
-        )
+    version, again = metadata.get("format_version"), "export it again with export/to_onnx.py"
+    if (inputs, outputs, version) != (INPUTS, OUTPUT, str(FORMAT_VERSION)):
         raise ModelError(
-            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {_shorten(version)}"
-            f", inputs {given}, outputs {made}); export one with export/to_onnx.py"
+            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {seen(version)}, "
+            f"inputs {seen(inputs)}, outputs {seen(outputs)}): {again}"
         )
-    card = {key: _parse(key, text, path) for key, text in metadata.items()}
-    for key, (name, unit, most) in WHOLE.items():
+    card: dict[str, Any] = {}
+    for key, text in metadata.items():
+        try:
+            card[key] = json.loads(text)
+        except json.JSONDecodeError:
+            card[key] = text
+        except (ValueError, RecursionError) as error:  # thousands of digits; nested too deep
+            said = f"its metadata {seen(key)} cannot be read, {seen(text)}"
+            raise ModelError(f"{path}: {said}; {again}") from error
+    for key, (unit, most) in WHOLE.items():
         value = card.get(key, 1)
         if type(value) is not int or not 1 <= value <= most:  # True is an int, too
-            raise ModelError(
-                f"{path}: its {name} is {_shorten(repr(value))}; it must be a whole number of "
-                f"{unit} from 1 to {most}: export it again with export/to_onnx.py"
-            )
+            must = f"it must be a whole number of {unit} from 1 to {most}"
+            raise ModelError(f"{path}: its {key} is {seen(value)}; {must}: {again}")
     return card
-
-
-def _shorten(text: str) -> str:
-    """Return text from a file as part of one line, cut to ``MAX_SHOWN`` characters."""
-    line = " ".join(text.split())
-    return line if len(line) <= MAX_SHOWN else f"{line[:MAX_SHOWN]}..."
-
-
-def _parse(key: str, text: str, path: Path) -> Any:
-    """Return a metadata value parsed as JSON, or as text if it is not JSON."""
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        return text
-    except (ValueError, RecursionError) as error:  # thousands of digits; nested too deep
-        raise ModelError(
-            f"{path}: its metadata {_shorten(key)!r} cannot be read, {_shorten(text)!r}; export it "
-            "again with export/to_onnx.py"
-        ) from error

@@ -54,7 +54,7 @@ def predict(
     count = len(plane)
     parts = -(-count // AT_ONCE)
     if parts == 1 or network.receptive_field is None:
-        return decode(network, (band.patches, table, voxels), offsets, progress, threads)
+        return decode(network, (band.patches, table, voxels), offsets, threads)
     blocks = np.zeros((len(offsets), len(voxels) + 1), np.float32)
     ends = [-1, *plane[np.arange(1, parts) * count // parts].tolist(), band.shape[0]]
     for first, last in pairwise(sorted(set(ends))):  # the planes after the first, to the last
@@ -66,7 +66,7 @@ def predict(
         near = table[start:stop] - np.int32(start)
         near[(near < 0) | (near >= stop - start)] = -1
         inputs = band.patches[start:stop], near, voxels[own] - np.int32(start)
-        blocks[:, own] = decode(network, inputs, offsets, None, threads)[:, :-1]
+        blocks[:, own] = decode(network, inputs, offsets, threads)[:, :-1]
         if progress:
             progress(last / band.shape[0])
     return blocks

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..errors import OutOfMemoryError, check_modules
-from ..options import check_goal, check_max_memory
+from ..options import OPTIONS, check_goal
 from ..progress import ShareCallback
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import give_back, held_memory, in_words, memory_bound
@@ -99,7 +99,7 @@ def simplify_mesh(
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
-    bound, count = memory_bound(check_max_memory(max_memory)), len(mesh.faces)
+    bound, count = memory_bound(OPTIONS["max_memory"].check(max_memory)), len(mesh.faces)
     need = count * BYTES_PER_TRIANGLE + (held_memory() or 0)
     if bound is not None and need > bound:
         raise OutOfMemoryError(

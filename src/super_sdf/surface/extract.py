@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..arrays import IntArray, Vectors
 from ..grid.sdf_grid import SdfGrid
-from ..options import AUTO, MARCHING, SHARP, MesherName, check_mesher
+from ..options import AUTO, MARCHING, OPTIONS, SHARP, MesherName
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk
 from ..threads import check_count, map_chunks
@@ -28,7 +28,7 @@ def choose_mesher(name: Any, *, exact: bool) -> MesherName:
     Without such samples it finds no edges, and its mesh is that of marching cubes.
     """
     automatic: MesherName = SHARP if exact else MARCHING
-    chosen = check_mesher(name)
+    chosen = OPTIONS["mesher"].check(name)
     return automatic if chosen == AUTO else chosen
 
 

@@ -1,30 +1,20 @@
-"""What files say of the axes of an array: names, units, steps and starts; its place and scale.
+"""What files say of the axes of an array, and what is made of it: its place, and its values.
 
-Arrays in HDF5, Zarr, NetCDF, MATLAB and TIFF share this, and the guard for parts that are not
-stored.
+Arrays in HDF5, Zarr, NetCDF, MATLAB and TIFF share this.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
 from ...grid.samples import UNNAMED, even_steps
 from ..volume import axes_direction, kept_axes, triple
 
 SPACE = "xyz"
-PREFIXES = {"k": 1e3, "": 1.0, "d": 1e-1, "c": 1e-2, "m": 1e-3, "u": 1e-6, "n": 1e-9, "p": 1e-12}
-WORDS = ("kilo", "", "deci", "centi", "milli", "micro", "nano", "pico")  # in the same order
-METRES = {f"{prefix}m": factor for prefix, factor in PREFIXES.items()} | {
-    **{f"{word}m": factor for word, factor in zip(WORDS, PREFIXES.values())},
-    **{"inch": 0.0254, "in": 0.0254, '"': 0.0254, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048},
-    **{"angstrom": 1e-10, "å": 1e-10, "mil": 2.54e-5, "thou": 2.54e-5},
-}
 
 
 class Axis(NamedTuple):
@@ -37,32 +27,14 @@ class Axis(NamedTuple):
     alias: str = ""  # another name, by an attribute of its coordinates
 
 
-def in_metres(unit: str) -> float | None:
-    """Return how many metres a unit is; None if it is no unit of length that is known here."""
-    plain = re.sub("[\u00b5\u03bc]", "u", unit.strip())  # both letters are in use for micro
-    if plain in METRES:
-        return METRES[plain]
-    word = re.sub(r"(?<=.)(?<!inche)s$|(?<=inch)es$", "", plain.lower())
-    word = re.sub("met(er|re)$", "m", {"micron": "um"}.get(word, word))
-    return METRES.get(word)
-
-
-def in_one_unit(units: Sequence[str]) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:
-    """Return factors from the units of x, y and z to the first, None if unknown, and a note.
-
-    An axis without a unit has that of the others.
-    """
+def one_unit(units: Sequence[str]) -> tuple[bool, tuple[str, ...]]:
+    """Return whether x, y and z have the same unit of length, or none; and a note that names it."""
     stated = list(dict.fromkeys(filter(None, units)))
     if len(stated) <= 1:
-        return np.ones(3), tuple(f"lengths are in the unit of its axes, {u}" for u in stated)
+        return True, tuple(f"lengths are in the unit of its axes, {unit}" for unit in stated)
     listed = ", ".join(f"{name} {unit}" for name, unit in zip(SPACE, units) if unit)
-    note = f"its axes have different units ({listed}): "
-    metres = [in_metres(unit or stated[0]) for unit in units]
-    if None in metres:
-        asked = "spacing and origin are not taken from its metadata (give --spacing)"
-        return None, (note + asked,)
-    factors = np.array(metres, np.float64) / (in_metres(stated[0]) or 1)
-    return factors, (f"{note}lengths are in {stated[0]}",)
+    said = f"its axes have different units ({listed}): spacing and origin are not taken from it"
+    return False, (f"{said} (give --spacing)",)
 
 
 def measured(name: str, places: Any, about: dict[str, Any]) -> Axis:
@@ -91,41 +63,35 @@ def placed(
     aliases = [(axis.alias or name).strip().lower() for axis, name in zip(axes, names)]
     names = aliases if _are_space(aliases) and not _are_space(names) else names
     kept = _kept(names, shape)
-    named = [names[axis] for axis in kept]
-    is_named = order == "zyx" and _are_space(names)
-    order = "".join(named) if is_named else order
-    notes: tuple[str, ...] = ()
-    world = [axes[kept[order.index(name)]] for name in SPACE]
-    factors, told = in_one_unit([axis.unit for axis in world])
-    notes += told
-    if any(named) and not _are_space(names):
+    named, notes = [names[axis] for axis in kept], []
+    if order == "zyx" and _are_space(names):
+        order = "".join(named)
+    elif any(named) and not _are_space(names):
         listed = ", ".join(name or "?" for name in named)
-        notes += (f"its axes are named {listed}: taken as {', '.join(order)}",)
+        notes = [f"its axes are named {listed}: taken as {', '.join(order)}"]
+    world = [axes[kept[order.index(name)]] for name in SPACE]
+    is_one, told = one_unit([axis.unit for axis in world])
     missing = [name for name, axis in zip(SPACE, world) if not axis.step]
     if 0 < len(missing) < 3:
         lacking = " and ".join(missing)
-        notes += (
-            f"it states no spacing along {lacking}: none is taken from it (give --spacing)",
-        )
-    direction = axes_direction(order).copy()
-    direction *= [-1 if (axes[axis].step or 0) < 0 else 1 for axis in kept]
+        told += (f"it states no spacing along {lacking}: none is taken from it (give --spacing)",)
     steps = starts = None
-    if factors is not None and not missing:
-        steps = [abs(axis.step or 0) * factor for axis, factor in zip(world, factors)]
+    if is_one and not missing:
+        steps = [abs(axis.step or 0) for axis in world]
         if None not in [axis.start for axis in world]:
-            starts = triple((axis.start or 0) * factor for axis, factor in zip(world, factors))
+            starts = triple(axis.start for axis in world)
     steps = _stated(attributes, "spacing", steps)
     spacing = None if steps is None else triple(steps[SPACE.index(name)] for name in order)
-    spacing = _stated(attributes, "element_size_um", spacing)
+    direction = axes_direction(order) * [-1 if (axes[n].step or 0) < 0 else 1 for n in kept]
     if "direction" in attributes:
         said = np.asarray(attributes["direction"])
         if said.size != 9 or said.dtype.kind not in "fiu":
             raise FileError(f"its attribute direction is {said.tolist()!r}: give nine numbers")
         direction = said.reshape(3, 3) @ direction
-    origin = _stated(attributes, "origin", starts)
     return {
-        **{"spacing": spacing, "origin": origin, "direction": direction},
-        **{"kept": kept, "notes": notes, "axes": order},
+        "spacing": _stated(attributes, "element_size_um", spacing),
+        "origin": _stated(attributes, "origin", starts),
+        **{"direction": direction, "kept": kept, "axes": order, "notes": (*notes, *told)},
     }
 
 
@@ -156,48 +122,39 @@ def _stated(attributes: dict[str, Any], name: str, default: Any) -> Any:
     try:
         return triple(np.broadcast_to(np.asarray(attributes[name], np.float64).ravel(), 3))
     except (TypeError, ValueError):
-        raise FileError(
-            f"its attribute {name} is {attributes[name]!r}: give one number or three"
-        ) from None
+        said = f"its attribute {name} is {attributes[name]!r}"
+        raise FileError(f"{said}: give one number or three") from None
 
 
-def values_of(
-    dtype: np.dtype[Any],
-    attributes: dict[str, Any],
-    missing: Any = None,
-    absent: int = 0,
-    total: int = 0,
-    fill: Any = None,
-) -> dict[str, Any]:
-    """Return what a ``Volume`` says of values that are stored as other numbers, or not at all.
+def stored(
+    values: Any, attributes: dict[str, Any], none: Any = None, absent: int = 0, fill: Any = None
+) -> tuple[Callable[[], Any], tuple[int, ...], np.dtype[Any]]:
+    """Return how a ``Volume`` loads an array of a file, its shape, and the type of the values.
 
     By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
-    plus ``add_offset``; ``missing``, or ``_FillValue``, is no value.
-
-    A file leaves out parts (chunks, strips) that hold nothing but its ``fill`` value: ``absent`` of
-    ``total``. In masks and densities 0 is the background, but of signed distances it is the
-    surface: those are refused. Any other fill value is as good as a stored one.
+    plus ``add_offset``; ``none``, or ``_FillValue``, is no value. Chunks that are not stored,
+    ``absent`` in number, read as ``fill``: 0 is the background of masks and densities, but the
+    surface of signed distances, which are refused.
     """
-    gaps = GridError(
-        f"{absent:,} of its {total:,} chunks are not stored and read as 0, which is the surface: "
-        "write them all, or give the array a fill value other than 0 (NaN for unknown)"
-    )
-    if absent and fill is None:
-        raise gaps
+    dtype = np.dtype(values.dtype)
     is_packed = "scale_factor" in attributes or "add_offset" in attributes
     is_packed |= dtype.kind == "f" and "_FillValue" in attributes
     factor = float(np.ravel(attributes.get("scale_factor", 1))[0])
     offset = float(np.ravel(attributes.get("add_offset", 0))[0])
-    none = np.ravel(attributes.get("_FillValue", missing))
+    missing = np.ravel(attributes.get("_FillValue", none))
     kind = np.result_type(dtype, np.float32) if is_packed else dtype
 
-    def convert(stored: NDArray[Any]) -> NDArray[Any]:
-        if absent and fill == 0 and dtype.kind in "fi" and (stored < 0).any():
-            raise gaps
+    def load() -> Any:
+        numbers = np.asarray(values[...])
+        if absent and not fill and dtype.kind in "fi" and (numbers < 0).any():
+            raise GridError(
+                f"{absent:,} of its chunks are not stored and read as 0, which is the surface: "
+                "write them all, or give the array a fill value other than 0 (NaN for unknown)"
+            )
         if not is_packed:
-            return stored
-        values: NDArray[Any] = (stored * factor + offset).astype(kind)
-        values[np.isin(stored, none)] = np.nan
-        return values
+            return numbers
+        unpacked = (numbers * factor + offset).astype(kind)
+        unpacked[np.isin(numbers, missing)] = np.nan
+        return unpacked
 
-    return {"convert": convert, "converted": kind}
+    return load, tuple(values.shape), kind

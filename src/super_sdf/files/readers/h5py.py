@@ -6,17 +6,13 @@ Axes are (z, y, x) unless dimension labels, scales, ``axistags`` or ``--axes`` s
 from __future__ import annotations
 
 import json
-import os
 from math import prod
 from typing import Any
 
-import numpy as np
-
 from ...errors import FileError
 from ...options import LPS
-from ..regular import check_beside
-from ..volume import PLACE, Request, Volume, triple
-from .axes import Axis, measured, placed, values_of
+from ..volume import Request, Volume, triple
+from .axes import Axis, measured, placed, stored
 
 NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -42,29 +38,9 @@ def read_hdf5(request: Request) -> Volume:
             "direction": image["Directions"][:].T[:, ::-1],
             "space": LPS,
         }
-        return _volume_of(request, image["VoxelData"], place)
+        return volume_of(image["VoxelData"], place)
     values = file[request.choose(names, "3D dataset")]
-    axes = _axes(values)
-    place = placed(axes, dict(values.attrs), values.shape, request.axes)
-    return _volume_of(request, values, place)
-
-
-def read_mat_73(request: Request, numbers: tuple[str, ...], place: Any) -> Volume:
-    """Read a MATLAB file of version 7.3: the axes of its datasets are in reverse order."""
-    import h5py
-
-    file = request.files.enter_context(h5py.File(request.path, "r"))
-    kinds = [each.encode() for each in numbers]
-    names = [
-        name
-        for name, entry in file.items()
-        if isinstance(entry, h5py.Dataset)
-        and len(entry.shape or ()) == 3
-        and entry.attrs.get("MATLAB_class", b"") in kinds
-    ]
-    values = file[request.choose(names, "array of three axes")]
-    stated = {key: np.transpose(file[key][()]) for key in PLACE if key in file}
-    return _volume_of(request, values, place(stated, values.shape))
+    return volume_of(values, placed(_axes(values), dict(values.attrs), values.shape, request.axes))
 
 
 def may_be_grid(shape: tuple[int, ...] | None) -> bool:
@@ -87,35 +63,26 @@ def _axes(values: Any) -> list[Axis]:
         places, about = None, {}
         if scale is not None and scale.shape == (count,):
             about = dict(scale.attrs)
-            if scale.is_virtual or scale.external:
-                raise FileError(f"its coordinates {scale.name} are in another file: store them")
+            check_own(scale)
             if NO_COORDINATES not in bytes(about.get("NAME", b"")):
                 places = scale[:]
         axes.append(measured(name, places, about))
     return axes
 
 
-def _volume_of(request: Request, values: Any, place: dict[str, Any]) -> Volume:
-    """Return a dataset whose raw data may be in files beside its own; FileError if elsewhere."""
-    import h5py
+def check_own(values: Any) -> None:
+    """Raise FileError if the numbers of a dataset are in other files, which may be any."""
+    if values.is_virtual or values.external:
+        raise FileError(f"the numbers of {values.name} are in other files: save them in this one")
 
-    if values.is_virtual:
-        raise FileError(
-            f"{request.path}:{values.name} is a virtual dataset, put together of others: save its "
-            "values as a dataset of their own"
-        )
-    absent = total = 0
+
+def volume_of(values: Any, place: dict[str, Any]) -> Volume:
+    """Return a dataset at its place."""
+    check_own(values)
+    absent, about = 0, {}
     if values.chunks:
+        about = {"chunks": list(values.chunks)}
         total = prod(-(-size // chunk) for size, chunk in zip(values.shape, values.chunks))
         absent = total - values.id.get_num_chunks()
-    about = dict(values.attrs)
-    said = values_of(values.dtype, about, None, absent, total, values.fillvalue)
-    for raw, _, _ in values.external or ():
-        check_beside(request.path, raw)
-    if values.external:  # HDF5 takes their names from the current folder, unless told otherwise
-        access = h5py.h5p.create(h5py.h5p.DATASET_ACCESS)
-        access.set_efile_prefix(os.fsencode(request.path.absolute().parent))
-        file, name = values.file.id, values.name.encode()
-        values.id.close()
-        values = h5py.Dataset(h5py.h5d.open(file, name, access))
-    return Volume(values, **place, **said)
+    numbers = stored(values, dict(values.attrs), absent=absent, fill=values.fillvalue)
+    return Volume(*numbers, **place, about=about)

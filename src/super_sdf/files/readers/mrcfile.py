@@ -9,10 +9,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ..volume import XYZ, Later, Request, Volume, in_words_of, triple
+from ..volume import XYZ, Request, Volume, triple
 
 VOLUME_STACKS = 401  # space groups from here on are of stacks of volumes
 RIGHT = 0.01  # degrees
@@ -30,51 +29,39 @@ def read_mrc(request: Request) -> Volume:
     with mrcfile.open(request.path, permissive=True, header_only=True) as opened:
         header = opened.header
     sizes = tuple(int(header[f"n{axis}"]) for axis in "zyx")
-    dtype = data_dtype_from_header(header)
-    if min(sizes) < 1:
-        raise FileError(f"its sizes are {sizes[::-1]}")
-    if header.ispg >= VOLUME_STACKS and header.mz != header.nz:
-        raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
     order = [int(header[name]) - 1 for name in ("maps", "mapr", "mapc")]
     order = [2, 1, 0] if order == [-1] * 3 else order
-    if sorted(order) != [0, 1, 2]:
-        raise FileError(f"its axes mapc, mapr, maps are {[axis + 1 for axis in order[::-1]]}")
-    angles = _numbers(header.cellb, ("alpha", "beta", "gamma"))
+    cell, angles, stated = (
+        np.array(header[name].tolist(), np.float64) for name in ("cella", "cellb", "origin")
+    )
+    is_sound = np.isfinite([cell, angles, stated]).all() and min(sizes) > 0
+    if not is_sound or sorted(order) != [0, 1, 2]:
+        raise FileError("its header is damaged: its sizes, axes, cell or origin cannot be")
+    if header.ispg >= VOLUME_STACKS and header.mz != header.nz:
+        raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
     if angles.any() and np.abs(angles - 90).max() > RIGHT:
-        raise GridError(
-            f"the angles of its unit cell are {_listed(angles)} degrees, not "
-            "90: resample it on a grid with right angles"
-        )
+        said = f"the angles of its unit cell are {_listed(angles)} degrees, not 90"
+        raise GridError(f"{said}: resample it on a grid with right angles")
     counts = np.array([int(header[name]) for name in ("mx", "my", "mz")])
-    cell = _numbers(header.cella, "xyz")
     steps, starts = cell / np.maximum(counts, 1), np.zeros(3)
     is_stated = bool((cell > 0).all() and (counts > 0).all())
     starts[order] = [int(header[f"n{axis}start"]) for axis in "zyx"]
-    stated, in_cell = _numbers(header.origin, "xyz"), starts * steps
-    notes: tuple[str, ...] = ()
+    in_cell, notes = starts * steps, tuple[str, ...]()
     if stated.any() and in_cell.any() and not np.allclose(stated, in_cell, atol=steps.max() / 100):
-        notes = (
-            f"its origin is {_listed(stated)} and its nstart means {_listed(in_cell)}: the origin "
-            "is taken",
-        )
+        both = f"its origin is {_listed(stated)} and its nstart means {_listed(in_cell)}"
+        notes = (f"{both}: the origin is taken",)
 
     def load() -> Any:
         with mrcfile.open(request.path, permissive=True) as opened:
             if opened.data is None:
-                raise FileError(f"it is truncated: {in_words_of(sizes, dtype)} are promised")
+                raise FileError("it is truncated")
             return opened.data
 
     spacing = triple(steps[order]) if is_stated else None
     origin = triple(stated if stated.any() else in_cell)
-    return Volume(Later(sizes, dtype, load), spacing, origin, XYZ[:, order], notes=notes)
+    dtype = data_dtype_from_header(header)
+    return Volume(load, sizes, dtype, spacing, origin, XYZ[:, order], notes=notes)
 
 
-def _numbers(fields: Any, names: Any) -> NDArray[np.float64]:
-    numbers = np.array([fields[name] for name in names], np.float64)
-    if not np.isfinite(numbers).all():
-        raise FileError(f"its header is damaged: {', '.join(names)} are {numbers.tolist()}")
-    return numbers
-
-
-def _listed(numbers: NDArray[np.float64]) -> str:
+def _listed(numbers: Any) -> str:
     return ", ".join(f"{number:g}" for number in numbers)

@@ -6,6 +6,7 @@ NIfTI states all.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import product
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from ...errors import GridError
 from ...options import RAS
 from ..regular import check_beside
-from ..volume import XYZ, Later, Request, Volume, from_affine, triple
+from ..volume import XYZ, Request, Volume, from_affine, triple
 
 PAIRS = (".img", ".IMG", ".img.gz")
 UNITS = {1: "metre", 3: "micrometre"}  # of lengths, but for millimetres
@@ -42,9 +43,9 @@ def read_nifti(request: Request) -> Volume:
             "it states no place (sform_code and qform_code are 0): its axes are taken as x, y and "
             "z, as ITK does; nibabel would mirror x",
         )
-        return Volume(image, triple(np.abs(header.get_zooms()[:3])), None, XYZ, notes=notes)
+        return Volume(*image, triple(np.abs(header.get_zooms()[:3])), None, XYZ, notes=notes)
     if min(codes) > 0:
-        corners = np.array(list(product(*((0, size - 1) for size in image.shape), [1])))
+        corners = np.array(list(product(*((0, size - 1) for size in image[1]), [1])))
         off = 0.0
         with suppress(ValueError):  # if the qform is no rotation
             off = np.abs(corners @ (header.get_sform() - header.get_qform()).T).max()
@@ -53,13 +54,13 @@ def read_nifti(request: Request) -> Volume:
                 f"its sform (code {codes[0]}) and qform (code {codes[1]}) place a corner {off:.3g} "
                 "apart: the sform is taken, as nibabel does; ITK may take the qform",
             )
-    return Volume(image, *from_affine(header.get_best_affine()), notes=notes, space=RAS)
+    return Volume(*image, *from_affine(header.get_best_affine()), notes=notes, space=RAS)
 
 
 def read_mgh(request: Request) -> Volume:
     """Read a ``.mgh`` or ``.mgz`` file of FreeSurfer."""
     image, header = _load(request)
-    return Volume(image, *from_affine(header.get_affine()), space=RAS)
+    return Volume(*image, *from_affine(header.get_affine()), space=RAS)
 
 
 def read_analyze(request: Request) -> Volume:
@@ -70,11 +71,11 @@ def read_analyze(request: Request) -> Volume:
         if file.read(348)[344:347] == b"ni1":
             return read_nifti(request)
     image, header = _load(request)
-    return Volume(image, triple(header.get_zooms()[:3]), None, XYZ, notes=(NO_PLACE,))
+    return Volume(*image, triple(header.get_zooms()[:3]), None, XYZ, notes=(NO_PLACE,))
 
 
-def _load(request: Request) -> tuple[Later, Any]:
-    """Return the samples of an image, and its header."""
+def _load(request: Request) -> tuple[tuple[Callable[[], Any], tuple[int, ...], Any], Any]:
+    """Return how an image is loaded, its shape and type; and its header."""
     import nibabel
 
     image: Any = nibabel.load(request.path, mmap=False)
@@ -83,4 +84,4 @@ def _load(request: Request) -> tuple[Later, Any]:
         raise GridError(f"{request.path} has shape {shape}: give a file of three axes (x, y, z)")
     if (getattr(proxy, "slope", 1), getattr(proxy, "inter", 0)) != (1, 0):
         dtype = np.asarray(proxy[(slice(0, 1),) * len(shape)]).dtype
-    return Later(shape[:3], dtype, lambda: np.asarray(proxy).reshape(shape[:3])), image.header
+    return (lambda: np.asarray(proxy).reshape(shape[:3]), shape[:3], dtype), image.header

@@ -7,17 +7,16 @@ bzip2, an axis of time, and spacings beside a space.
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import FileError, GridError, seen
+from ...errors import FileError, GridError
 from ...options import LPS, RAS
 from ..regular import check_beside
-from ..volume import MOST_NAMED, Later, Request, Volume, from_affine
-from .axes import in_one_unit
+from ..volume import Request, Volume, from_affine, triple
+from .axes import one_unit
 
 CENTERING = (
     "it states axis mins, but no centerings: its samples are taken as cells, half a spacing from "
@@ -39,26 +38,19 @@ def read_nrrd(request: Request) -> Volume:
     if "data file" in header:
         check_beside(request.path, str(header["data file"]))
     sizes = tuple(int(size) for size in header["sizes"])
-    if len(sizes) < 3 or header["dimension"] != len(sizes):
+    kept = _axes_in_space(header) or tuple(n for n, size in enumerate(sizes) if size > 1)
+    longer = [axis for axis, size in enumerate(sizes) if size > 1 and axis not in kept]
+    if len(kept) != 3 or longer or header["dimension"] != len(sizes):
         raise GridError(f"{request.path} has shape {sizes}: give a file of three axes (x, y, z)")
     if min(sizes) < 1:
         raise FileError(f"its sizes are {sizes}")
-    in_space = _axes_in_space(header)
-    layer = _layer(request, header, sizes, in_space)
-    shape = sizes if layer is None else (1, *sizes[1:])
-    kept = in_space or tuple(axis for axis, size in enumerate(shape) if size > 1)
-    longer = [axis for axis, size in enumerate(shape) if size > 1 and axis not in kept]
-    if len(kept) != 3 or longer:
-        raise GridError(f"{request.path} has shape {sizes}: give a file of three axes (x, y, z)")
     dtype = nrrd.reader._determine_datatype(raw)
-
-    def load() -> NDArray[Any]:
-        data = nrrd.read(str(request.path))[0]
-        return data if layer is None else data[layer : layer + 1]
-
-    place, notes = _place(header, kept)
     space = SPACES.get(str(header.get("space", "")).lower())
-    return Volume(Later(shape, dtype, load), *place, kept, notes=notes, space=space)
+    place, notes = _place(header, kept)
+    read = nrrd.read
+    return Volume(
+        lambda: read(str(request.path))[0], sizes, dtype, *place, kept, notes=notes, space=space
+    )
 
 
 def _axes_in_space(header: dict[str, Any]) -> tuple[int, ...] | None:
@@ -72,41 +64,19 @@ def _axes_in_space(header: dict[str, Any]) -> tuple[int, ...] | None:
     return axes if len(axes) == 3 and len(is_in_space) == count else None
 
 
-def _layer(
-    request: Request, header: dict[str, Any], sizes: tuple[int, ...], in_space: Any
-) -> int | None:
-    """Return which layer of a segmentation is read: the fastest of four axes; None without any."""
-    count = sizes[0]
-    if request.member is None and (count == 1 or len(sizes) < 4 or 0 in (in_space or ())):
-        return None
-    if len(sizes) < 4:
-        raise FileError(f"{request.path} holds one array: give no name of another in it")
-    asked = (request.member or "").strip("/")
-    if asked in map(str, range(count)):
-        return int(asked)
-    listed = []
-    for layer in range(min(count, MOST_NAMED)):
-        segments = [
-            f"{header.get(key.replace('_Layer', '_Name'), '?')} "
-            f"{header.get(key.replace('_Layer', '_LabelValue'), '?')}"
-            for key, value in header.items()
-            if re.fullmatch(r"Segment\d+_Layer", key) and value.strip() == str(layer)
-        ]
-        listed.append(f"{layer} ({seen(', '.join(segments))})" if segments else str(layer))
-    wrong = f", and none of them is {seen(asked)}" if asked else ""
-    raise FileError(
-        f"{request.path} holds {count:,} layers, {', '.join(listed)}{wrong}: give "
-        f"{request.path}:0, say, and --label for one of several segments in it"
-    )
-
-
 def _place(header: dict[str, Any], space: tuple[int, ...]) -> tuple[tuple[Any, Any, Any], Any]:
-    """Return spacing, origin and direction of the axes in space, and notes on the unit.
+    """Return spacing, origin and direction of the axes in space, None if not stated, and notes.
 
-    None stands for what is not stated. A ``space origin`` holds beside ``spacings``, too. The mins
-    of cells are their borders: their first sample is half a step further. Samples whose centering
-    is not stated are cells, as for ITK and teem.
+    A ``space origin`` holds beside ``spacings``, too. The mins of cells are their borders: their
+    first sample is half a step further. Samples whose centering is not stated are cells, as for ITK
+    and teem.
     """
+
+    def of_axes(name: str, default: Any) -> Any:
+        said = header.get(name, ())
+        said = said.split() if isinstance(said, str) else said  # pynrrd does not split some
+        return [said[axis] for axis in space] if len(said) > max(space) else default
+
     notes: tuple[str, ...] = ()
     columns: NDArray[np.float64] | None
     origin, units = header.get("space origin"), header.get("space units")
@@ -115,12 +85,6 @@ def _place(header: dict[str, Any], space: tuple[int, ...]) -> tuple[tuple[Any, A
         if columns.shape != (3, 3) or not np.isfinite(columns).all():
             raise FileError(f"its space directions are {columns.T.tolist()}: give three of three")
     else:
-
-        def of_axes(name: str, default: Any) -> Any:
-            said = header.get(name, ())
-            said = said.split() if isinstance(said, str) else said  # pynrrd does not split some
-            return [said[axis] for axis in space] if len(said) > max(space) else default
-
         none = [np.nan] * 3
         steps, low, high = (
             np.array(of_axes(name, none), np.float64)
@@ -135,13 +99,12 @@ def _place(header: dict[str, Any], space: tuple[int, ...]) -> tuple[tuple[Any, A
         if origin is None and columns is not None and np.isfinite(low).all():
             origin = low
             notes = (CENTERING,) if "centerings" not in header else ()
-    factors, told = in_one_unit([unit.strip('"') for unit in (units or [])[:3]] or [""] * 3)
-    if factors is None:
+    is_one, told = one_unit([unit.strip('"') for unit in (units or [])[:3]])
+    if not is_one:
         return (None, None, None), notes + told
     if origin is not None:
-        origin = np.asarray(origin, np.float64)[:3] * factors
-        origin = tuple(origin.tolist()) if np.isfinite(origin).all() else None
+        origin = triple(origin[:3]) if np.isfinite(origin[:3]).all() else None
     if columns is None:
         return (None, origin, None), notes + told
-    spacing, _, direction = from_affine(np.column_stack([np.diag(factors) @ columns, np.zeros(3)]))
+    spacing, _, direction = from_affine(np.column_stack([columns, np.zeros(3)]))
     return (spacing, origin, direction), notes + told

@@ -13,9 +13,18 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ...errors import FileError, GridError
-from ..volume import PLACE, Later, Request, Volume, axes_direction, in_words_of, kept_axes, triple
+from ..volume import (
+    PLACE,
+    Request,
+    Volume,
+    axes_direction,
+    in_words_of,
+    kept_axes,
+    of_array,
+    triple,
+)
 
-OPEN3D = {"key.npy", "voxel_size.npy", "block_resolution.npy", "attr_name_tsdf.npy"}
+OPEN3D = ("key", "voxel_size", "block_resolution", "attr_name_tsdf", "attr_name_weight")
 
 
 def _header(file: IO[bytes], size: int, name: str) -> tuple[tuple[int, ...], str, np.dtype[Any]]:
@@ -30,19 +39,10 @@ def _header(file: IO[bytes], size: int, name: str) -> tuple[tuple[int, ...], str
         raise FileError(f"{name} holds Python objects: save the numbers alone")
     follow = size - file.tell()
     if prod(shape) * dtype.itemsize > follow:
-        raise FileError(
-            f"{name} is truncated: its header promises {in_words_of(shape, dtype)}, but "
-            f"{follow:,} follow"
-        )
-    return shape, "F" if is_fortran else "C", dtype
-
-
-def _volume(values: Any, order: str, axes: str, **place: Any) -> Volume:
-    about = {"order": "Fortran" if order == "F" else "C"}
-    kept = kept_axes(values.shape)
-    return Volume(
-        values, direction=axes_direction(axes), kept=kept, axes=axes, about=about, place=place
-    )
+        promised = in_words_of(shape, dtype)
+        said = f"{name} is truncated: its header promises {promised}, but {follow:,} follow"
+        raise FileError(said)
+    return shape, "Fortran" if is_fortran else "C", dtype
 
 
 def read_npy(request: Request) -> Volume:
@@ -52,7 +52,14 @@ def read_npy(request: Request) -> Volume:
     if 0 in shape:
         raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")
     values = np.load(request.path, mmap_mode="r", allow_pickle=False)
-    return _volume(values, order, request.axes)
+    return Volume(
+        *of_array(values),
+        direction=axes_direction(request.axes),
+        kept=kept_axes(shape),
+        axes=request.axes,
+        about={"order": order},
+        is_mapped=True,
+    )
 
 
 def read_npz(request: Request) -> Volume:
@@ -60,15 +67,11 @@ def read_npz(request: Request) -> Volume:
     archive = request.files.enter_context(np.load(request.path, allow_pickle=False))
     if not isinstance(archive, np.lib.npyio.NpzFile):
         raise FileError(f"{request.path} is not a readable .npz archive: it is one array")
-    zipped: Any = archive.zip
-    names = zipped.namelist()
-    if OPEN3D.issubset(names):
-        return _read_blocks(archive, request)
+    if set(OPEN3D) <= set(archive.files):
+        return _blocks_of_open3d(archive)
     if {"voxels", "factor"} <= set(archive.files):
-        raise FileError(
-            f"{request.path} is a refined field, no grid: mesh it with "
-            "extract_mesh(read_field(path))"
-        )
+        way_out = "mesh it with extract_mesh(read_field(path))"
+        raise FileError(f"{request.path} is a refined field, no grid: {way_out}")
     if "values" not in archive.files:
         held = ", ".join(archive.files) or "nothing"
         raise FileError(f"{request.path} has no key 'values' (it holds {held})")
@@ -80,46 +83,37 @@ def read_npz(request: Request) -> Volume:
             if place[key].size > most or place[key].dtype.kind not in "fiu":
                 said = f"shape {place[key].shape} and dtype {place[key].dtype}"
                 raise GridError(f"{request.path}[{key}] has {said}: give {asked}")
-    member = "values.npy" if "values.npy" in names else "values"
-    info = zipped.getinfo(member)
+    zipped: Any = archive.zip
+    info = zipped.getinfo("values.npy" if "values.npy" in zipped.namelist() else "values")
     with zipped.open(info) as file:
         shape, order, dtype = _header(file, info.file_size, f"{request.path}[values]")
-    return _volume(
-        Later(shape, dtype, lambda: archive["values"]), order, request.axes, **place
+    return Volume(
+        *(lambda: archive["values"], shape, dtype),
+        direction=axes_direction(request.axes),
+        kept=kept_axes(shape),
+        axes=request.axes,
+        about={"order": order},
+        place=place,
     )
 
 
-def _read_blocks(archive: Any, request: Request) -> Volume:
+def _blocks_of_open3d(archive: Any) -> Volume:
     """Return the truncated distances in cubes of voxels, at the keys of a hash map.
 
     Voxel (x, y, z) of the block with key k is at ``voxel_size * (k * resolution + (x, y, z))``;
     voxels without weight, and blocks that are missing, are unknown.
     """
-
-    def array(key: str) -> Any:
-        if key not in archive.files:
-            raise FileError(f"{request.path} is Open3D's VoxelBlockGrid, but has no key {key!r}")
-        return archive[key]
-
-    keys = array("key").astype(np.int64)
-    resolution, step = (array(name).item() for name in ("block_resolution", "voxel_size"))
-    values, weights = (
-        array(f"value_{array(f'attr_name_{name}').item():03d}") for name in ("tsdf", "weight")
-    )
-    blocks = (len(keys), *(resolution,) * 3, 1)
-    if keys.shape != (len(keys), 3) or not len(keys) or not values.shape == weights.shape == blocks:
-        raise GridError(f"its keys have shape {keys.shape}, its values {values.shape}")
-    samples = np.where(weights > 0, values, np.nan)[..., 0]
-    samples = samples.transpose(0, 3, 2, 1)  # (block, x, y, z)
-    low = keys.min(0)
-    starts = (keys - low) * resolution
-    shape = tuple((starts.max(0) + resolution).tolist())
+    keys, step, resolution, *numbers = (archive[name] for name in OPEN3D)
+    values, weights = (archive[f"value_{int(number.item()):03d}"] for number in numbers)
+    low, side, step = keys.min(0).astype(np.int64), int(resolution.item()), float(step.item())
+    starts = (keys - low) * side
+    shape = tuple((starts.max(0) + side).tolist())
+    samples = np.where(weights > 0, values, np.nan)[..., 0].transpose(0, 3, 2, 1)  # block, x, y, z
 
     def load() -> Any:
         whole = np.full(shape, np.nan, samples.dtype)
         for (x, y, z), block in zip(starts, samples):
-            whole[x : x + resolution, y : y + resolution, z : z + resolution] = block
+            whole[x : x + side, y : y + side, z : z + side] = block
         return whole
 
-    origin = triple(step * resolution * low)
-    return Volume(Later(shape, samples.dtype, load), (step,) * 3, origin)
+    return Volume(load, shape, samples.dtype, (step,) * 3, triple(step * side * low))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...errors import GridError
 from ...options import LPS
 from ..regular import check_beside
-from ..volume import Later, Request, Volume
+from ..volume import Request, Volume, triple
 
 EVEN = 0.01  # share of the spacing by which slices may be off
 PARALLEL = 1e-4  # by which components of directions may differ
@@ -32,7 +32,7 @@ class _Slice(NamedTuple):
     shape: tuple[int, int]
     corner: NDArray[np.float64]
     across: NDArray[np.float64]  # world directions along a row and down a column
-    spacing: tuple[float, float]
+    spacing: NDArray[np.float64]  # of rows and of columns
     scale: tuple[float, float]
 
     def read(self) -> NDArray[Any]:
@@ -42,7 +42,10 @@ class _Slice(NamedTuple):
 
 
 def read_dicom(request: Request) -> Volume:
-    """Read ``FOLDER``, or ``FOLDER:SERIES`` by the UID of one of several series."""
+    """Read ``FOLDER``, or ``FOLDER:SERIES`` by the UID of one of several series.
+
+    The slices must have one size, spacing and direction, and lie in even steps.
+    """
     import pydicom
 
     series: dict[str, list[tuple[Path, Any]]] = {}
@@ -54,12 +57,30 @@ def read_dicom(request: Request) -> Volume:
                 if "Rows" in header:
                     uid = str(header.get("SeriesInstanceUID", ""))
                     series.setdefault(uid, []).append((path, header))
-    uid = request.choose(list(series), "series of DICOM images")
-    slices, step = _in_order(list(_slices(series[uid])))
+    slices = list(_slices(series[request.choose(list(series), "series of DICOM images")]))
     first = slices[0]
+    normal = np.cross(*first.across)
+    slices.sort(key=lambda each: float(each.corner @ normal))
+    for each in slices:
+        same = each.shape == first.shape and np.allclose(each.spacing, first.spacing, rtol=1e-4)
+        if not same or not np.allclose(each.across, first.across, atol=PARALLEL):
+            said = f"{each.path.name} has another size, spacing or direction than {first.path.name}"
+            raise GridError(f"{said}: put the slices of one volume into a folder")
+    if len(slices) == 1:
+        raise GridError(f"{first.path.name} is its only slice: give the folder of a series")
+    corners = np.array([each.corner for each in slices])
+    shift = (corners[-1] - corners[0]) / (len(slices) - 1)
+    off = np.linalg.norm(corners - corners[0] - np.outer(np.arange(len(slices)), shift), axis=1)
+    step = float(np.linalg.norm(shift))
+    if not off.max() < EVEN * step:
+        raise GridError(
+            f"{slices[int(off.argmax())].path.name} is {off.max():.4g} mm off from even steps of "
+            f"{step:.6g}: put all slices of one volume (one time, one echo) into a folder, or "
+            "resample the series"
+        )
     scales = np.array([each.scale for each in slices])
     is_plain, is_whole = (scales == (1, 0)).all(), (scales == np.rint(scales)).all()
-    dtype = first.read().dtype if is_plain else np.dtype(np.int32 if is_whole else np.float32)
+    dtype = slices[0].read().dtype if is_plain else np.dtype(np.int32 if is_whole else np.float32)
 
     def load() -> NDArray[Any]:
         planes = np.empty((len(slices), *first.shape), dtype)
@@ -67,10 +88,10 @@ def read_dicom(request: Request) -> Volume:
             plane[:] = each.read() if is_plain else each.read() * each.scale[0] + each.scale[1]
         return planes.T
 
-    direction = np.column_stack([*first.across, np.cross(*first.across)])
-    values = Later((*first.shape[::-1], len(slices)), dtype, load)
-    spacing, origin = (*first.spacing[::-1], step), tuple(first.corner.tolist())
-    return Volume(values, spacing, origin, direction, space=LPS)
+    direction = np.column_stack([*first.across, shift / step])
+    spacing = triple((*first.spacing[::-1], step))
+    shape = (*first.shape[::-1], len(slices))
+    return Volume(load, shape, dtype, spacing, triple(corners[0]), direction, space=LPS)
 
 
 def _slices(images: list[tuple[Path, Any]]) -> Iterator[_Slice]:
@@ -95,55 +116,14 @@ def _slices(images: list[tuple[Path, Any]]) -> Iterator[_Slice]:
                 _stated(groups, "PixelValueTransformationSequence", f"Rescale{name}")
                 for name in ("Slope", "Intercept")
             )
-            yield _Slice(
-                *(path, index, (header.Rows, header.Columns), np.array(corner, np.float64)),
-                np.array(across, np.float64).reshape(2, 3),
-                (float(steps[0]), float(steps[1])),
-                (1.0 if slope is None else float(slope), float(intercept or 0)),
-            )
+            place = (np.array(numbers, np.float64) for numbers in (corner, across, steps))
+            corner, across, steps = place
+            scale = (1.0 if slope is None else float(slope), float(intercept or 0))
+            shape = (header.Rows, header.Columns)
+            yield _Slice(path, index, shape, corner, across.reshape(2, 3), steps, scale)
 
 
 def _stated(groups: list[Any], sequence: str, name: str) -> Any:
     """Return an element of the first group that has it, in a sequence or plainly; else None."""
     among = (each for group in groups for each in (*group.get(sequence, ()), group))
     return next((each[name].value for each in among if name in each), None)
-
-
-def _in_order(slices: list[_Slice]) -> tuple[list[_Slice], float]:
-    """Return slices by their position along their normal, and the step between them."""
-    first = slices[0]
-    normal = np.cross(*first.across)
-    slices = sorted(slices, key=lambda each: float(each.corner @ normal))
-    for each in slices:
-        same = each.shape == first.shape and np.allclose(each.spacing, first.spacing, rtol=1e-4)
-        if not same or not np.allclose(each.across, first.across, atol=PARALLEL):
-            raise GridError(
-                f"{each.path.name} has another size, spacing or direction than {first.path.name}: "
-                "put the slices of one volume into a folder"
-            )
-    if len(slices) == 1:
-        raise GridError(f"{slices[0].path.name} is its only slice: give the folder of a series")
-    corners = np.array([each.corner for each in slices])
-    heights, names = corners @ normal, [each.path.name for each in slices]
-    steps = np.diff(heights)
-    step = float(np.median(steps))
-    worst, nearest = int(np.abs(steps - step).argmax()), int(steps.argmin())
-    if steps[nearest] <= EVEN * step:
-        raise GridError(
-            f"{names[nearest]} and {names[nearest + 1]} are at one place: put the slices of one "
-            "volume (one time, one echo) into a folder"
-        )
-    if abs(steps[worst] - step) > EVEN * step:
-        raise GridError(
-            f"{names[worst]} and {names[worst + 1]} are {steps[worst]:.6g} mm apart, others "
-            f"{step:.6g}: add the slices that are missing, or resample the series in even steps"
-        )
-    step = float(heights[-1] - heights[0]) / len(steps)
-    shift = corners - corners[0]
-    aside = np.linalg.norm(shift - np.outer(shift @ normal, normal), axis=1).max()
-    if aside > EVEN * min(step, *first.spacing) * len(steps):
-        raise GridError(
-            f"its slices lie up to {aside:.4g} mm beside one another, as with a tilted gantry: "
-            "resample them on a grid with right angles"
-        )
-    return slices, step

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from ...errors import FileError
-from ..volume import PLACE, Later, Request, Volume
-from .axes import Axis, measured, placed, values_of
-from .h5py import may_be_grid, read_hdf5, read_mat_73
+from ..volume import PLACE, Request, Volume, of_array
+from .axes import Axis, measured, placed, stored
+from .h5py import may_be_grid, read_hdf5, volume_of
 
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
@@ -34,13 +34,14 @@ def read_netcdf(request: Request) -> Volume:
         scale = variables.get(name)
         axes.append(Axis(name) if scale is None else measured(name, scale.data, scale._attributes))
     place = placed(axes, about, values.shape, request.axes)
-    return Volume(values.data, **place, **values_of(values.data.dtype, about))
+    return Volume(*stored(values.data, about), **place)
 
 
 def read_mat(request: Request) -> Volume:
     """Read ``FILE.mat:VARIABLE``; without a name the only array of three axes.
 
-    Variables ``spacing``, ``origin`` and ``direction`` beside it are its place, as in ``.npz``.
+    Variables ``spacing``, ``origin`` and ``direction`` beside it are its place, as in ``.npz``. In
+    files of version 7.3, which are HDF5, the axes of all are in reverse order.
     """
     import h5py
     from scipy.io import loadmat, whosmat
@@ -49,14 +50,26 @@ def read_mat(request: Request) -> Volume:
         found = placed([Axis()] * 3, stated, shape, request.axes[::-1])
         return found | {"notes": (ORDER,) if request.axes == "xyz" else ()}
 
+    what = "array of three axes"
     if h5py.is_hdf5(request.path):
-        return read_mat_73(request, NUMBERS, place)
+        file = request.files.enter_context(h5py.File(request.path, "r"))
+        kinds = [kind.encode() for kind in NUMBERS]
+        names = [
+            name
+            for name, entry in file.items()
+            if isinstance(entry, h5py.Dataset)
+            and len(entry.shape or ()) == 3
+            and entry.attrs.get("MATLAB_class", b"") in kinds
+        ]
+        dataset = file[request.choose(names, what)]
+        stated = {key: file[key][()].T for key in PLACE if key in file}
+        return volume_of(dataset, place(stated, dataset.shape))
     listed = whosmat(request.path)
-    arrays = {name: shape for name, shape, kind in listed if len(shape) == 3 and kind in NUMBERS}
-    name = request.choose(list(arrays), "array of three axes")
+    shapes = {name: shape for name, shape, kind in listed if len(shape) == 3 and kind in NUMBERS}
+    name = request.choose(list(shapes), what)
     variables = loadmat(request.path, variable_names=[name, *PLACE])
     stated = {key: variables[key] for key in PLACE if key in variables}
     values = variables[name].T  # planes of the last axis are contiguous
-    if values.shape[::-1] != arrays[name]:
+    if values.shape[::-1] != shapes[name]:
         raise FileError(f"it is damaged: {name} has shape {values.shape[::-1]}")
-    return Volume(Later(values.shape, values.dtype, lambda: values), **place(stated, values.shape))
+    return Volume(*of_array(values), **place(stated, values.shape))

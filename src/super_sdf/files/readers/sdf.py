@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError
-from ..volume import Request, Volume, in_words_of
+from ..volume import Request, Volume, in_words_of, of_array
 
 HEADER = struct.Struct("<3i6f")
 TAGGED = re.compile(rb"#sdf 1\r?\ndim +(\d{1,9}) +(\d{1,9}) +(\d{1,9})\s*\ndata\r?\n")
@@ -26,41 +26,34 @@ FLOAT = np.dtype("<f4")
 
 def read_sdf(request: Request) -> Volume:
     """Read an ``.sdf`` file of any of the three dialects."""
-    with request.path.open("rb") as file:
+    path = request.path
+    with path.open("rb") as file:
         beginning = file.read(4096)
-    size = request.path.stat().st_size
     place: dict[str, Any] = {}
     if tagged := TAGGED.match(beginning):
         start, shape = tagged.end(), tuple(map(int, tagged.groups()))
     elif TEXT.fullmatch(beginning):
-        return _read_text(request)
+        words = path.read_bytes().split()
+        try:
+            shape = tuple(max(int(word), 0) for word in words[:3])
+            x, y, z, spacing = (float(word) for word in words[3:7])
+            values = np.array(words[7:], np.float32).reshape(shape[::-1]).T
+        except (ValueError, OverflowError):
+            raise FileError(
+                f"{path} is no .sdf grid, or truncated: SDFGen's text begins with three sizes, the "
+                "origin and the spacing, and a value for each sample follows"
+            ) from None
+        return Volume(*of_array(values), (spacing,) * 3, (x, y, z))
     else:
         fields = HEADER.unpack(beginning[: HEADER.size].ljust(HEADER.size, b"\0"))
         start, shape, low, high = HEADER.size, fields[:3], np.array(fields[3:6]), fields[6:]
         if min(shape) < 1 or not (high > low).all():
-            raise FileError(
-                f"{request.path} is no .sdf grid: it is neither SDFGen's text nor a binary grid "
-                "(#sdf 1, or sizes and box before the values)"
-            )
+            said = "it is neither SDFGen's text nor a binary grid"
+            raise FileError(f"{path} is no .sdf grid: {said} (#sdf 1, or sizes, box and values)")
         steps = (high - low) / shape
         place = {"spacing": tuple(steps.tolist()), "origin": tuple(low.tolist())}
-    if prod(shape) * FLOAT.itemsize != size - start:
-        raise FileError(
-            f"{request.path} is damaged: {in_words_of(shape, FLOAT)} are promised, but "
-            f"{size - start:,} follow"
-        )
-    return Volume(np.memmap(request.path, FLOAT, "r", start, shape), **place)
-
-
-def _read_text(request: Request) -> Volume:
-    words = request.path.read_bytes().split()
-    try:
-        shape = tuple(max(int(word), 0) for word in words[:3])
-        x, y, z, spacing = (float(word) for word in words[3:7])
-        values = np.array(words[7:], np.float32).reshape(shape[::-1]).T
-    except (ValueError, OverflowError):
-        raise FileError(
-            f"{request.path} is no .sdf grid, or truncated: SDFGen's text begins with three sizes, "
-            "the origin and the spacing, and a value for each sample follows"
-        ) from None
-    return Volume(values, (spacing,) * 3, (x, y, z))
+    follow, promised = path.stat().st_size - start, in_words_of(shape, FLOAT)
+    if prod(shape) * FLOAT.itemsize != follow:
+        raise FileError(f"{path} is damaged: {promised} are promised, but {follow:,} follow")
+    values = np.memmap(path, FLOAT, "r", start, shape)
+    return Volume(*of_array(values), **place, is_mapped=True)

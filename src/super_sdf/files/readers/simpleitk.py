@@ -17,17 +17,17 @@ import numpy as np
 from ...errors import FileError, GridError, seen
 from ...options import LPS
 from ..regular import LONGEST_HEADER, check_beside
-from ..volume import Later, Request, Volume, kept_axes, triple
+from ..volume import Request, Volume, kept_axes, triple
 
 NO_UNIT = ("", "?", "mm", "UNKNOWN")
-PIECE = 1 << 16  # compressed bytes at a time
 
 
 def read_metaimage(request: Request) -> Volume:
     """Read a ``.mha`` file, or a ``.mhd`` file and the data files that it names."""
     import SimpleITK
 
-    with request.path.open("rb") as file:
+    path = request.path
+    with path.open("rb") as file:
         beginning = file.read(LONGEST_HEADER)
     found = re.search(rb"^ElementDataFile *[=:] *([^\n]*)\n?", beginning, re.M)
     if not found:
@@ -35,38 +35,39 @@ def read_metaimage(request: Request) -> Volume:
     lines = beginning[: found.start()].decode(errors="replace").splitlines()
     pairs = (re.split("[=:]", line, maxsplit=1) for line in lines)
     fields = {pair[0].strip(): pair[-1].strip() for pair in pairs}
+
+    def is_true(name: str) -> bool:
+        return fields.get(name, "F")[:1] in ("T", "t", "1")  # as ITK reads it
+
     named = found[1].decode(errors="surrogateescape").strip()
     names = [] if named.lower() == "local" else _names(named, beginning[found.end() :])
-    files = [check_beside(request.path, name) for name in names]
+    files = [check_beside(path, name) for name in names]
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
-    reader.SetFileName(str(request.path))
+    reader.SetFileName(str(path))
     reader.SetImageIO("MetaImageIO")
     try:
         reader.ReadImageInformation()
     except RuntimeError:
         raise FileError("ITK finds its header damaged, or that of no MetaImage") from None
-    size, components = reader.GetSize(), reader.GetNumberOfComponents()
-    kept = kept_axes(size)
-    if len(kept) != 3 or components != 1:
-        more = f" of {components} numbers" * (components != 1)
-        raise GridError(
-            f"{request.path} has shape {size}{more}: give a file of three axes (x, y, z)"
-        )
+    size, kept = reader.GetSize(), kept_axes(reader.GetSize())
+    if len(kept) != 3 or reader.GetNumberOfComponents() != 1:
+        more = f" of {reader.GetNumberOfComponents()} numbers"
+        raise GridError(f"{path} has shape {size}{more}: give a file of three axes (x, y, z)")
     one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
-    path, start = (files[0], 0) if files else (request.path, found.end())
-    promised, follow = prod(size) * dtype.itemsize, path.stat().st_size - start
-    is_packed = _is_true(fields, "CompressedData") and len(files) <= 1
+    data, start = (files[0], 0) if files else (path, found.end())
+    promised, follow = prod(size) * dtype.itemsize, data.stat().st_size - start
+    is_packed = is_true("CompressedData") and len(files) <= 1
     if not is_packed and len(files) <= 1 and promised > follow:
-        raise FileError(f"{path} is truncated: {promised:,} bytes are promised, {follow:,} follow")
+        raise FileError(f"{data} is truncated: {promised:,} bytes are promised, {follow:,} follow")
 
     def load() -> Any:
         if not is_packed:
             return SimpleITK.GetArrayFromImage(reader.Execute()).T
-        is_big = any(_is_true(fields, f"{name}ByteOrderMSB") for name in ("BinaryData", "Element"))
+        is_big = is_true("BinaryDataByteOrderMSB") or is_true("ElementByteOrderMSB")
         stored = dtype.newbyteorder(">" if is_big else "<")
-        return np.frombuffer(_unpacked(path, start, promised), stored).reshape(size[::-1]).T
+        return np.frombuffer(_unpacked(data, start, promised), stored).reshape(size[::-1]).T
 
     steps = np.array(reader.GetSpacing())[list(kept)]
     direction = np.array(reader.GetDirection()).reshape(len(size), -1)[np.ix_(kept, kept)]
@@ -76,11 +77,7 @@ def read_metaimage(request: Request) -> Volume:
     notes = (f"lengths are in the unit that it states, {unit}",) * (unit not in NO_UNIT)
     if not {"ElementSpacing", "ElementSize"} & set(fields):
         notes += ("it states no ElementSpacing: taken as 1, as ITK does",)
-    return Volume(Later(size, dtype, load), *place, kept, notes=notes, space=LPS)
-
-
-def _is_true(fields: dict[str, str], name: str) -> bool:
-    return fields.get(name, "F")[:1] in ("T", "t", "1")  # as ITK reads it
+    return Volume(load, size, dtype, *place, kept, notes=notes, space=LPS)
 
 
 def _names(named: str, rest: bytes) -> list[str]:
@@ -96,17 +93,13 @@ def _names(named: str, rest: bytes) -> list[str]:
     return [pattern % number for number in range(first, last + 1, step)]
 
 
-def _unpacked(path: Path, start: int, size: int) -> bytearray:
+def _unpacked(path: Path, start: int, size: int) -> bytes:
     """Return the ``size`` bytes of a zlib stream; FileError unless it is whole and has as many."""
-    unpacker, data = zlib.decompressobj(), bytearray()
-    with path.open("rb") as file:
-        file.seek(start)
-        while len(data) <= size and not unpacker.eof and (piece := file.read(PIECE)):
-            data += unpacker.decompress(piece)
+    unpacker = zlib.decompressobj()
+    data = unpacker.decompress(path.read_bytes()[start:], size + 1)
     if len(data) != size or not unpacker.eof:
-        end = "ends" if unpacker.eof else "is torn"
         raise FileError(
-            f"{path} is damaged: {size:,} bytes are promised, and its compressed data {end} "
-            f"after {len(data):,}"
+            f"{path} is damaged: {size:,} bytes are promised, and its compressed data is torn or "
+            f"has others ({len(data):,})"
         )
     return data

@@ -12,8 +12,8 @@ from xml.etree import ElementTree
 
 from ...errors import GridError
 from ..regular import check_beside
-from ..volume import Later, Request, Volume
-from .axes import Axis, placed, values_of
+from ..volume import Request, Volume
+from .axes import Axis, placed
 
 
 def read_tiff(request: Request) -> Volume:
@@ -36,38 +36,41 @@ def read_tiff(request: Request) -> Volume:
         )
     is_named = request.axes == "zyx" and sorted(series.axes) == ["X", "Y", "Z"]
     names = series.axes.lower() if is_named else request.axes
-    stated = _ome_axes(ome) if ome is not None else _imagej_axes(file)
+    sizes, unit = _pixel_sizes(file)
+    stated = _ome_axes(ome) if ome is not None else _imagej_axes(file, sizes, unit)
     place = placed([stated.get(name, Axis(name)) for name in names], {}, series.shape, names)
-    sizes, unit = _pixel_sizes(file), _resolution_unit(file)
     if ome is None and not stated and sizes and unit:
         place["notes"] += (
             f"its pixels are {sizes[0]:.6g} x {sizes[1]:.6g} {unit}, but it does not state how far "
             "its pages are apart: no spacing is taken from it (give --spacing X,Y,Z)",
         )
-    segments = [size for page in series.pages if page is not None for size in page.databytecounts]
-    said = values_of(
-        series.dtype,
-        {},
-        absent=segments.count(0),
-        total=len(segments),
-        fill=series.keyframe.nodata,
-    )
-    return Volume(Later(series.shape, series.dtype, series.asarray), **place, **said)
+    return Volume(series.asarray, series.shape, series.dtype, **place)
 
 
-def _imagej_axes(file: Any) -> dict[str, Axis]:
+def _pixel_sizes(file: Any) -> tuple[tuple[float, float] | None, str]:
+    """Return the sizes of a pixel by the resolution, None if not stated, and their unit."""
+    tags = file.pages[0].tags
+    units = {2: "inch", 3: "cm", 4: "mm", 5: "µm"}
+    number = int(tags["ResolutionUnit"].value) if "ResolutionUnit" in tags else 2  # the standard
+    if "XResolution" not in tags or "YResolution" not in tags:
+        return None, units.get(number, "")
+    stated = (tags[name].value for name in ("XResolution", "YResolution"))  # pixels, units
+    x, y = (units / pixels if pixels else 0.0 for pixels, units in stated)
+    return ((x, y) if x > 0 and y > 0 else None), units.get(number, "")
+
+
+def _imagej_axes(file: Any, sizes: tuple[float, float] | None, printed: str) -> dict[str, Axis]:
     """Return the axes of an ImageJ stack by their names; none if it is not calibrated.
 
     What is not stated holds as in ImageJ: a spacing of z of 1, the unit of the resolution, that of
     x for all axes, and origins of 0 beside others, which are in pixels.
     """
     metadata: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
-    sizes = _pixel_sizes(file)
     if not sizes or not (file.is_imagej or "spacing" in metadata):
         return {}
-    unit = str(metadata.get("unit") or _resolution_unit(file))
-    if "spacing" not in metadata and "unit" not in metadata and unit:
+    if "spacing" not in metadata and "unit" not in metadata and printed:
         return {}  # x and y may be those of a print
+    unit = str(metadata.get("unit") or printed)
     # ImageJ writes letters beyond ASCII by their numbers
     units = [
         re.sub(r"\\u([0-9a-fA-F]{4})", lambda number: chr(int(number[1], 16)), each)
@@ -80,21 +83,6 @@ def _imagej_axes(file: Any) -> dict[str, Axis]:
     starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]
     places = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
     return {each[0]: Axis(*each) for each in zip("xyz", units, steps, places)}
-
-
-def _pixel_sizes(file: Any) -> tuple[float, float] | None:
-    tags = file.pages[0].tags
-    if "XResolution" not in tags or "YResolution" not in tags:
-        return None
-    stated = (tags[name].value for name in ("XResolution", "YResolution"))  # pixels, units
-    x, y = (units / pixels if pixels else 0.0 for pixels, units in stated)
-    return (x, y) if x > 0 and y > 0 else None
-
-
-def _resolution_unit(file: Any) -> str:
-    tag = file.pages[0].tags.get("ResolutionUnit")
-    number = 2 if tag is None else int(tag.value)  # inches, by the standard
-    return {2: "inch", 3: "cm", 4: "mm", 5: "µm"}.get(number, "")
 
 
 def _ome_axes(ome: ElementTree.Element) -> dict[str, Axis]:

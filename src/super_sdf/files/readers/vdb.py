@@ -20,14 +20,16 @@ from numpy.typing import NDArray
 from ...arrays import BoolArray
 from ...errors import FileError, GridError
 from .. import vdb_writer as vdb
-from ..volume import Later, Request, Volume, from_affine
+from ..volume import Request, Volume, from_affine
 
 Ints = NDArray[np.int64]
 
 OLDEST = 222  # version of the file format, of OpenVDB 3
 MARGIN = 2  # voxels of background around the others, so that the border is outside
-FLOAT, DOUBLE = np.dtype("<f4"), np.dtype("<f8")
-TYPES: dict[str, np.dtype[Any]] = {"Tree_float_5_4_3": FLOAT, "Tree_double_5_4_3": DOUBLE}
+TYPES: dict[str, np.dtype[Any]] = {
+    "Tree_float_5_4_3": np.dtype("<f4"),
+    "Tree_double_5_4_3": np.dtype("<f8"),
+}
 HALF = "_HalfFloat"  # ends the type of a grid whose values are stored in 16 bits
 NUMBERS = {"float": "f", "double": "d", "int32": "i", "int64": "q", "bool": "?"}  # of metadata
 # How many vectors a map has, and which are the translation and the scale.
@@ -48,8 +50,9 @@ def read_vdb(request: Request) -> Volume:
     names = [name for name, *_ in usable]
     if request.describes and request.member is None:
         names = names[:1]
-    chosen = names.index(request.choose(names, "grid of floating-point values"))
-    name, kind, parent, place = usable[chosen]
+    name, kind, parent, place = usable[
+        names.index(request.choose(names, "grid of floating-point values"))
+    ]
     cursor = start.at(place)
     flags, metadata, affine = cursor.number("I"), cursor.metadata(), cursor.transform()
     if parent:  # whose tree it shares
@@ -76,7 +79,7 @@ def read_vdb(request: Request) -> Volume:
     matrix = size * np.column_stack([affine[:, :3], affine[:, :3] @ low + affine[:, 3]])
     if "PicoGK.VoxelSize" in metadata:
         notes = (f"voxels of {size:.6g} mm, as PicoGK states: the mesh is in millimetres",)
-    volume = Volume(Later(shape, tree.dtype, load), *from_affine(matrix), notes=notes)
+    volume = Volume(load, shape, tree.dtype, *from_affine(matrix), notes=notes)
     return _with_grids(volume, start, entries, name) if request.describes else volume
 
 
@@ -97,12 +100,9 @@ def _entries(cursor: _Cursor) -> list[tuple[str, str, str, int]]:
     """Return name, type, name of the grid whose tree it shares, and place of each grid."""
     if len(cursor.data) < 12 or cursor.number("q") != vdb.MAGIC:
         raise FileError(f"{cursor.name} is no .vdb file: its first bytes are not OpenVDB's")
-    version = cursor.number("I")
-    if version < OLDEST:
-        raise FileError(
-            f"{cursor.name} has version {version} of the format: save it with OpenVDB 3 or later, "
-            f"whose files have {OLDEST} at least"
-        )
+    if (version := cursor.number("I")) < OLDEST:
+        said = f"{cursor.name} has version {version} of the format: save it with OpenVDB 3 or later"
+        raise FileError(f"{said}, whose files have {OLDEST} at least")
     cursor.take(8)  # the library's version
     seekable = cursor.number("?")
     cursor.take(36)  # the file's own number
@@ -131,10 +131,8 @@ class _Cursor:
 
     def take(self, count: int) -> bytes:
         if not 0 <= count <= len(self.data) - self.place:
-            raise FileError(
-                f"{self.name} is truncated or damaged: {count:,} bytes are to follow byte "
-                f"{self.place:,} of {len(self.data):,}"
-            )
+            said = f"{count:,} bytes are to follow byte {self.place:,} of {len(self.data):,}"
+            raise FileError(f"{self.name} is truncated or damaged: {said}")
         self.place += count
         return self.data[self.place - count : self.place]
 
@@ -188,8 +186,8 @@ class _Tree:
         self.cursor, self.flags = cursor, flags
         self.dtype = TYPES[kind.removesuffix(HALF)]
         self.stored = np.dtype("<f2") if kind.endswith(HALF) else self.dtype
-        if (buffers := cursor.number("I")) != 1:
-            raise FileError(f"{cursor.name} is damaged: its tree has {buffers} buffers, not one")
+        if cursor.number("I") != 1:
+            raise FileError(f"{cursor.name} is damaged: its tree has not one buffer")
         self.background = float(cursor.array(self.dtype, 1)[0])
         self.cubes: list[tuple[Ints, int, Any, Any]] = []
         leaves: list[Ints] = []

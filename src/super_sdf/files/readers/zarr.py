@@ -22,7 +22,7 @@ import numpy as np
 from ...errors import FileError, GridError, seen
 from ..regular import check_beside, check_regular_file
 from ..volume import Request, Volume
-from .axes import Axis, measured, placed, values_of
+from .axes import Axis, measured, placed, stored
 
 MOST_AXES = 5  # time, channel, and three of space
 ARRAY_2, ATTRIBUTES_2, NODE_3 = ".zarray", ".zattrs", "zarr.json"
@@ -44,7 +44,7 @@ def read_zarr(request: Request) -> Volume:
         raise FileError(f"{request.path} is one array: give no name of another in it")
     name = "" if "" in store.arrays else _choose(store, request)
     array, axes = store.open(name), _image_axes(store, name)
-    stated, version = dict(array.attrs), 2 if store.document(name, ARRAY_2) else 3
+    attributes, version = dict(array.attrs), 2 if store.document(name, ARRAY_2) else 3
     if axes and (not {*"xyz"} <= {axis.name for axis in axes} or len(axes) != array.ndim):
         listed = ", ".join(axis.name for axis in axes)
         said = f"an array of {array.ndim} axes has the axes {listed}"
@@ -52,15 +52,15 @@ def read_zarr(request: Request) -> Volume:
     if axes:
         place = placed(axes, {}, array.shape, request.axes)
     else:
-        place = placed(_named_axes(store, name, array), stated, array.shape, request.axes)
+        place = placed(_named_axes(store, name, array), attributes, array.shape, request.axes)
     total = prod(-(-size // chunk) for size, chunk in zip(array.shape, array.chunks))
     absent = max(total - array.nchunks_initialized, 0)
     none = array.fill_value if version == 2 else None  # as xarray takes it
-    kind = values_of(array.dtype, stated, none, absent, total, array.fill_value)
     about = {"chunks": list(array.chunks), "zarr format": version}
     if shards := getattr(array, "shards", None):
         about["shards"] = list(shards)
-    return Volume(array, **place, **kind, about=about)
+    numbers = stored(array, attributes, none, absent, array.fill_value)
+    return Volume(*numbers, **place, about=about)
 
 
 class _Store:
@@ -104,20 +104,15 @@ class _Store:
             raise FileError(f"{self.path} is damaged: {key} is no JSON object")
         return content
 
+    def attributes(self, path: str) -> Document:
+        of_3 = self.document(path, NODE_3).get("attributes") or {}
+        return {**self.document(path, ATTRIBUTES_2), **of_3}
+
     def images(self, path: str) -> list[Document]:
         """Return the images that the metadata of a group describes, as OME-NGFF has it."""
         attributes = self.attributes(path)
-        about = attributes.get("ome", attributes)
-        images = about.get("multiscales") if isinstance(about, dict) else None
-        for image in images or []:
-            levels = image.get("datasets") if isinstance(image, dict) else None
-            if not levels or not all(isinstance(each, dict) and "path" in each for each in levels):
-                raise FileError("its OME metadata is damaged: multiscales names no arrays")
-        return images or []
-
-    def attributes(self, path: str) -> Document:
-        stated = self.document(path, NODE_3).get("attributes") or {}
-        return {**self.document(path, ATTRIBUTES_2), **stated}
+        images: list[Document] = attributes.get("ome", attributes).get("multiscales") or []
+        return images
 
     def open(self, path: str) -> Any:
         """Return an array, whose codecs must be in the list."""
@@ -144,10 +139,10 @@ def _codecs_of(about: Document) -> Iterator[str]:
     for key in ("compressor", "filters", "codecs", "index_codecs"):
         listed: Any = about.get(key) or ()
         for codec in listed if isinstance(listed, (list, tuple)) else (listed,):
-            stated = codec if isinstance(codec, dict) else {"name": codec}
-            yield str(stated.get("id", stated.get("name"))).removeprefix("numcodecs.")
-            if isinstance(stated.get("configuration"), dict):
-                yield from _codecs_of(stated["configuration"])
+            named = codec if isinstance(codec, dict) else {"name": codec}
+            yield str(named.get("id", named.get("name"))).removeprefix("numcodecs.")
+            if isinstance(named.get("configuration"), dict):
+                yield from _codecs_of(named["configuration"])
 
 
 def _choose(store: _Store, request: Request) -> str:
@@ -166,8 +161,8 @@ def _choose(store: _Store, request: Request) -> str:
 
 def _named_axes(store: _Store, name: str, array: Any) -> list[Axis]:
     """Return the axes of an array by the names of its dimensions, and by arrays of these names."""
-    stated = getattr(getattr(array, "metadata", None), "dimension_names", None)
-    names = [str(each or "") for each in stated or array.attrs.get("_ARRAY_DIMENSIONS") or ()]
+    said = getattr(getattr(array, "metadata", None), "dimension_names", None)
+    names = [str(each or "") for each in said or array.attrs.get("_ARRAY_DIMENSIONS") or ()]
     names = names if len(names) == array.ndim else [""] * array.ndim
     group, axes = name.rpartition("/")[0], []
     for axis, count in zip(names, array.shape):
@@ -195,24 +190,22 @@ def _image_axes(store: _Store, name: str) -> list[Axis] | None:
     image, level = next(levels, (None, None))
     if image is None or level is None:
         return None
-    stated = image.get("axes", "zyx")
-    named = [axis if isinstance(axis, dict) else {"name": axis} for axis in stated]
-    count, key = len(named), "coordinateTransformations"
+    named = [
+        axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", "zyx")
+    ]
+    key = "coordinateTransformations"
     steps = [*level.get(key, ()), *image.get(key, ())]
-    scale, shift = np.ones(count), np.zeros(count)
+    scale, shift = np.ones(len(named)), np.zeros(len(named))
     for step in steps:
-        kind = step.get("type")
-        numbers = np.asarray(step.get(str(kind), ()), np.float64)
-        if kind == "identity":
-            continue
-        if kind not in ("scale", "translation") or numbers.shape != (count,):
-            said = f"one of its {key} has the type {kind!r} and {numbers.size} numbers"
-            raise GridError(
-                f"{said}: give scale or translation, with one number for each of its {count} axes"
-            )
-        factor, moved = (numbers, 0) if kind == "scale" else (1, numbers)
-        scale, shift = scale * factor, shift * factor + moved
-    places = zip(scale.tolist(), shift.tolist()) if steps else [(None, None)] * count
+        kind = str(step.get("type"))
+        numbers = np.asarray(step.get(kind, ()), np.float64)
+        if kind not in ("identity", "scale", "translation"):
+            raise GridError(f"one of its {key} has the type {kind!r}: give scale or translation")
+        if kind == "scale":
+            scale, shift = scale * numbers, shift * numbers
+        elif kind == "translation":
+            shift = shift + numbers
+    places = zip(scale.tolist(), shift.tolist()) if steps else [(None, None)] * len(named)
     return [
         Axis(str(axis.get("name", "")).lower(), str(axis.get("unit") or ""), *place)
         for axis, place in zip(named, places)
