@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import dask
-from distributed import Client, KilledWorker, LocalCluster, get_worker, wait
+from distributed import Client, KilledWorker, LocalCluster, Security, get_worker, wait
+from distributed.comm import core as comm
 
 from .. import __version__
 from ..errors import ClusterError, SuperSdfError
@@ -75,6 +76,8 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
                     silence_logs=logging.CRITICAL,
                 )
                 server = {"address": stack.enter_context(cluster)}
+            elif not is_file:
+                asyncio.run(_greet(address))
             client = Client(**server, timeout=CONNECT_SECONDS, set_as_default=False)
         except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
             is_silent = isinstance(error, (OSError, *TIMEOUTS)) or not str(error)
@@ -94,6 +97,13 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
         for worker, version in answers.items():
             _check_version(worker, version, __version__)
         yield client
+
+
+async def _greet(address: str) -> None:
+    """Raise if a scheduler does not answer in time: a Client would wait for ever."""
+    arguments = Security().get_connection_args("client")
+    peer = await asyncio.wait_for(comm.connect(address, **arguments), CONNECT_SECONDS)
+    await peer.close()
 
 
 def _check_version(worker: str, there: Any, here: str) -> None:

@@ -74,7 +74,7 @@ class Batch:
     def run(self, progress: Progress | None = None) -> None:
         """Convert what is to be converted; call ``progress`` after each file is in the report."""
         for job in self.of(REFUSED):
-            if job.row["reason"] != self.record.rows.get(job.target, {}).get("reason"):
+            if not job.wrong and job.row["reason"] != self.record.rows.get(job.target, {}).get("reason"):
                 self.record.add(job.row)
         left = sorted(self.of(TO_DO), key=lambda job: -expected_work(job))
         total, done, died = len(left), 0, set[str]()  # outputs whose worker died once

@@ -23,8 +23,7 @@ from typing import Any, NamedTuple, TypeVar
 from ..convert import Conversion, convert
 from ..errors import FileError, GridError, OptionError, SuperSdfError, WriteError
 from ..files.output import naming
-from ..labels.files import convert_labels
-from ..labels.names import Names
+from ..labels.files import Names, convert_labels
 from ..network.network import load_network
 from ..options import Options
 from .inputs import Job, one_line
@@ -71,12 +70,14 @@ def convert_job(
             target.parent.mkdir(parents=True, exist_ok=True)
         made: Any
         if options.labels is None:
-            made, files = convert(job.source, target, network, options, force=True), [target]
+            made, names = convert(job.source, target, network, options, force=True), [job.mesh]
         else:
             where = job.source, target, network, options
             made = convert_labels(*where, names=settings.names, force=True)
-            files = [Path(label["output"]) for label in made.labels]
-        known = {path.relative_to(stage).as_posix(): fingerprint(path) for path in files}
+            for label in made.labels:
+                label["output"] = Path(label["output"]).relative_to(stage).as_posix()
+            names = [label["output"] for label in made.labels]
+        known = {name: fingerprint(stage / name) for name in names}
         row |= {"output": known if job.has_label_files else known[job.mesh], **made.report()}
         row |= {"closed": made.closed, "warnings": list(made.warnings)}
         row["stages"] = {name: round(seconds, 4) for name, seconds in made.seconds.items()}
@@ -112,11 +113,13 @@ def _check(job: Job, settings: Settings, mesh: Path, made: Conversion, sha256: s
 def _reason(error: Exception) -> str:
     """Return what went wrong, in one line; the package's own messages are for users as they are."""
     first = one_line(next(iter(str(error).splitlines()), ""))
-    if type(error) is MemoryError:
+    if isinstance(error, SuperSdfError):
+        return first
+    if isinstance(error, MemoryError):
         return "out of memory: use a smaller --factor or grid"
-    if isinstance(error, OSError) and not isinstance(error, SuperSdfError):  # a long name, say
+    if isinstance(error, OSError):  # no bug: a name too long, say
         return f"the system refuses it: {error.strerror or error}"
-    return first if isinstance(error, SuperSdfError) else f"{type(error).__name__}: {first}"
+    return f"{type(error).__name__}: {first}"
 
 
 class Death(NamedTuple):
