@@ -8,7 +8,6 @@ import pytest
 import trimesh
 
 from super_sdf import SdfGrid, load_network, make_grid, reconstruct
-from super_sdf.check.check import check_mesh
 from super_sdf.grid.sdf_grid import cubic_grid, on_samples
 
 BALLS = np.array([(4.1, 3.6, 4.9, 2.3), (5.3, 4.1, 7.0, 1.4), (5.9, 3.0, 4.2, 1.2)])
@@ -97,16 +96,6 @@ def test_the_note_names_what_is_resampled():
         "the spacing differs between axes: the values are resampled along y from 0.6 and z from 1 "
         "to 0.4, the finest, to 25 x 19 x 26 samples"
     )
-
-
-def test_the_certificate_counts_samples_only(network):
-    grid = make_grid(sampled((0.3, 0.3, 0.6)), spacing=(0.3, 0.3, 0.6))
-    found = check_mesh(reconstruct(grid, network), grid)
-    index = found.touching.points / grid.spacing
-    assert np.abs(index - np.rint(index)).max() < 1e-6
-    assert found.voxel_size == 0.3 and not found.faults()
-    assert np.abs(found.touching.residuals).mean() < 0.02
-    assert np.allclose(pear(found.touching.points), found.touching.values * 0.3, atol=1e-6)
 
 
 def test_the_command_says_what_it_resamples(folder, command):

@@ -3,10 +3,8 @@
 The browser is the distribution's; Playwright only drives it.
 """
 
-import os
 import shutil
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +20,6 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 WITHOUT_GPU = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 PATIENCE = 120_000  # milliseconds: without a GPU, on a busy machine
 MARKUP = "<b>bold<img src=x onerror=document.title='ran'>"
-OCHRE = (219, 158, 84)  # the inside of a mesh that is cut
 FAST = ("--quality", "fast", "--factor", "2", "--spacing", "1", "--device", "cpu")
 pytestmark = pytest.mark.graphics
 
@@ -46,8 +43,8 @@ def visit(browser):
     """Open an address; return the page, which has what it asked for and complained of."""
     opened = []
 
-    def go(address, **options):
-        page = browser.new_page(**{"viewport": {"width": 1000, "height": 900}, **options})
+    def go(address):
+        page = browser.new_page(viewport={"width": 1000, "height": 900})
         page.set_default_timeout(PATIENCE)
         page.requested, page.complaints = [], []
         page.on("request", lambda request: page.requested.append(request.url))
@@ -62,22 +59,14 @@ def visit(browser):
         page.close()
 
 
-def run(folder, *arguments):
-    """Run a command in a folder; return its exit code."""
-    before = os.getcwd()
-    os.chdir(folder)
-    try:
-        return CliRunner().invoke(cli, list(arguments)).exit_code
-    finally:
-        os.chdir(before)
-
-
 @pytest.fixture(scope="module")
 def report(tmp_path_factory):
     """The address of the page of one conversion."""
     folder = tmp_path_factory.mktemp("report")
     np.save(folder / "a.npy", wedge())
-    assert run(folder, "upsample", "a.npy", "a.ply", *FAST, "--report", "a.html") == 0
+    files = [str(folder / name) for name in ("a.npy", "a.ply", "a.html")]
+    words = ["upsample", *files[:2], *FAST, "--report", files[2]]
+    assert CliRunner().invoke(cli, words).exit_code == 0
     return (folder / "a.html").as_uri()
 
 
@@ -89,8 +78,9 @@ def batch(tmp_path_factory):
     np.save(folder / "in" / f"{MARKUP}.npy", ball(12, 3.0).values)
     np.save(folder / "in" / "b.npy", ball(12, 4.0).values)
     np.save(folder / "in" / "bad.npy", np.ones((4, 4, 4)))
-    arguments = ("in", "--out", "out", "--jobs", "1", "--report", "page & more.html")
-    assert run(folder, "batch", *arguments, *FAST) == 1
+    where = [str(folder / name) for name in ("in", "out", "page & more.html")]
+    words = ["batch", where[0], "--out", where[1], "--report", where[2], "--jobs", "1", *FAST]
+    assert CliRunner().invoke(cli, words).exit_code == 1
     return (folder / "page & more.html").as_uri()
 
 
@@ -139,7 +129,7 @@ def test_the_page_opens_with_two_views_and_asks_for_nothing(visit, report):
     assert any("Content Security Policy" in said for said in page.complaints)
 
 
-def test_turning_one_view_turns_both_alike_and_keys_turn_and_zoom(visit, report):
+def test_turning_one_view_turns_both_and_each_switch_changes_the_pictures_and_back(visit, report):
     page = visit(report)
     before = pictures(page)
     box = page.locator("canvas").last.bounding_box()
@@ -148,22 +138,9 @@ def test_turning_one_view_turns_both_alike_and_keys_turn_and_zoom(visit, report)
     page.mouse.move(box["x"] + 320, box["y"] + 150, steps=4)
     page.mouse.up()
     turned = pictures(page)
-    page.locator(".views").focus()
-    for _ in range(8):
-        page.keyboard.press("ArrowLeft")
-    after = pictures(page)
-    assert max(map(overlap, before + turned, turned + after)) < 0.9
-    assert min(overlap(*turned), overlap(*after)) > 0.9
+    assert max(map(overlap, before, turned)) < 0.9 < overlap(*turned)
     page.get_by_role("button", name="Reset view").click()
     assert max(changed(before, pictures(page))) < 0.01
-    page.locator(".views").press("-")
-    for old, new in zip(before, pictures(page)):
-        assert silhouette(new).mean() < 0.9 * silhouette(old).mean()
-
-
-def test_each_switch_changes_the_pictures_and_back(visit, report):
-    page = visit(report)
-    before = pictures(page)
     for label in ("Normals", "Flat shading", "Wireframe"):
         control = page.get_by_label(label)
         control.click()
@@ -171,18 +148,16 @@ def test_each_switch_changes_the_pictures_and_back(visit, report):
         (page.get_by_label("Plain") if label == "Normals" else control).click()
         assert max(changed(before, pictures(page))) < 0.01, label
     page.get_by_label("Residuals").check()
-    assert "does not reach them by 0.1 voxel or more" in page.locator(".legend").inner_text()
     coarse = pictures(page)[1]  # cuts off edges: does not reach the balls there
     blue = (coarse[..., 2] > coarse[..., 0] + 80) & silhouette(coarse)
     assert blue.mean() > 0.01
 
 
-def test_a_batch_loads_meshes_from_beside_the_page_when_they_are_asked_for(visit, batch, tmp_path):
-    """Names with markup are text; meshes that are gone are said."""
+def test_a_batch_loads_meshes_from_beside_the_page_and_names_are_text(visit, batch):
     page = visit(batch)
     names = page.locator(".name").all_inner_texts()
     assert f"{MARKUP}.ply" in [name.strip() for name in names]
-    assert page.locator("img[src=x], .name b").count() == 0 and page.title() == "Batch: out"
+    assert page.locator("img[src=x], .name b").count() == 0 and page.title().endswith("out")
     assert page.requested == [batch] and page.locator("canvas").count() == 0
     assert "failed" in page.locator(".file").first.inner_text()
     page.locator("summary", has_text="b.ply").click()
@@ -192,9 +167,3 @@ def test_a_batch_loads_meshes_from_beside_the_page_when_they_are_asked_for(visit
     page.locator("summary", has_text=MARKUP).click()  # only one viewer is open at a time
     page.locator(".file", has_text=MARKUP).locator("canvas").first.wait_for()
     assert page.locator("canvas").count() == 2 and page.complaints == []
-    copy = tmp_path / "moved.html"
-    shutil.copyfile(Path(page.evaluate("decodeURIComponent(location.pathname)")), copy)
-    page = visit(copy.as_uri())
-    page.locator("summary", has_text="b.ply").click()
-    said = page.get_by_text("The meshes cannot be shown: ").inner_text()
-    assert said.endswith(".js is not beside this page")

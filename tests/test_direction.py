@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_anisotropic import pear as to_pear
 
-from super_sdf import make_grid, read_grid, reconstruct
+from super_sdf import make_grid, reconstruct
 from super_sdf.errors import GridError
-from super_sdf.files.grids import write_grid
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 ORIGIN = np.array([10.0, -20.0, 5.0])
@@ -58,20 +57,6 @@ NO_DIRECTION = {
 def test_what_is_no_direction_is_refused(said):
     place = {"spacing": 0.5, "direction": NO_DIRECTION[said]}
     assert refusal(GridError, make_grid, pear(), **place) == f"direction is {said}"
-
-
-def test_npz_keeps_the_direction(folder):
-    direction = turn(0.4, 0.1, -0.3) @ MIRROR
-    grid = make_grid(pear(), spacing=0.5, origin=ORIGIN, direction=direction)
-    write_grid(grid, "a.npz")
-    again = read_grid("a.npz")
-    assert again.direction == grid.direction and again.is_mirrored
-    assert "direction -" in repr(again) or "direction 0" in repr(again)
-    write_grid(make_grid(pear(), spacing=0.5), "b.npz")
-    assert sorted(np.load("b.npz")) == ["origin", "spacing", "values"]
-    np.savez("c.npz", values=pear(), direction=np.zeros(12))
-    with pytest.raises(GridError, match=r"direction\] has shape \(12,\).*: give nine num"):
-        read_grid("c.npz")
 
 
 def test_the_command_takes_a_direction_and_check_agrees(folder, command):

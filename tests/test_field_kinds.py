@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from conftest import ball, refusal, trilinear
+from conftest import refusal, trilinear
 from scipy import ndimage
 
-from lab.surfaces import isosurface
-from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct
+from super_sdf import SdfGrid, make_grid, reconstruct
 from super_sdf.errors import GridError, OptionError
 from super_sdf.options import FIELDS
 
@@ -245,47 +244,11 @@ def opposite(patches, table, voxels, offsets):
     return -trilinear(patches, table, voxels, offsets)
 
 
-@pytest.mark.parametrize("network", [trilinear, opposite])
-def test_samples_of_a_mask_keep_their_side(network):
-    grid = make_grid(MASK, **PLACE)
-    field = pipeline.upsample(grid, network, 4)
-    own = MASK[tuple(field.voxel_ijk.T)]
-    np.testing.assert_array_equal(field.blocks[62] <= 0, own)
-    assert reconstruct(grid, network).is_closed()
-
-
-@pytest.mark.parametrize("low", [-1, -10])
-def test_distances_over_their_truncation_get_their_unit_back(low):
-    grid = make_grid(np.clip(box(), low, 1), spacing=1.5, origin=0)
-    assert grid.field.kind == "truncated"
-    assert grid.notes[0].startswith("the values are divided by their slope, 0.6")
-    kept = np.abs(box()) < 0.9
-    np.testing.assert_allclose(grid.values[kept], 1.5 * box()[kept], rtol=0.03)
-
-
 def test_a_smooth_field_of_another_slope_is_that_of_its_spline():
     mesh = reconstruct(make_grid(ellipsoid(), **PLACE, field="scaled"), opposite)
     x, y, z = (mesh.vertices.T + 0.5) / 32 - 0.5
     value = (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.15) ** 2 - 1
     assert np.abs(value).max() < 0.02  # a twentieth of a change from sample to sample
-
-
-def test_the_command_takes_labels_levels_and_scales(folder, command):
-    np.save("labels.npy", np.where(MASK, 3, 0) + 2 * (box() < -9))
-    np.save("grid.npy", 100 - 40 * ball(16, 5).values)
-    base = "upsample", "--spacing", "1", "--force", "--quality", "fast"
-    labels, level = (*base, "labels.npy", "out.ply"), (*base, "grid.npy", "out.ply", "--level", 100)
-    assert command(*labels, "--label", "3")[0] == 0
-    assert command(*level, "--scale", "0.025")[0] == 0
-    check = "check", "out.ply", "grid.npy", "--spacing", 1, "--level", 100, "--scale", 0.025
-    assert command(*check)[0] == 0
-    whole = "give a whole number, -2^63 to 2^64 - 1"
-    for run, said in (
-        ((*labels, "--label", 2**64), f"--label is {2**64}: {whole}"),
-        ((*level, "--scale", "0"), "--scale is 0: give a number greater than 0"),
-    ):
-        code, _, err = command(*run)
-        assert (code, err.splitlines()[-1]) == (2, f"Error: {said}")
 
 
 def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
@@ -304,21 +267,3 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
             "their signs make no mask: they look like densities: give the level of their surface, "
             f"such as --level {level}"
         )
-
-
-def torus_at(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """Return distances to a torus that stands askew in a grid of 24^3, in voxels."""
-    x, y, z = x - 11.6, y - 11.3, z - 11.7
-    x, z = 0.8 * x + 0.6 * z, 0.8 * z - 0.6 * x
-    y, z = 0.96 * y + 0.28 * z, 0.96 * z - 0.28 * y
-    return np.hypot(np.hypot(x, y) - 6.7, z) - 2.8
-
-
-@pytest.mark.parametrize("factor", [1 + 0.1 * np.sin(np.indices((24,) * 3).sum(0) / 4), 0.91])
-def test_what_is_nearly_a_distance_is_no_worse_than_marching_cubes(factor):
-    """Of slopes of .9 to 1.1, and in another unit."""
-    values = torus_at(*np.indices((24,) * 3)) * factor
-    mesh = reconstruct(make_grid(values, **PLACE), load_network())
-    plain = isosurface(values.astype(np.float32), 1.0, 0.0)
-    ours, theirs = (np.abs(torus_at(*m.vertices.T)).mean() for m in (mesh, plain))
-    assert mesh.is_closed() and ours < 0.8 * theirs

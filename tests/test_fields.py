@@ -113,21 +113,6 @@ def test_the_examples_of_the_docs_run(capsys):
     assert Path("part-sharp.ply").read_bytes() == Path("want.ply").read_bytes()
 
 
-def test_the_keys_are_as_documented():
-    write_field(upsample(plane(), trilinear, 4), "field.npz")
-    data = np.load("field.npz")
-    text = (Path(__file__).parent.parent / "docs" / "reference" / "files.md").read_text()
-    table = text[text.index("| Key |") : text.index("Distances are float64")]
-    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
-    assert sorted(re.findall(r"`(\w+)`", " ".join(rows))) == sorted(data.files)
-    samples = data["origin"] + data["spacing"] * data["sample_voxels"]
-    assert np.abs(data["sample_distances"] - to_plane(samples)).max() < 1e-6
-    assert tuple(data["shape"]) == (12, 11, 10) and int(data["version"]) == 1
-    assert data["leaves"] and float(data["offset"]) == 0
-    border = data["origin"] + data["spacing"] * data["border_inside"]
-    assert len(border) and (to_plane(border) < 0).all()
-
-
 @pytest.fixture(scope="module")
 def good(tmp_path_factory) -> dict[str, np.ndarray]:
     """Return the arrays of a field's file."""
@@ -168,9 +153,11 @@ def test_files_that_are_no_fields_are_refused_in_one_line(said, good):
 
 def test_a_lattice_that_does_not_fit_is_refused(monkeypatch):
     monkeypatch.setattr("super_sdf.threads.free_memory", lambda: 10**9)
-    said = refusal(OutOfMemoryError, writing.check_field_fits, Path("a.vti"), (1025,) * 3)
+    with writing.saving_field("a.vti") as file:
+        said = refusal(OutOfMemoryError, file.check_fits, (256,) * 3, 4)
     assert said.startswith("a.vti, 1025 x 1025 x 1025 values, needs 4.31 GB of memory, 1.00 GB are")
-    writing.check_field_fits(Path("a.npy"), (1025,) * 3)
+    with writing.saving_field("a.npy") as file:
+        file.check_fits((256,) * 3, 4)
 
 
 def test_the_command_writes_the_mesh_and_the_field(command):

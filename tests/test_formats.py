@@ -7,7 +7,6 @@ by the format's own library; where each sample is in the world is said by that l
 from __future__ import annotations
 
 import itertools
-import json
 import os
 from pathlib import Path
 
@@ -20,7 +19,6 @@ import pyvista
 import SimpleITK as sitk  # noqa: N813
 import tifffile
 import trimesh
-import zarr
 from conftest import ball
 from numpy.typing import ArrayLike
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
@@ -235,31 +233,6 @@ def test_components_and_missing_axes_are_refused():
             read_grid(name)
 
 
-def test_batch_takes_the_same_inputs(command):
-    """Arrays of a file by name, folders that are grids, and double suffixes."""
-    affine = affine_of(np.eye(3))
-    os.mkdir("in")
-    save_nifti("in/a.nii.gz", affine)
-    with h5py.File("two.h5", "w") as file:
-        file["deep/b"] = file["c"] = sampled(affine).T
-    store = zarr.create_array("in/d.zarr", shape=SIZES[::-1], chunks=(5, 6, 7), dtype="f4")
-    store[:] = sampled(affine).T
-    arguments = ["in", "two.h5:/deep/b", "two.h5:c", "--out", "out", "--quality", "fast"]
-    arguments += ["--spacing", "0.5", "--jobs", "1", "--json"]
-    code, out, err = command("batch", *arguments)
-    assert code == 0, err
-    names = sorted(path.name for path in Path("out").glob("*.ply"))
-    assert names == ["a.ply", "d.ply", "two-c.ply", "two-deep-b.ply"]
-    options = ("--quality", "fast", "--spacing", 0.5)
-    assert command("upsample", "in/a.nii.gz", "a.ply", *options)[0] == 0
-    assert Path("a.ply").read_bytes() == Path("out/a.ply").read_bytes()
-    before = Path("out/d.ply").read_bytes()
-    store[:] = sampled(affine).T + 0.2
-    code, out, err = command("batch", *arguments)
-    assert code == 0 and json.loads(out)["done"] == 1, out
-    assert Path("out/d.ply").read_bytes() != before
-
-
 def test_the_page_on_formats_lists_those_of_the_table():
     page = (Path(__file__).parent.parent / "docs" / "guides" / "formats.md").read_text()
     for format_ in (*formats.FORMATS, formats.DICOM):
@@ -273,11 +246,3 @@ def test_every_dtype_and_order_is_read(dtype, order):
     values = np.clip(ball().values * 8, -120, 120).astype(dtype)
     np.save("in.npy", np.asarray(values, order=order))
     np.testing.assert_array_equal(read_grid("in.npy", spacing=8).values, values)
-
-
-def test_options_go_before_the_keys_of_an_npz():
-    np.savez("in.npz", values=ball().values, spacing=1.0, origin=[1, 2, 3])
-    grid = read_grid("in.npz")
-    assert grid.origin == (1.0, 2.0, 3.0) and grid.notes == ()
-    other = read_grid("in.npz", origin=(4, 5, 6), spacing=1.01)
-    assert other.origin == (4.0, 5.0, 6.0) and other.spacing == (1.01,) * 3

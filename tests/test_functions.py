@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 from conftest import refusal, trilinear
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from super_sdf import DistanceFunction, extract_mesh, make_grid, reconstruct, upsample
+from super_sdf import DistanceFunction, reconstruct
 from super_sdf.check.check import check_mesh
 from super_sdf.errors import GridError, OptionError, OptionTypeError
-from super_sdf.grid.derived import sample_near
 
 H = 2 / 19
 BOX = (-1.0, 1.0)
@@ -47,44 +44,6 @@ def test_vertices_lie_where_the_function_is_0():
     assert is_on(torus, mesh)
     assert mesh.is_closed()
     assert 2 * len(mesh.vertices) <= asked.evaluations < 20**3 + 2.3 * len(mesh.vertices)
-    nodes = 4**3 * upsample(asked.sample(BOX, H), trilinear).counts["band_voxels"]
-    assert asked.evaluations - 20**3 < 1.5 * nodes
-
-
-def torus_samples():
-    axis = -1 + H * np.arange(20)
-    points = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), 3).reshape(-1, 3)
-    return torus(points).reshape((20,) * 3).astype(np.float32)
-
-
-def test_the_mesh_of_a_field_and_of_a_grid_is_the_same():
-    grid = DistanceFunction(torus).sample(BOX, H, np.inf)
-    np.testing.assert_allclose(grid.values, torus_samples(), atol=1e-6)
-    assert grid.origin == (-1, -1, -1) and grid.shape == (20, 20, 20)
-    one = reconstruct(grid, trilinear, function=torus)
-    other = extract_mesh(upsample(grid, trilinear), function=torus)
-    np.testing.assert_array_equal(one.vertices, other.vertices)
-    assert is_on(torus, one)
-
-
-@given(st.integers(0, 10**6))
-@settings(max_examples=40)
-def test_samples_near_the_surface_are_those_of_the_whole_lattice(seed):
-    random = np.random.default_rng(seed)
-    shape, step = random.integers(9, 40, 3), random.uniform(0.02, 0.08, 3)
-    middles = random.uniform(0, 1, (3, 3)) * shape * step
-    radii = random.uniform(0.01, 0.4, 3)
-    low = random.uniform(-9, 9, 3)
-
-    def balls(points):
-        return (np.linalg.norm(points[:, None] - low - middles, axis=2) - radii).min(1)
-
-    asked = DistanceFunction(balls)
-    near, cut = sample_near(lambda ijk: asked(low + step * ijk), tuple(shape), step, 0.1)
-    whole = balls(low + step * np.argwhere(np.ones(shape))).reshape(shape)
-    np.testing.assert_allclose(np.clip(near, -cut, cut), np.clip(whole, -cut, cut), atol=1e-6)
-    assert 0.08 < cut < 0.18  # no slope is above the square root of 3
-    assert asked.evaluations == np.isfinite(near).sum()
 
 
 def test_edges_and_corners_are_those_of_the_function():
@@ -97,9 +56,6 @@ def test_edges_and_corners_are_those_of_the_function():
     )
     assert np.median(near) < 1e-4 < 1e-2 < np.median(far)
     assert near.max() < 0.05
-    inside = np.abs(mesh.vertices @ TURNED) - SIDES
-    on_edges = (np.abs(inside) < 2e-3 * H).sum(1) >= 2
-    assert on_edges.sum() > 12 * 0.9 / H  # at least as many as the coarse lattice has cells there
     assert 4 * off(block, mesh).mean() < off(block, plain).mean()
     assert mesh.is_closed()
     assert check_mesh(mesh, DistanceFunction(block).sample(BOX, H)).surface.faults() == []
@@ -113,17 +69,6 @@ def test_any_function_that_changes_sign_there_will_do(sign):
     mesh = reconstruct(None, trilinear, function=occupancy, bounds=BOX, spacing=H)
     assert off(torus, mesh).mean() < 1e-4
     assert mesh.is_closed() and mesh.volume() > 0
-
-
-def test_a_jump_within_a_voxel_is_found():
-    def occupancy(points):
-        return np.tanh(block(points) / (0.05 * H))
-
-    plain = reconstruct(DistanceFunction(occupancy).sample(BOX, H))
-    mesh = reconstruct(function=occupancy, bounds=BOX, spacing=H)
-    assert np.median(off(block, mesh)) < 1e-3 < 0.05 < np.median(off(block, plain))
-    assert off(block, mesh).mean() < 0.5 * off(block, plain).mean()
-    assert check_mesh(mesh, DistanceFunction(occupancy).sample(BOX, H)).surface.faults() == []
 
 
 def cubes(points, gap):
@@ -165,53 +110,43 @@ def test_an_offset_is_where_the_function_has_it(sign):
 class Tensor:
     """What PyTorch's tensors do: NumPy takes one only without gradients, from the CPU."""
 
-    def __init__(self, values, steps=("detach", "cpu")):
-        self.values, self.steps = values, steps
-        self.dtype = "torch.float32"
+    dtype = "torch.float32"
+
+    def __init__(self, values, detached=False):
+        self.values, self.detached = values, detached
 
     def detach(self):
-        return Tensor(self.values, [step for step in self.steps if step != "detach"])
+        return Tensor(self.values, True)
 
     def cpu(self):
-        return Tensor(self.values, [step for step in self.steps if step != "cpu"])
+        return self.values if self.detached else self
 
     def __array__(self, dtype=None, copy=None):
-        if self.steps:
-            raise TypeError(f"call {self.steps[0]}")
-        return np.array(self.values, dtype)
+        raise TypeError("call detach and cpu")
 
 
 def test_tensors_are_taken():
     mesh = reconstruct(None, trilinear, function=lambda p: Tensor(torus(p)), bounds=BOX, spacing=H)
     assert is_on(torus, mesh)
-    grid = make_grid(Tensor(torus_samples()), spacing=H)
-    np.testing.assert_array_equal(grid.values, torus_samples())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "kind", "message"),
-    [
-        ({"function": 3}, OptionTypeError, "function is 3: give a function of points (n, 3)"),
-        ({}, OptionTypeError, "grid is None: make one with make_grid(values, spacing=...) or "
-         "read_grid(path)"),
-        ({"function": torus}, OptionError,
-         "a function needs bounds and spacing, or a grid of its samples"),
-        ({"function": torus, "bounds": (1, -1), "spacing": H}, OptionError,
-         "bounds are (1, -1): the box is empty, give (lowest, highest)"),
-        ({"function": torus, "bounds": BOX, "spacing": 1e-4}, OptionError,
-         "spacing is 0.0001: the box takes more than 2^31 samples"),
-        ({"function": lambda p: p, "bounds": BOX, "spacing": H}, OptionTypeError,
-         "the function returns an array of shape (162, 3) for 162 points: return one number for "
-         "each"),
-        ({"function": lambda p: np.full(len(p), np.nan), "bounds": BOX, "spacing": H}, GridError,
-         "the function has no finite value at any sample: give other bounds"),
-        ({"function": lambda p: np.tanh(8 * torus(p)), "bounds": BOX, "spacing": H, "offset": 0.01},
-         OptionError, "offset is 0.01: the function is no distance, leave it out"),
-        ({"function": lambda p: p[:, 0] + 9, "bounds": BOX, "spacing": H}, GridError,
-         "the function goes from 8 to 10 at 8,000 samples, and its surface is where it is 0: "
-         "subtract a level, or give a finer spacing or other bounds"),
-    ],
-)  # fmt: skip
+ASKED = {"function": torus, "bounds": BOX, "spacing": H}
+
+
+@pytest.mark.parametrize(("arguments", "kind", "message"), [
+    ({"function": 3}, OptionTypeError, "function is 3: give a function of points (n, 3)"),
+    ({}, OptionTypeError, "grid is None: make one with make_grid(values, spacing=...) or "),
+    ({"function": torus}, OptionError, "a function needs bounds and spacing, or a grid of its "),
+    ({**ASKED, "bounds": (1, -1)}, OptionError, "bounds are (1, -1): the box is empty, give "),
+    ({**ASKED, "function": lambda p: p}, OptionTypeError,
+     "the function returns an array of shape (162, 3) for 162 points: return one number for each"),
+    ({**ASKED, "function": lambda p: np.full(len(p), np.nan)}, GridError,
+     "the function has no finite value at any sample: give other bounds"),
+    ({**ASKED, "function": lambda p: np.tanh(8 * torus(p)), "offset": 0.01}, OptionError,
+     "offset is 0.01: the function is no distance, leave it out"),
+    ({**ASKED, "function": lambda p: p[:, 0] + 9}, GridError,
+     "the function goes from 8 to 10 at 8,000 samples, and its surface is where it is 0: "),
+])  # fmt: skip
 def test_errors(arguments, kind, message):
     said = refusal(kind, reconstruct, network=trilinear, **arguments)
     assert said.startswith(message), said

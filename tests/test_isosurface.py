@@ -14,8 +14,9 @@ from super_sdf import threads as limits
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField, SampleSpheres
 from super_sdf.refine.nodes import block_ijk, share_parts
-from super_sdf.surface.cell_cases import FACES, make_tables, tables
+from super_sdf.surface.cell_cases import make_tables
 from super_sdf.surface.extract import extract, reach_in_voxels
+from super_sdf.surface.marching import FACES, tables
 from super_sdf.surface.mesh import CLEARANCE
 
 

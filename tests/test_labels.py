@@ -1,19 +1,24 @@
-"""Labels of an image in one run: closed meshes, walls that coincide, no worse than one by one."""
+"""Labels of an image in one run: closed meshes, shared walls, names, colours and volumes."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
 from pathlib import Path
+from zipfile import ZipFile
 
 import nibabel
 import numpy as np
 import pytest
 import trimesh
-from conftest import trilinear
+from conftest import refusal, trilinear
 
 from super_sdf import load_network, make_grid, reconstruct, reconstruct_labels
-from super_sdf.errors import GridError, OptionError, OutOfMemoryError
+from super_sdf.check.check import check_mesh
+from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
+from super_sdf.grid.sdf_grid import volume_of_samples
+from super_sdf.labels.files import LabelName, read_names
+from super_sdf.labels.volumes import keep_volumes
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +58,6 @@ IMAGES = {
     # four labels meet at a line, eight at a point
     "octants": 1 + sum((np.indices((8, 8, 8))[axis] >= 4) << axis for axis in range(3)),
     "nested": nested(),
-    "layers": np.arange(6)[:, None, None] // 2 * np.ones((6, 4, 5), int),
 }
 
 
@@ -79,9 +83,6 @@ def test_meshes_are_closed_and_share_their_walls(name, factor):
         assert set(triangles[label].values()) == {1}
     for a, b, c in seen:  # no two labels are on the same side of a triangle, nor three beside it
         assert seen[a, b, c] == 1
-    if name == "layers":  # a wall across the grid, of which each label has one side
-        one, other = (set(map(bytes, mesh.vertices)) for mesh in meshes.values())
-        assert len(one & other) > 50
 
 
 def test_what_does_not_fit_in_memory_is_refused():
@@ -103,13 +104,8 @@ def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
 
 @pytest.mark.parametrize(
     ("dtype", "low", "high"),
-    [
-        (np.int16, -5, 300),
-        (np.uint64, 2**53 + 1, 2**53),
-        (np.int64, -(2**63), 2**62 + 1),
-        (np.float64, -1, 2**40),
-    ],
-)
+    [(np.uint64, 2**53 + 1, 2**53), (np.int64, -(2**63), 2**62 + 1), (float, -1, 2**40)],
+)  # fmt: skip
 def test_labels_of_any_type_are_compared_as_whole_numbers(dtype, low, high):
     labels = np.zeros((7, 6, 6), dtype)
     labels[2:4, 2:4, 2:4], labels[4:6, 2:4, 2:4] = low, high
@@ -120,27 +116,23 @@ def test_labels_of_any_type_are_compared_as_whole_numbers(dtype, low, high):
     assert list(reconstruct_labels(labels, [0, low], trilinear, 2, spacing=1)) == sorted([0, low])
 
 
-AS_DENSITIES = "choose what is above a value with --level if they are densities"
 UNFIT = {
     "labels is 3: give all, or some labels such as 1,2,3": (IMAGES["noise"], 3),
     "labels are 1,001: give 1 to 1,000 at a time": (IMAGES["noise"], range(1001)),
     "labels is 1.5: give a whole number, -2^63 to 2^64 - 1": (IMAGES["noise"], [1, 1.5]),
     "no sample has the label 5: the labels are 0, 1, 2, 3": (IMAGES["noise"], [1, 5]),
     "every sample has the label 0: there is no surface": (np.zeros((4, 4, 4), int), "all"),
-    f"a value is 0.5: labels are whole numbers; {AS_DENSITIES}": (IMAGES["noise"] / 2, "all"),
-    "the values are more than 1,000 different whole numbers: choose some of them (--labels 1,2,3) "
-    "if they are labels, or a --level if they are densities": (
-        np.arange(11**3).reshape(11, 11, 11),
-        "all",
-    ),
-}
+    "a value is 0.5: labels are whole numbers; ": (IMAGES["noise"] / 2, "all"),
+    "the values are more than 1,000 different whole numbers: ": (
+        np.arange(11**3).reshape(11, 11, 11), "all"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("message", UNFIT)
 def test_wrong_labels_and_values_that_are_none_are_one_line(message):
     with pytest.raises(OptionError if message.startswith("labels ") else GridError) as caught:
         reconstruct_labels(*UNFIT[message], trilinear)
-    assert str(caught.value) == message
+    assert str(caught.value).startswith(message)
 
 
 @pytest.fixture
@@ -176,30 +168,172 @@ def test_the_command_writes_a_file_for_each_label(image, command):
     np.testing.assert_allclose((low + high) / 2, (3, -9, 23), atol=0.5)
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".3mf"])
-def test_one_file_holds_all_labels_as_parts(image, suffix, command):
-    assert command("upsample", image, f"all{suffix}", "--labels", "1,12", *PLAIN)[0] == 0
-    parts = trimesh.load(f"all{suffix}", process=False).geometry
-    assert sorted(parts) == ["label 1", "label 12"]
-    assert all(mesh.is_watertight and mesh.volume > 0 for mesh in parts.values())
-    one, other = (set(map(bytes, mesh.vertices.astype(np.float32))) for mesh in parts.values())
-    assert len(one & other) > 25  # the vertices of the wall
+@pytest.mark.parametrize(("words", "name"), [
+    ("--simplify 0.1", "simplify 0.1"), ("--mesher sharp", "mesher 'sharp'"),
+    ("--open", "open"), ("--save-field f.npz", "save-field"),
+])  # fmt: skip
+def test_options_that_would_tear_the_walls_are_refused(words, name, image, command):
+    code, _, err = command("upsample", image, "a.ply", "--labels", "all", *words.split(), *PLAIN)
+    assert code == 2 and f"Error: {name} does not go with labels, which share their walls: " in err
+    assert not Path("a-1.ply").exists()
+
+
+TABLES = {
+    "slicer.ctbl": "# Color table file\n0 Background 0 0 0 0\n1 liver 221 130 101 255\n"
+    "5 left_kidney 185 102 83 255\n",
+    "snap.txt": '# ITK-SNAP\n    0     0    0    0        0  0  0    "Clear Label"\n'
+    '    1   221  130  101        1  1  1    "liver"\n'
+    '    5   185  102   83        1  1  1    "left_kidney"\n',
+    "FreeSurferColorLUT.txt": "#No. Label Name:       R   G   B   A\n\n1   liver   221 130 101 0\n"
+    "5   left_kidney   185 102 83 0\n",
+    "map.csv": "index,name,r,g,b\n1,liver,221,130,101\n5,left_kidney,185,102,83\n",
+    "map.tsv": "1\tliver\t221\t130\t101\n5\tleft_kidney\t185\t102\t83\n",
+}
+LIVER, KIDNEY = LabelName("liver", (221, 130, 101)), LabelName("left_kidney", (185, 102, 83))
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_tables_with_colours(name, folder):
+    Path(name).write_text(TABLES[name])
+    names = read_names(name)
+    assert (names[1], names[5]) == (LIVER, KIDNEY)
+
+
+def test_names_in_json(folder):
+    one, other = {"1": "liver", "5": "left kidney"}, {"liver": 1, "left kidney": 5}
+    for content in (one, other, {"labels": {"background": 0, **other}}):
+        Path("names.json").write_text(json.dumps(content))
+        names = read_names("names.json")
+        assert names[1] == LabelName("liver") and names[5] == LabelName("left kidney")
 
 
 @pytest.mark.parametrize(
-    ("words", "name"),
+    ("name", "content", "message"),
     [
-        ("--simplify 0.1", "simplify 0.1"),
-        ("--mesher sharp", "mesher 'sharp'"),
-        ("--open", "open"),
-        ("--save-field f.npz", "save-field"),
+        ("a.json", "[1]", "a.json cannot be read as a table of labels: it is no object of names"),
+        ("a.txt", "liver\n", "a.txt names no label: give lines such as '1 liver'"),
+        ("a.csv", b"\xff\xfe\x00", "a.csv cannot be read as a table of labels: 'utf-8' codec"),
     ],
-)
-def test_options_that_would_tear_the_walls_are_refused(words, name, image, command):
-    code, _, err = command("upsample", image, "a.ply", "--labels", "all", *words.split(), *PLAIN)
-    assert (code, err.splitlines()[-1]) == (
-        2,
-        f"Error: {name} does not go with labels, which share their walls: leave it out, or mesh "
-        "one label (--label)",
+)  # fmt: skip
+def test_what_is_no_table(name, content, message, folder):
+    Path(name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    assert refusal(FileError, read_names, name).startswith(message)
+    assert refusal(FileError, read_names, "none.txt") == "none.txt does not exist"
+
+
+@pytest.fixture
+def boxes(folder):
+    """Two boxes that share a wall, and a small one apart, twice in label 5."""
+    labels = np.zeros((16, 12, 12), np.uint8)
+    labels[3:8, 3:9, 3:9], labels[8:13, 3:9, 3:9] = 1, 5
+    labels[14, 1, 1] = 5
+    np.savez("labels.npz", values=labels, spacing=(0.5, 1.0, 2.0), origin=0.0)
+    Path("names.ctbl").write_text(TABLES["slicer.ctbl"].replace("liver", "liver&co"))
+    return "labels.npz"
+
+
+def convert(command, image, out, labels="all", *more):
+    words = ("upsample", image, out, "--labels", labels, "--factor", 2, "--json", *more)
+    code, said, err = command(*words)
+    assert code == 0, err
+    return json.loads(said)["labels"], err
+
+
+def test_files_and_parts_have_the_names(command, boxes):
+    rows, err = convert(command, boxes, "o.stl", "all", "--names", "names.ctbl")
+    assert [row["output"] for row in rows] == ["o-liver_co.stl", "o-left_kidney.stl"]
+    assert [row["name"] for row in rows] == ["liver&co", "left_kidney"]
+    assert [row["sample_volume"] for row in rows] == [180.0, 181.0]
+    assert [row["components"] for row in rows] == [1, 2]
+    assert "o-left_kidney.stl: left_kidney, " in err and " of its samples 181" in err
+    for suffix in (".glb", ".3mf"):
+        rows, _ = convert(command, boxes, f"o{suffix}", "all", "--names", "names.ctbl")
+        parts = trimesh.load(f"o{suffix}", process=False).geometry
+        assert sorted(parts) == ["left_kidney", "liver&co"]
+    colour = trimesh.load("o.glb").geometry["liver&co"].visual.material.baseColorFactor
+    linear = ((np.array([221, 130, 101]) / 255 + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(colour[:3] / 255, linear, atol=3e-3)
+    with ZipFile("o.3mf") as archive:
+        model = archive.read("3D/3dmodel.model").decode()
+    assert '<base name="liver&amp;co" displaycolor="#DD8265"/>' in model
+    assert '<object id="1" name="liver&amp;co" pid="3" pindex="0" type="model">' in model
+
+
+def test_labels_are_chosen_by_name(command, boxes):
+    rows, _ = convert(command, boxes, "o.ply", "left_kidney", "--names", "names.ctbl")
+    assert [(row["label"], row["output"]) for row in rows] == [(5, "o-left_kidney.ply")]
+    for table, names, ends in (
+        ('{"1": "a/b", "5": "A:b"}', ["a/b", "A:b"], ["a_b-1", "A_b-5"]),
+        ('{"1": "label 5"}', ["label 5 1", "label 5 5"], ["label_5_1", "5"]),
+        ('{"1": "5"}', ["5", "label 5"], ["5-1", "5-5"]),
+        ('{"1": "", "5": "\U0001f600"}', ["label 1", "\U0001f600"], ["1", "label"]),
+    ):
+        Path("t.json").write_text(table)
+        rows, _ = convert(command, boxes, "t.stl", "all", "--names", "t.json", "--force")
+        assert [row["name"] for row in rows] == names
+        assert [row["output"] for row in rows] == [f"t-{end}.stl" for end in ends]
+    known = "names of the table (Background, liver&co, left_kidney)"
+    for words, said in (
+        (("--labels", "lung"), f"labels has 'lung': give numbers, or {known}"),
+        ((), "--names names.ctbl is for --labels: give that, too"),
+    ):
+        run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words
+        assert command(*run) == (2, "", f"Error: {said}\n")
+
+
+SPACING = (1.5, 1.5, 4.0)
+
+
+MASK = painted((18, 19, 20), (1, 1, 1), [ball((8.3, 9.1, 9.6), 6.7)]) > 0
+
+
+def test_a_mask_has_the_volume_of_its_samples():
+    grid = make_grid(MASK, spacing=0.5)
+    mesh = reconstruct(grid)
+    volume = volume_of_samples(grid)
+    assert volume == MASK.sum() / 8
+    assert mesh.volume() < 0.985 * volume
+    (kept,) = keep_volumes([mesh], [volume], 0.5)
+    assert kept.volume() == pytest.approx(volume, rel=1e-5)
+    assert check_mesh(kept, grid).surface.faults() == []
+    away = np.linalg.norm(kept.vertices - mesh.vertices, axis=1)
+    assert 0.25 < away.min() / away.max() < 1 and away.max() < 0.05 * 0.5
+
+
+def test_labels_have_the_volumes_of_their_samples_and_share_their_walls():
+    labels = painted((42, 32, 12), SPACING, [ball((22, 24, 24), 16), ball((44, 24, 24), 11)])
+    plain, kept = (
+        reconstruct_labels(labels, spacing=SPACING, keep_volume=k) for k in (False, True)
     )
-    assert not Path("a-1.ply").exists()
+    for label, mesh in kept.items():
+        volume = (labels == label).sum() * np.prod(SPACING)
+        assert mesh.volume() == pytest.approx(volume, rel=1e-4)
+        assert abs(plain[label].volume() - volume) > 2e-3 * volume
+        np.testing.assert_array_equal(mesh.faces, plain[label].faces)
+        grid = make_grid(labels, label=label, spacing=SPACING)
+        assert check_mesh(mesh, grid).surface.faults() == []
+    one, other = (set(map(bytes, mesh.vertices)) for mesh in kept.values())
+    assert len(one & other) > 500  # the vertices of the wall
+
+
+def test_a_volume_that_stays_off_is_noted(tmp_path, command):
+    np.save(tmp_path / "mask.npy", MASK)
+    run = "upsample", tmp_path / "mask.npy", tmp_path / "mask.ply", "--spacing", 1
+    for option, is_off in (((), False), (("--simplify", 0.2), True)):
+        code, _, err = command(*run, "--keep-volume", "--force", *option)
+        assert code == 0 and ("off those of the samples: the mesh " in err) == is_off
+
+
+def test_what_has_no_volume_to_keep_is_refused(tmp_path, command):
+    exact = 6 - np.linalg.norm(np.indices((18, 18, 18)) - 8.6, axis=0)
+    np.save(tmp_path / "exact.npy", -exact)
+    np.save(tmp_path / "mask.npy", MASK)
+    for name, option, message in (
+        ("exact", (), " is for masks and labels, the values are exact: leave it out"),
+        ("mask", ("--offset", "0.1"), " is for the surface of the samples, offset is 0.1: "),
+        ("mask", ("--open",), " needs a closed mesh: leave out --open"),
+    ):  # fmt: skip
+        run = "upsample", tmp_path / f"{name}.npy", tmp_path / "out.ply", "--keep-volume"
+        code, _, err = command(*run, "--spacing", 1, *option)
+        assert code == 2 and f"Error: keep-volume{message}" in err
+        assert not (tmp_path / "out.ply").exists()

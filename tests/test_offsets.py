@@ -70,16 +70,6 @@ def test_the_suggested_offset_works(network):
         assert mesh.volume() == pytest.approx(cube_volume(1.5) * scale**3, rel=0.02)
 
 
-def test_fill_values_end_the_distances_too(network):
-    values = np.where(np.abs(cube()) > 3, np.copysign(1e300, cube()), cube())
-    grid = make_grid(values, spacing=1)
-    assert "samples are exactly 1e+300, where no distance is: they are taken" in grid.notes[1]
-    said = refusal(GridError, reconstruct, grid, network, 2, offset=1.5)
-    assert "1.5 spacings (1.5) to either side of it, but they end at 2.99" in said
-    mesh = reconstruct(grid, network, 2, offset=1.49)
-    assert mesh.volume() == pytest.approx(cube_volume(1.49), rel=0.02)
-
-
 def test_truncated_distances_are_filled_in_for_an_offset(network):
     grid = make_grid(np.clip(cube(), -1, 1), spacing=1)
     for offset in (-0.3, 0.4, 0.8):
@@ -97,17 +87,6 @@ def test_an_offset_beyond_all_values_has_no_surface(network, fill):
         reconstruct(make_grid(values, spacing=1), network, 2, offset=99)
     ends = "-3 to 3" if fill == 3 else f"{near.min():.6g} to {near.max():.6g}"
     assert str(caught.value) == f"no surface at 99: the values go from {ends}"
-
-
-def test_the_command_reads_the_sign_from_the_solid(command, tmp_path, monkeypatch):
-    """The border's sign is read at level 0; at the offset most of the border is inside."""
-    monkeypatch.chdir(tmp_path)
-    np.save("cube.npy", cube()[4:-4, 4:-4, 4:-4].astype(np.float32))
-    code, _, err = command("upsample", "cube.npy", "a.ply", "--offset", 3, "--cap", "--factor", 2)
-    assert code == 0 and "taken as inside" not in err
-    mesh = trimesh.load("a.ply")
-    low, high = 4 - 0.5 - 4, 17 + 0.5 - 4  # capped at the faces of the outer voxels
-    assert mesh.is_watertight and mesh.volume > 0.9 * (high - low) ** 3 > cube_volume(0)
 
 
 def test_the_command_refuses_an_offset_near_the_truncation(command, tmp_path, monkeypatch):

@@ -1,32 +1,25 @@
-"""Pages: meshes packed and unpacked, what is said of files, escaping, the security policy."""
+"""Pages, ``--report`` and ``view``: what is packed, escaped, written, and what is opened."""
 
 import base64
 import hashlib
+import os
 import re
+import stat
 import zlib
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import numpy as np
 import pytest
 import trimesh
+from batches import CONSTANT
 from pages import blocks, wedge
-from skimage.measure import marching_cubes
 
-from super_sdf import Mesh, SdfGrid, reconstruct
-from super_sdf.check.check import FULL, check_mesh
-from super_sdf.options import Options
-from super_sdf.pages import meshes
+from super_sdf import Mesh, SdfGrid, reconstruct, write_mesh
+from super_sdf.pages import items
 from super_sdf.pages.html import is_page, make_page, write_page
-from super_sdf.pages.items import (
-    Item,
-    certificate_facts,
-    entry_of,
-    find_item,
-    item_of_files,
-    item_path,
-    keep_item,
-    read_meshes,
-)
-from super_sdf.pages.meshes import coarse_surface, packed_mesh, residual_bytes
+from super_sdf.pages.items import entry_of, packed_mesh
 
 NASTY = '</script><img src=x onerror=alert(1)> & "quoted" \u2028\udcff'
 EMPTY = {"title": "", "lead": "", "alert": "", "summary": [], "notes": [], "files": []}
@@ -57,75 +50,11 @@ def test_a_packed_mesh_comes_out_within_half_a_step_and_a_large_one_simplified(m
     assert (faces == mesh.faces).all() and not len(residuals) and not packed["residuals"]
     assert packed["caption"] == "ball: 1,280 triangles"
     assert unpack(packed_mesh("no", Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))))[0].size == 0
-    monkeypatch.setattr(meshes, "MOST_TRIANGLES", 300)
+    monkeypatch.setattr(items, "MOST_TRIANGLES", 300)
     packed = packed_mesh("ball", mesh)
     vertices, faces, _ = unpack(packed)
     assert 150 < len(faces) <= 300
     assert packed["caption"] == f"ball: 1,280 triangles, shown simplified to {len(faces)}"
-    monkeypatch.setattr("super_sdf.errors.find_spec", lambda name: None)
-    (item := Item()).show("ball", mesh)
-    assert item.meshes == []
-    assert item.remarks[0].startswith("not shown: a view of more than 300 triangles needs pyfqmr: ")
-
-
-def test_residuals_are_full_at_a_tenth_of_a_voxel_and_unknown_ones_are_told_apart():
-    values = np.array([0, FULL, -FULL, 5, -5, FULL / 2, np.nan], np.float32)
-    assert residual_bytes(values).tolist() == [0, 127, -127, 127, -127, 64, -128]
-    assert certificate_facts({"error": "no room"}) == [["not checked", "no room"]]
-    assert certificate_facts({}) == []
-
-
-@pytest.mark.parametrize("direction", [None, ((-1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))])
-def test_coarse_marching_cubes_are_those_of_a_library(direction):
-    """Of any field whose cells have one case: as many triangles, vertices at the same places."""
-    grid = SdfGrid.trusted(2 * wedge(), (2, 2, 2), (5, -7, 1), direction=direction)
-    mesh = coarse_surface(grid)
-    vertices, faces, _, _ = marching_cubes(wedge(), 0.0, method="lorensen")
-    assert mesh.is_closed() and len(mesh.faces) == len(faces) and mesh.volume() > 0
-    there = grid.to_world(vertices)
-    assert np.abs(np.sort(mesh.vertices, 0) - np.sort(there, 0)).max() < 4e-3
-    assert coarse_surface(grid, offset=1.0).volume() > 1.3 * mesh.volume()
-
-
-def test_an_item_has_the_residuals_of_both_meshes_and_the_certificate(monkeypatch):
-    grid = SdfGrid(wedge(), (1.0, 1.0, 1.0))
-    mesh = reconstruct(grid, factor=2)
-
-    class Made:
-        """What a conversion keeps."""
-
-    made = Made()
-    made.grid, made.mesh = grid, mesh
-    item = item_of_files("", "", Options(), made)
-    ours, coarse = item.meshes
-    assert ours["caption"] == f"super-sdf: {len(mesh.faces):,} triangles"
-    assert coarse["caption"].startswith("marching cubes of the samples: ")
-    assert item.certificate == check_mesh(mesh, grid).report() and item.remarks == []
-    means = [np.abs(unpack(each)[2].astype(float)).mean() for each in (ours, coarse)]
-    assert 0 < means[0] < means[1]  # coarse marching cubes cut off the edges
-    made.grid = SdfGrid(wedge()[:, :, ::2], (1.0, 1.0, 2.0))
-    caption = item_of_files("", "", Options(), made).meshes[1]["caption"]
-    assert caption.startswith("marching cubes of the samples, made equally spaced: ")
-    monkeypatch.setattr("super_sdf.errors.find_spec", lambda name: None)
-    bare = item_of_files("", "", Options(), made)
-    assert len(bare.meshes) == 2 and not bare.meshes[0]["residuals"]
-    assert bare.certificate["error"].startswith("a check of the mesh, with residuals, needs igl: ")
-
-
-def test_the_file_of_an_item_is_read_back_and_what_is_none_is_none(tmp_path):
-    item, folder = Item(remarks=["a\u2028b"]), tmp_path / "page-files"
-    item.show(NASTY, icosphere(1))
-    keep_item(item, folder, "out.ply", "digest")
-    head, path = find_item(folder, "out.ply", "digest"), item_path(folder, "out.ply")
-    assert head.remarks == ["a\u2028b"] and head.meshes == []
-    assert head.size == len(item.meshes[0]["data"]) and read_meshes(path) == item.meshes
-    assert find_item(folder, "out.ply", "other") is find_item(folder, "b.ply", "digest") is None
-    comment, call, rest = path.read_text("ascii").split("\n")
-    assert comment.startswith("// {") and rest == ""
-    assert call.startswith(f'superSdfMeshes("{path.stem}", [{{"caption": "')
-    for text in ("", "// ", "// []", '// {"other": 1}', "\0\xff"):
-        path.write_text(text, "latin-1")
-        assert find_item(folder, "out.ply", "digest") is None
 
 
 def test_what_comes_from_files_cannot_be_markup_and_is_read_back(tmp_path):
@@ -142,9 +71,8 @@ def test_what_comes_from_files_cannot_be_markup_and_is_read_back(tmp_path):
     assert known == [True, False, False]
 
 
-@pytest.mark.parametrize("beside", [False, True])
-def test_the_policy_allows_these_scripts_and_nothing_else(beside):
-    page = make_page(EMPTY, beside=beside)
+def test_the_policy_allows_these_scripts_and_nothing_else():
+    page = make_page(EMPTY)
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page).group(1)
     rules = dict(rule.strip().split(" ", 1) for rule in policy.split(";"))
 
@@ -154,7 +82,124 @@ def test_the_policy_allows_these_scripts_and_nothing_else(beside):
         return [f"'sha256-{base64.b64encode(digest).decode()}'" for digest in digests]
 
     assert len(hashes("script")) == 3
-    assert rules["script-src"].split() == hashes("script") + ["'self'", "file:"] * beside
+    assert rules["script-src"].split() == hashes("script")
     assert rules["style-src"].split() == hashes("style")
     assert rules["default-src"] == "'none'" and rules["img-src"] == "data:"
     assert not re.search(r'(src|href)="(?!data:,)', page)
+
+
+UPSAMPLE = ("upsample", "a.npy", "a.ply", "--quality", "fast", "--factor", 2, "--spacing", 1)
+BATCH = ("in", "--report", "page.html")
+
+
+def files_of(page):
+    """Return the entries of a page."""
+    return blocks(Path(page))["facts"]["files"]
+
+
+def test_the_page_of_a_conversion_holds_all_of_it(command, folder):
+    np.save("a.npy", wedge())
+    code, _, err = command(*UPSAMPLE, "--report", "a.html")
+    assert code == 0 and err.endswith("\nReport: a.html\n")
+    assert sorted(os.listdir()) == ["a.html", "a.npy", "a.ply"]
+    found = blocks(Path("a.html"))
+    (entry,) = found["facts"]["files"]
+    assert found["facts"]["title"] == "a.ply" and entry["status"] == "ok"
+    assert entry["meshes"] == "page"
+    assert entry["notes"] == ["origin not given: sample (0, 0, 0) is at 0, 0, 0"]
+    triangles = found["meshes-0"][0]["triangles"]
+    assert entry["line"] == f"{triangles:,} triangles, closed, from 24 x 24 x 24 samples"
+    assert entry["seconds"] > 0 and entry["faults"] == [] and 0 < entry["residual"] < 0.1
+    assert ["surface", "closed, oriented, manifold"] in entry["certificate"]
+    ours, coarse = found["meshes-0"]
+    assert ours["residuals"] and coarse["residuals"] and ours["triangles"] > coarse["triangles"]
+
+
+def test_a_page_is_replaced_with_force_only(command, folder):
+    np.save("a.npy", wedge())
+    Path("a.html").write_text("mine")
+    said = "Error: a.html exists: remove it or use --force\n"
+    assert command(*UPSAMPLE, "--report", "a.html") == (1, "", said)
+    assert Path("a.html").read_text() == "mine" and not Path("a.ply").exists()
+    assert command(*UPSAMPLE, "--report", "a.html", "--force", "-q") == (0, "", "")
+    assert files_of("a.html")
+    code, _, err = command(*UPSAMPLE, "--report", "a.pdf", "--force")
+    assert code == 2 and "a.pdf is not a page: give --report a file .html or .htm" in err
+
+
+def test_without_the_extra_a_page_says_that_nothing_is_checked(command, opened, monkeypatch):
+    found = {"igl": None, "pyfqmr": None}
+    monkeypatch.setattr("super_sdf.errors.find_spec", lambda name: found.get(name, 1))
+    assert command(*UPSAMPLE, "--report", "a.html")[0] == 0
+    assert command("view", "a.npy", *UPSAMPLE[3:], "--out", "v.html")[0] == 0 and len(opened) == 1
+    for page in ("a.html", "v.html"):
+        (entry,) = files_of(page)
+        ((label, why),) = entry["certificate"]
+        assert label == "not checked" and why.startswith(
+            "a check of the mesh, with residuals, needs"
+        )
+        assert [mesh["residuals"] for mesh in blocks(Path(page))["meshes-0"]] == [False, False]
+
+
+def test_the_page_of_a_batch_made_without_one_names_failures_first(run_batch, grid_folder):
+    run_batch("in")
+    before = Path("out/a.ply").stat().st_mtime_ns
+    assert run_batch(*BATCH)[0] == 1
+    assert Path("out/a.ply").stat().st_mtime_ns == before
+    bad, *made = files_of("page.html")
+    assert [entry["name"] for entry in made] == ["a.ply", "deep/b.ply", "deep/er/c.d.ply"]
+    assert all(entry["status"] == "ok" and entry["residual"] > 0 for entry in made)
+    assert (bad["name"], bad["status"], bad["reason"]) == ("bad.ply", "failed", CONSTANT)
+    found = blocks(Path("page.html"))
+    assert set(found) == {"facts"} and found["facts"]["alert"] == ""
+    beside = [entry["meshes"] for entry in made]
+    assert sorted(beside) == sorted(f"page-files/{name}" for name in os.listdir("page-files"))
+    times = [path.stat().st_mtime_ns for path in sorted(Path("page-files").iterdir())]
+    run_batch(*BATCH)  # the page is replaced, and nothing drawn again
+    assert [path.stat().st_mtime_ns for path in sorted(Path("page-files").iterdir())] == times
+    assert len(files_of("page.html")) == 4
+
+
+def test_a_page_of_others_is_not_replaced_by_a_batch(run_batch, grid_folder):
+    Path("page.html").write_text("mine")
+    assert run_batch(*BATCH)[::2] == (1, "Error: page.html exists: remove it or use --force\n")
+    assert Path("page.html").read_text() == "mine" and not Path("out").exists()
+
+
+@pytest.fixture
+def opened(tmp_path, monkeypatch):
+    """Work in a folder with a grid and a mesh; return the addresses that a browser is opened at."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "temporary"))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    Path("temporary").mkdir()
+    np.save("a.npy", wedge())
+    write_mesh(reconstruct(SdfGrid(wedge(), 1.0), factor=2), "b.ply")
+    addresses = []
+    monkeypatch.setattr("webbrowser.open", lambda address: addresses.append(address) or True)
+    return addresses
+
+
+def test_the_page_is_a_private_file_that_the_browser_opens(command, opened):
+    code, out, err = command("view", "a.npy", "b.ply", *UPSAMPLE[3:], "--device", "cpu")
+    assert (code, out, err) == (0, "", opened[0] + "\n") and len(opened) == 1
+    page = Path(url2pathname(urlsplit(opened[0]).path))
+    assert page.is_relative_to(Path("temporary").absolute())
+    assert stat.S_IMODE(page.parent.stat().st_mode) == 0o700
+    found = blocks(page)
+    assert [file["meshes"] for file in found["facts"]["files"]] == ["page", "page"]
+    assert [len(found[f"meshes-{number}"]) for number in (0, 1)] == [2, 1]
+    assert "'self'" not in page.read_text("utf-8")  # it may load nothing from beside it
+    assert sorted(os.listdir()) == ["a.npy", "b.ply", "temporary"]
+
+
+def test_without_a_browser_that_is_said_and_errors_leave_nothing(command, opened, monkeypatch):
+    assert command("view", "no.ply") == (1, "", "Error: no.ply does not exist\n")
+    Path("bad.ply").write_text("ply")
+    code, _, err = command("view", "bad.ply")
+    assert code == 1 and err.startswith("Error: bad.ply cannot be read as a mesh: ")
+    assert not os.listdir("temporary")
+    monkeypatch.setattr("webbrowser.open", lambda address: False)
+    code, _, err = command("view", "b.ply")
+    note = "Note: no browser can be started here: open that address in yours"
+    assert code == 0 and re.fullmatch(rf"file://\S+/view.html\n{note}\n", err)

@@ -6,13 +6,8 @@ from conftest import refusal, trilinear
 from scipy import ndimage
 
 from super_sdf import (
-    extract_mesh,
-    fine_grid,
     make_grid,
-    read_field,
     reconstruct,
-    upsample,
-    write_field,
 )
 from super_sdf.errors import GridError
 
@@ -112,16 +107,6 @@ def test_an_offset_needs_distances_in_the_world(name):
         "distances by which an offset surface could be found; mesh the solid itself (--offset 0), "
         "sample the mesh (super-sdf sample), and mesh that grid with the offset"
     )
-
-
-def test_a_second_run_and_a_saved_field_keep_the_spacings(tmp_path):
-    grid = make_grid(two_parts() < 0, spacing=SPACING, origin=ORIGIN)
-    field = upsample(grid, trilinear, 2)
-    for coarse in (grid, fine_grid(field)):
-        assert np.abs(off(reconstruct(coarse, trilinear, 2))).mean() < 0.6
-    write_field(field, tmp_path / "field.npz")
-    want, mesh = extract_mesh(field), extract_mesh(read_field(tmp_path / "field.npz"))
-    np.testing.assert_array_equal(mesh.vertices, want.vertices)
 
 
 @pytest.mark.parametrize("cut", [0.5, 1, 2])

@@ -90,12 +90,6 @@ def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
     assert said.startswith("no value is below 0 (the smallest is ") and want in said
 
 
-def test_a_given_spacing_is_believed_of_a_thin_part():
-    """Beside the part opposite samples are equal, so values change by little there."""
-    walls = np.abs(Z) - 0.501  # one pair of planes inside, one thousandth of a spacing deep
-    assert make_grid(walls, spacing=1.0, origin=0, inside="negative").notes == ()
-
-
 def test_thin_solids_alone_are_meshed_with_a_warning(folder, command):
     np.save("thin.npy", THIN["plate"])
     np.save("ball.npy", ball().values)

@@ -89,14 +89,6 @@ def test_of_a_distance_transform_only_the_sides_are_used(library, spacing):
         np.testing.assert_array_equal(grid.values < 0, inside, name)
 
 
-def test_zeros_of_signed_numbers_are_inside():
-    inside = organ(THICK)
-    for name in ("Maurer world", "Maurer world positive"):
-        values = of_itk(inside, THICK)[name]
-        grid = make_grid(values, spacing=THICK, origin=0, field="mask")
-        np.testing.assert_array_equal(grid.values < 0, inside)
-
-
 def blocks(cells: np.ndarray, size: tuple[int, int, int], shift, spacing) -> np.ndarray:
     """Return distances to a solid of equal blocks, found from all faces of these.
 
@@ -158,13 +150,6 @@ def test_exact_distances_to_boxes_are_no_transform_wherever_their_faces_are(name
 def test_exact_distances_with_faces_on_samples_have_the_volume_of_the_solid(name, volume):
     grid = make_grid(blocks(*SOLIDS[name], (0, 0, 0), (1, 1, 1)), spacing=1.0, origin=0)
     assert reconstruct(grid, trilinear).volume() == pytest.approx(volume, rel=0.02)
-
-
-def test_exact_distances_at_45_degrees_are_no_city_block_distances():
-    x, y, z = np.indices((24, 24, 24)) - 12
-    for values in ((x + y) / 2**0.5, (x + y - 0.5) / 2**0.5, (x + y + z) / 3**0.5):
-        grid = make_grid(values, spacing=1.0, origin=0, inside="negative")
-        assert grid.field.kind == "exact"
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.float32, np.float64, bool])

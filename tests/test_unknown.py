@@ -149,19 +149,6 @@ def test_fields_of_all_kinds_have_unknown_samples(field):
         SdfGrid(values, 1.0)
 
 
-@pytest.mark.parametrize("unit", [1.5, 3])
-def test_a_band_over_its_truncation_is_the_same_with_nan_elsewhere(unit):
-    """Its extremes are a little less than 1 then."""
-    distances = box() / unit
-    filled, seen = (
-        make_grid(np.where(np.abs(distances) < 1, distances, far), **PLACE)
-        for far in (np.sign(distances), np.nan)
-    )
-    said = "the values are divided by their slope, 0."
-    for grid in (filled, seen):
-        assert grid.field.kind == "truncated" and any(n.startswith(said) for n in grid.notes)
-
-
 @pytest.mark.parametrize("value", [0, 1, -1000, 255, 1e10])
 def test_a_value_where_nothing_was_seen_is_told_by_its_jumps(value):
     distances = np.linalg.norm(np.indices((28,) * 3).T - 13.3, axis=-1) - 8.2

@@ -292,16 +292,6 @@ def test_chunks_that_are_not_stored_are_counted(values, kind):
             )
 
 
-def test_background_of_a_mask_need_not_be_stored(values):
-    mask = (values < 0).astype(np.uint8)
-    store(mask)
-    with h5py.File("a.h5", "w") as file:
-        file.create_dataset("d", data=mask[:24], chunks=(8, 8, 8), maxshape=(None,) * 3)
-        file["d"].resize(mask.shape)
-    for path in ("a.zarr", "a.h5"):
-        assert (read(path) < 0).sum() == mask.sum()
-
-
 # Codecs
 
 
@@ -364,11 +354,3 @@ def test_a_metaimage_is_placed_where_itk_places_it(lines):
         ijk = grid.to_index(np.array(image.TransformIndexToPhysicalPoint(index)))
         assert np.abs(ijk - np.rint(ijk)).max() < 1e-5
         assert grid.values[tuple(np.rint(ijk).astype(int))] == image[index]
-
-
-def test_a_spacing_below_0_is_that_of_itk():
-    name = write("a.mha", MHA.replace("0.5 0.5", "-0.5 0.5"), "ElementDataFile = LOCAL\n", RAW)
-    image, grid = sitk.ReadImage(name), read_grid(name)
-    assert image.GetDirection()[0] == -1
-    assert np.allclose(grid.origin, image.TransformIndexToPhysicalPoint((23, 0, 0)))
-    assert np.array_equal(grid.values, VALUES[::-1])

@@ -14,11 +14,8 @@ from test_vdb import text
 
 from super_sdf import (
     SdfGrid,
-    extract_mesh,
     fine_grid,
     make_grid,
-    read_grid,
-    reconstruct,
     upsample,
     write_field,
 )
@@ -126,18 +123,6 @@ def test_the_head_is_the_one_that_openvdb_expects():
             h = np.array(fine.spacing)
             vectors = np.frombuffer(data, "<f8", 18, at).reshape(6, 3)
             np.testing.assert_allclose(vectors, [fine.origin, h, h, 1 / h, 1 / h**2, 0.5 / h])
-
-
-@pytest.mark.parametrize("name", GRIDS)
-def test_the_level_set_is_a_closed_grid_with_the_same_surface(name):
-    """Also of a solid that leaves the grid: closed along the border, as the mesh is."""
-    field = upsample(GRIDS[name](), trilinear, 4)
-    write_field(field, "a.vdb")
-    again = reconstruct(read_grid("a.vdb"), trilinear, 2, cap=False, mesher="marching")
-    want = extract_mesh(field, cap=True, mesher="marching")
-    assert again.is_closed() and again.volume() == pytest.approx(want.volume(), rel=0.01)
-    ends = [np.array([mesh.vertices.min(0), mesh.vertices.max(0)]) for mesh in (again, want)]
-    assert np.abs(ends[0] - ends[1]).max() < 0.5 * max(fine_grid(field).spacing)
 
 
 def test_trees_of_many_nodes_have_the_right_side_everywhere(tmp_path):

@@ -103,33 +103,6 @@ def test_axes_of_time_and_channel_have_length_one(values):
     )
 
 
-def test_an_array_without_metadata_may_begin_with_axes_of_length_one(values):
-    store("a.zarr", values.T[None])
-    np.testing.assert_array_equal(read_grid("a.zarr", spacing=1).values, values)
-    store("b.zarr", np.stack([values.T] * 3), chunks=(1, 8, 8, 8))
-    said = "b.zarr: its axis 0 has 3 entries, and a grid has three "
-    assert said_of("b.zarr", spacing=1).startswith(said)
-    store("c.zarr", values[0])
-    said = "c.zarr: values have shape (26, 22): give three axes (x, y, z)"
-    assert said_of("c.zarr", spacing=1) == said
-
-
-def test_batch_finds_stores_in_folders_and_by_patterns(run_batch, values):
-    Path("in/deep").mkdir(parents=True)
-    store("in/a.zarr", values.T)
-    store("in/deep/b.zarr", values.T, 2)
-    with zarr.storage.ZipStore("in/c.zarr.zip", mode="w") as zipped:
-        store(zipped, values.T)
-    for out, pattern, want in (
-        ("out", "in", ["a.ply", "c.ply", "deep/b.ply"]),
-        ("by-pattern", "in/**/*.zarr", ["a.ply", "deep/b.ply"]),
-    ):
-        assert run_batch(pattern, "--spacing", 1, out=out)[0] == 0
-        made = sorted(path.relative_to(out).as_posix() for path in Path(out).rglob("*.ply"))
-        assert made == want
-        assert len({Path(out, name).read_bytes() for name in made}) == 1
-
-
 def test_info_of_a_file_prints_its_chunks(command, values):
     store("a.zarr", values.T, chunks=(4, 4, 4), shards=(16, 8, 8))
     said = command("info", "a.zarr")[1]

@@ -44,6 +44,12 @@ def cross(a: Vectors, b: Vectors) -> Vectors:
     return product
 
 
+def face_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
+    """Return normals of triangles (m, 3), as long as twice their areas."""
+    a, b, c = (points[corner] for corner in faces.T)
+    return cross(b - a, c - a)
+
+
 def length(vectors: Vectors) -> Numbers:
     """Return the lengths of vectors, (n,)."""
     lengths: Numbers = np.sqrt(dot(vectors, vectors))

@@ -12,24 +12,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .arrays import Triple
-from .errors import check_modules
 from .files.grids import read_grid
 from .files.meshes import check_target, write_mesh
 from .files.output import check_apart, check_free
 from .files.regular import files_of
-from .grid.samples import as_triple
 from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
-from .network.decoder import Decoder
-from .options import MASK, SCALED, SHARP, Options
 from .pipeline import mesh_grid
 from .progress import Progress, Stopwatch, part_of, share_of
-from .refine.field import lattice_shape
-from .surface.cap import check_can_close
-from .surface.mesh import Mesh
 
 if TYPE_CHECKING:
+    from .network.decoder import Decoder
+    from .options import Options
     from .simplify.simplify import Simplified
+    from .surface.mesh import Mesh
 
 CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
@@ -45,7 +40,6 @@ class Conversion:
     grid: SdfGrid  # as it was read
     mesh: Mesh  # as it was written
     counts: dict[str, int]
-    bounds: tuple[Triple, Triple]  # lowest and highest coordinates, in world units
     closed: bool  # no edge is open; else the surface leaves the grid and is not capped
     capped: bool  # the solid runs out of the grid, and was closed along the border
     warnings: tuple[str, ...]  # on what may be wrong with the result
@@ -60,10 +54,11 @@ class Conversion:
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
+        points = self.mesh.vertices
         return {
             **describe_place(self.grid),
             **self.counts,
-            "bounds": [list(corner) for corner in self.bounds],
+            "bounds": [points.min(0).tolist(), points.max(0).tolist()],  # in world units
             "closed": self.closed,
             "capped": self.capped,
             "field": self.grid.field.report(),
@@ -98,28 +93,25 @@ def convert(
     Nothing is written then.
     """
     watch, files = Stopwatch(), files_of(source)
-    if options.goals():
-        check_modules("simplifying", "simplify")
     check_target(target, force=force, unit=options.unit)
     check_apart(target, files)
-    grid = read_grid(source, **options.reading())
-    check_can_close(grid, cap=options.cap)
-    if options.keep_volume:
-        from .labels.volumes import check_has_volume  # imported here, as few conversions need it
-
-        check_has_volume(grid, options.offset, cap=options.cap)
-    lattice = cubic_grid(grid, options.offset)
     saving: Any = nullcontext()
     if save_field is not None:
-        from .files.fields import check_field_fits, saving_field
+        from .files.fields import saving_field
 
         check_apart(save_field, files)
-        shape = lattice_shape(grid.shape, options.factor)
-        check_field_fits(Path(save_field), shape)
         saving = saving_field(save_field, force=force)
-    watch.lap("read")
-    shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
     with saving as file:
+        grid = read_grid(source, **options.reading())
+        if options.keep_volume:
+            from .labels.volumes import check_has_volume  # imported here, as few need it
+
+            check_has_volume(grid, options.offset, cap=options.cap)
+        lattice = cubic_grid(grid, options.offset)
+        if file:
+            file.check_fits(grid.shape, options.factor)
+        watch.lap("read")
+        shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
         write_field = file.write if file else None
         made = mesh_grid(grid, network, options, progress=shown, save_field=write_field, **how)
         watch.take(made.seconds)
@@ -132,34 +124,25 @@ def convert(
             if before_rename:
                 before_rename(part)
 
-        write_mesh(
-            mesh,
-            target,
-            force=force,
-            unit=options.unit,
-            space=grid.space,
-            before_rename=complete,
-        )
+        stated: Any = {"unit": options.unit, "space": grid.space}
+        write_mesh(mesh, target, force=force, before_rename=complete, **stated)
         watch.lap("write")
     is_open = made.open_edges > 0
     warnings = find_warnings(grid, options.offset, made.counts, is_open=is_open)
-    vertices, triangles = len(mesh.vertices), len(mesh.faces)
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    no_edges = []
-    if options.mesher == SHARP and not lattice.field.has_exact:
-        no_edges = [
-            f"{lattice.field.kind} values show no edges: the mesh is that of marching cubes"
-        ]
+    notes = [*lattice.notes, *off]
+    if options.mesher == "sharp" and not lattice.field.has_exact:
+        why = f"{lattice.field.kind} values show no edges"
+        notes.append(f"{why}: the mesh is that of marching cubes")
+    sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "tiles": made.tiles}
     return Conversion(
         grid,
         mesh,
-        {**made.counts, "vertices": vertices, "triangles": triangles, "tiles": made.tiles},
-        bounds=(as_triple(low, "low"), as_triple(high, "high")),
+        {**made.counts, **sizes},
         closed=simplified.mesh.is_closed() if simplified else not is_open,
         capped=options.cap and made.leaves,
         warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
-        notes=(*lattice.notes, *no_edges, *off),
+        notes=tuple(notes),
         seconds=watch.seconds,
         saved_field=file.report if file else None,
     )
@@ -203,7 +186,10 @@ def find_warnings(
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if grid.field.kind in (MASK, SCALED):  # only distances can be noisy, or contradict each other
+    if grid.field.kind in (
+        "mask",
+        "scaled",
+    ):  # only distances can be noisy, or contradict each other
         return warnings
     if counts["noisy_voxels"]:
         share = 100 * counts["noisy_voxels"] / counts["band_voxels"]

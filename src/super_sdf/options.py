@@ -323,6 +323,11 @@ class Options:
         """Return the keywords of ``read_grid``."""
         return {name: getattr(self, name) for name in (*READ, "max_memory")}
 
+    def mesher_for(self, *, exact: bool) -> MesherName:
+        """Return the mesher; by itself ``sharp`` if samples are exact: else it finds no edges."""
+        automatic: MesherName = SHARP if exact else MARCHING
+        return automatic if self.mesher == AUTO else self.mesher
+
     def values(self) -> Values:
         """Return what the values are: keywords of ``make_grid``."""
         return cast(Values, {name: getattr(self, name) for name in Values.__annotations__})

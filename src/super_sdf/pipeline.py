@@ -14,19 +14,17 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
-from .arrays import CENTRE
 from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
-from .functions.function import Function, as_function, sampled
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
-from .options import OPTIONS, MesherName, Options
+from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.bounds import keep_within_bounds
@@ -35,10 +33,13 @@ from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
 from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
-from .surface.extract import choose_mesher, extract
+from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
 from .threads import in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
+
+if TYPE_CHECKING:
+    from .functions.function import Function
 
 
 def refine(
@@ -101,7 +102,7 @@ def refine_band(
         own_ijk,
         blocks[:, :-1],
         parts,
-        spheres=SampleSpheres(band.shape, band.voxel_ijk[exact], patches[exact, CENTRE].copy()),
+        spheres=SampleSpheres.of(band.shape, band.voxel_ijk[exact], patches[exact]),
         leaves=band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
         counts={
@@ -204,13 +205,15 @@ def extract_mesh(
     grid = field.placed if grid is None else grid
     check_grid(grid)
     samples = field.spheres
-    chosen = choose_mesher(mesher, exact=samples is not None and len(samples.distance) > 0)
-    cap = OPTIONS["cap"].check(cap) and field.grid is not None
+    asked = Options(mesher=mesher, cap=cap)  # checks them
+    chosen = asked.mesher_for(exact=samples is not None and len(samples.distance) > 0)
+    cap = asked.cap and field.grid is not None
     check_can_close(grid, cap=cap)
     mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
     if function is None:
         return mesh
-    from .functions.zero import put_on_zero  # imported here, as few call it
+    from .functions.function import as_function
+    from .functions.zero import put_on_zero
 
     return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)
 
@@ -275,8 +278,14 @@ def reconstruct(
     OutOfMemoryError
         If not even small tiles of the grid fit in the memory.
     """
-    exact = None if function is None else as_function(function)
-    grid = sampled(grid, exact, bounds, spacing, OPTIONS["offset"].check(offset))
+    chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
+    exact = None
+    if function is not None or bounds is not None or spacing is not None:
+        from .functions.function import as_function, sampled  # imported here, as few need it
+
+        exact = None if function is None else as_function(function)
+        grid = sampled(grid, exact, bounds, spacing, chosen.offset)
+    grid = check_grid(grid)
     where = {"model": quality, "device": device, "precision": precision, "threads": threads}
     asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
     if network is None:
@@ -284,11 +293,10 @@ def reconstruct(
     elif asked:
         name = next(iter(asked)).replace("model", "quality")
         raise OptionError(f"a network and {name} are given: give only one of them")
-    chosen = Options(factor=factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh
-    from .functions.zero import put_on_zero  # imported here, as few call it
+    from .functions.zero import put_on_zero
 
     return put_on_zero(mesh, exact, grid, factor, offset)
 
@@ -344,7 +352,7 @@ def mesh_grid(
     check_can_close(grid, cap=chosen.cap)
     steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
-    mesher = choose_mesher(chosen.mesher, exact=lattice.field.has_exact)
+    mesher = chosen.mesher_for(exact=lattice.field.has_exact)
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     threads, shape = useful_threads(decoder.threads), lattice.shape
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)

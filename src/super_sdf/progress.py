@@ -11,9 +11,6 @@ Progress = Callable[[int, int], None]
 If it raises an exception, the work stops with that exception.
 """
 
-ShareCallback = Callable[[float], None]
-"""Called with the finished share of a step, from 0 to 1."""
-
 TOTAL = 1000
 # Share of the time that each step takes with a network on a CPU.
 STEPS = {"band": 0.03, "network": 0.45, "nodes": 0.15, "isosurface": 0.37}
@@ -28,7 +25,7 @@ def part_of(progress: Progress | None, begin: float, end: float) -> Progress | N
     )
 
 
-def share_of(progress: Progress | None) -> ShareCallback | None:
+def share_of(progress: Progress | None) -> Callable[[float], None] | None:
     """Return a callback for the share of the work that is done; None without one."""
     return None if progress is None else lambda share: progress(round(TOTAL * share), TOTAL)
 
@@ -51,10 +48,6 @@ class Stopwatch:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + more
         self.clock = time.perf_counter()
 
-    def rounded(self) -> dict[str, float]:
-        """Return the seconds of each stage as reports have them."""
-        return {stage: round(spent, 4) for stage, spent in self.seconds.items()}
-
 
 class StepCounter(Stopwatch):
     """Reports progress and measures time, step by step; ``finish`` ends each step."""
@@ -76,7 +69,7 @@ class StepCounter(Stopwatch):
         self.done += self.lengths[name]
         self._show(TOTAL if name == "isosurface" else self.done)
 
-    def within(self, name: str) -> ShareCallback | None:
+    def within(self, name: str) -> Callable[[float], None] | None:
         """Return a callback for the share of a step that starts now; None without ``progress``."""
         begin, length = self.done, self.lengths[name]
         return (lambda share: self._show(begin + share * length)) if self.progress else None

@@ -10,21 +10,22 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import BoolArray
 from .errors import MeshError, OptionError, OutOfMemoryError
-from .grid.sdf_grid import SdfGrid
-from .options import MesherName
 from .refine import bounds, prediction, spheres
 from .refine.prediction import AT_ONCE
 from .refine.survey import BandSummary
 from .surface.extract import KEYS_PER_NODE, reach_in_voxels
 from .surface.mesh import Mesh
 from .threads import check_count, held_memory, in_words, memory_bound
+
+if TYPE_CHECKING:
+    from .grid.sdf_grid import SdfGrid
+    from .options import MesherName
 
 Index = tuple[int, int, int]
 Box = tuple[Index, Index]
@@ -47,7 +48,7 @@ class Tile:
         box = zip(self.inner_low, self.inner_high)
         return "samples " + ", ".join(f"{low} to {high - 1}" for low, high in box)
 
-    def owns(self, voxel_ijk: NDArray[np.integer]) -> BoolArray:
+    def owns(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Return which voxels (n, 3) belong to the tile, (n,)."""
         inside = (voxel_ijk >= self.inner_low) & (voxel_ijk < self.inner_high)
         return np.asarray(inside.all(1))
@@ -60,7 +61,7 @@ class Part:
     tile: Tile
     mesh: Mesh
     keys: NDArray[np.int64]  # (n,), of its vertices
-    mine: BoolArray  # (n,), which of these it owns
+    mine: NDArray[np.bool_]  # (n,), which of these it owns
     counts: dict[str, int]  # see ``FineField``
     leaves: bool  # whether the solid leaves the whole grid
     is_cut: bool  # whether the surface leaves the grid there, or may end at unknown samples

@@ -52,10 +52,9 @@ CANCELLED = concurrent.futures.CancelledError, asyncio.CancelledError
 def connect(address: str, workers: int = 0, max_memory: int | None = None) -> Iterator[Client]:
     """Connect to a cluster; at the end, and after errors, everything that was started is closed.
 
-    The address is "local", for processes of this machine (``workers`` of them, 0: one per core),
-    that of a Dask scheduler, such as tcp://10.0.0.1:8786, or its scheduler file. ``max_memory`` are
-    the bytes of all workers together for "local". ClusterError if nobody answers, or if there is no
-    worker of this version of super-sdf.
+    The address is that of a Dask scheduler, such as tcp://10.0.0.1:8786, or its scheduler file, or
+    "local", for ``workers`` processes of this machine (0: one per core), which share the bytes of
+    ``max_memory``. ClusterError if nobody answers, or if a worker has another version.
     """
     with ExitStack() as stack:
         logging.disable(logging.CRITICAL)  # what Dask has to say comes as one line
@@ -82,10 +81,9 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
         except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
             is_silent = isinstance(error, (OSError, *TIMEOUTS)) or not str(error)
             why = "" if is_silent else f" ({' '.join(str(error).split())})"
-            raise ClusterError(
-                f"no Dask scheduler answers at {address}{why}: start one with 'dask scheduler' and "
-                "workers with 'dask worker ADDRESS', or give 'local' or another address"
-            ) from error
+            start = "start one with 'dask scheduler' and workers with 'dask worker ADDRESS'"
+            said = f"no Dask scheduler answers at {address}{why}: {start}, or give 'local'"
+            raise ClusterError(said) from error
         stack.callback(client.close, timeout=CONNECT_SECONDS)
         with suppress(*TIMEOUTS):
             client.wait_for_workers(1, timeout=FIRST_WORKER_SECONDS)
@@ -120,9 +118,9 @@ def completed(
     """Yield tasks with their results as the workers complete them.
 
     ``take`` returns the next task, None while there is none; ``work(task, memory)`` is called in a
-    worker with the bytes that it may hold, if that is known. The result is a Death if the workers
-    died that had the task, or if it raised an error. ClusterError if the connection is lost or
-    there is no worker any more; SuperSdfError as a worker raised it.
+    worker with the bytes that it may hold, if known. The result is a Death if the workers died that
+    had the task, or if it raised an error that is not SuperSdfError. ClusterError if the scheduler
+    or all workers are lost.
     """
     running, threads, seen = dict[Any, Task](), 0, time.monotonic()
     try:
@@ -148,8 +146,8 @@ def completed(
                     raise
                 except KilledWorker as error:
                     times = error.allowed_failures + 1
-                    cause = f"was lost {times} times by the cluster (most likely out of memory)"
-                    yield task, Death(cause)
+                    hint = "(most likely out of memory)"
+                    yield task, Death(f"was lost {times} times by the cluster {hint}")
                 except ImportError as error:
                     raise ClusterError(f"a worker cannot import super-sdf: {error}") from None
                 except Exception as error:
@@ -181,7 +179,7 @@ def tiles_on(client: Client) -> Callable[..., Iterator[Any]]:
 
         for task, part in completed(client, lambda: next(tasks, None), work):
             if isinstance(part, Death):
-                raise ClusterError(f"a worker at {task.tile} {part.cause}: give it more memory")
+                raise ClusterError(f"a worker at {task.tile} {part}: give it more memory")
             yield part
 
     return map_tiles
@@ -197,13 +195,11 @@ def convert_on_cluster(
     """
     options, items, base = settings.options, settings.items, Path.cwd()
     files = [base / stage, base / split_member(first.source)[0]]
-    if options.model and Path(options.model).exists():
-        files.append(base / options.model)
-        options = replace(options, model=str(files[-1]))
     files = [path for path in files if path.exists()]
-    there = replace(
-        settings, options=options, folder=base / settings.folder, items=items and base / items
-    )
+    if options.model and Path(options.model).exists():
+        options = replace(options, model=str(base / options.model))
+    there = replace(settings, options=options, folder=base / settings.folder)
+    there = replace(there, items=items and base / items)
 
     def work(job: Job, memory: int | None) -> Row:
         placed = replace(job, source=base / job.source)

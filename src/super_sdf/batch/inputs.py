@@ -72,10 +72,10 @@ def find_jobs(
 ) -> list[Job]:
     """Return the jobs that the arguments name, each once: files, folders, patterns, lists.
 
-    ``suffix`` is the mesh file format, such as ".ply"; a list may say otherwise, and it may have
-    other options. ``names`` are those of labels, in place of which jobs have numbers. OptionError
-    if an argument names no grid, if two inputs would become one output, or if an option does not go
-    with labels; FileError if a list, or the only folder, cannot be read.
+    ``suffix`` is the mesh file format, such as ".ply", and ``options`` are those of all jobs; a
+    list may say otherwise. ``names`` are those of labels, in place of which jobs have numbers.
+    OptionError if an argument names no grid, or if two inputs would become one output; FileError if
+    a list, or the only folder, cannot be read.
     """
     by_target, chosen = dict[str, Job](), with_numbers(options, names)
     for argument in arguments:
@@ -83,30 +83,24 @@ def find_jobs(
             other = by_target.setdefault(os.path.normcase(job.target), job)
             same = os.path.abspath(other.source) == os.path.abspath(job.source)
             if not (same and other.options == job.options):
-                raise OptionError(
-                    f"{other.source} and {job.source} would both become {job.target}: rename one, "
-                    "or give 'out' in a .jsonl list"
-                )
+                both = f"{other.source} and {job.source} would both become {job.target}"
+                raise OptionError(f"{both}: rename one, or give 'out' in a .jsonl list")
             check_mesh_suffix(Path(job.mesh), job.options.unit)
             if PurePath(job.target).parts[0].casefold() in OWN_NAMES:
-                raise OptionError(
-                    f"{job.source} would become {job.target}, but the first of these names is the "
-                    "batch's own: rename it"
-                )
+                said = f"{job.source} would become {job.target}, but"
+                raise OptionError(f"{said} the first of these names is the batch's own: rename it")
     return list(by_target.values())
 
 
 def _expand(argument: str, suffix: str, options: Options, names: Names | None) -> list[Job]:
     """Return the jobs that one argument stands for, with those of folders that cannot be read."""
     path, kinds, paths = Path(argument), ", ".join(GRID_SUFFIXES), list[Path]()
-    unread = list[tuple[Path, str]]()
+    unread = list[OSError]()
     if path.suffix.lower() in LIST_SUFFIXES and path.is_file():
         return list(_read_list(path, suffix, options, names))
     if argument and path.is_dir() and not is_store(path):
         root = path
-        for at, folders, files in os.walk(
-            path, onerror=lambda error: unread.append((Path(error.filename), reason_of(error)))
-        ):
+        for at, folders, files in os.walk(path, onerror=unread.append):
             stores = [name for name in folders if is_store(Path(at, name))]
             folders[:] = [name for name in folders if name not in stores]
             paths += [Path(at, name) for name in (*stores, *files)]
@@ -119,33 +113,33 @@ def _expand(argument: str, suffix: str, options: Options, names: Names | None) -
         hidden = any(part.startswith(".") for part in parts)
         found = root.glob("/".join(parts))  # follows links to folders where they are named
         paths = [p for p in found if hidden or "/." not in f"/{p.relative_to(root).as_posix()}"]
-    elif not argument or not os.path.lexists(path):
-        said = f"{argument or repr(argument)} does not exist"
-        raise OptionError(f"{said}: give grids, folders, patterns or a list")
     else:
-        lists = ", ".join(LIST_SUFFIXES)
-        raise OptionError(f"{argument} is neither a grid ({kinds}) nor a list ({lists})")
+        said = f"{argument} is neither a grid ({kinds}) nor a list ({', '.join(LIST_SUFFIXES)})"
+        if not argument or not os.path.lexists(path):
+            give = "give grids, folders, patterns or a list"
+            said = f"{argument or repr(argument)} does not exist: {give}"
+        raise OptionError(said)
     # Anything with a grid's suffix counts. If it is no regular file, its job fails and names it.
     grids = sorted({p for p in paths if is_grid(p) and (is_store(p) or not p.is_dir())})
     if not grids and unread:
-        raise FileError(f"{unread[-1][0]} {unread[-1][1]}")
+        raise FileError(f"{unread[-1].filename} {reason_of(unread[-1])}")
     if not grids:
         raise OptionError(f"{argument} holds no grid ({kinds})")
-    jobs = [
-        Job(grid, mesh_path(grid.relative_to(root), suffix, options.label).as_posix(), options)
-        for grid in grids
-    ]
-    for folder, why in unread:
-        target = (folder.relative_to(root) / f"*{suffix}").as_posix()
-        jobs.append(Job(folder, target, options, wrong=f"{folder} {why}"))
+    jobs = list[Job]()
+    for grid in grids:
+        target = mesh_path(grid.relative_to(root), suffix, options.label)
+        jobs.append(Job(grid, target.as_posix(), options))
+    for error in unread:
+        folder, why = Path(error.filename), f"{error.filename} {reason_of(error)}"
+        target = folder.relative_to(root) / f"*{suffix}"
+        jobs.append(Job(folder, target.as_posix(), options, wrong=why))
     return jobs
 
 
 def _read_list(path: Path, suffix: str, options: Options, names: Names | None) -> Iterator[Job]:
     """Yield a job for each line of a list; OptionError with the number of one that is not valid.
 
-    Blank lines, and in ``.txt`` lines that start with ``#``, are skipped. The text is UTF-8; a byte
-    order mark and CRLF line ends are accepted.
+    Blank lines, and in ``.txt`` lines that start with ``#``, are skipped.
     """
     try:
         lines = path.read_text("utf-8-sig").split("\n")
@@ -186,11 +180,11 @@ def _job_of(
         inside = not path.is_absolute() and ".." not in path.parts
         return Job(home / source, path.as_posix() if inside else path.name, chosen)
     path = PurePath(target) if isinstance(target, str) else PurePath()
-    if path.suffix.lower() not in MESH_SUFFIXES:
-        kinds = ", ".join(MESH_SUFFIXES)
-        raise OptionError(f"'out' is {seen(target)}: give a file, one of {kinds}")
-    if path.is_absolute() or ".." in path.parts:
-        raise OptionError(f"'out' is {seen(target)}: give a path within the output folder")
+    give = f"a file, one of {', '.join(MESH_SUFFIXES)}"
+    if path.suffix.lower() in MESH_SUFFIXES:
+        give = "a path within the output folder" * (path.is_absolute() or ".." in path.parts)
+    if give:
+        raise OptionError(f"'out' is {seen(target)}: give {give}")
     return Job(home / source, path.as_posix(), chosen)
 
 

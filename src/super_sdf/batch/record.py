@@ -101,10 +101,9 @@ def outputs_of(row: Row) -> dict[str, Fingerprint]:
 
 
 def fingerprint(path: Path) -> Fingerprint | None:
-    """Return the fingerprint of a file, None if it cannot be read or is no regular file.
+    """Return the fingerprint of a file with those that it names, or of all in a Zarr folder.
 
-    Of a Zarr folder it covers the names and contents of all files in it; of a header or a network
-    also those of the files that it names.
+    None if it cannot be read or is no regular file.
     """
     (file, _), digest = split_member(path), hashlib.sha256()
     try:
@@ -129,14 +128,11 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = True) -> bool:
-    """Return whether a file still has a known fingerprint; None stands for an unreadable file.
-
-    Its content is read only if the modification time or the path is another.
-    """
+    """Return whether a file has a known fingerprint; None stands for one that cannot be read."""
     if known is None:
         file, _ = split_member(path)
         return not ((os.path.isfile(file) or is_store(file)) and os.access(file, os.R_OK))
-    with suppress(OSError):
+    with suppress(OSError):  # the content is read only if the time or the path is another
         if same_path and file_state(path) == (known.get("size"), known.get("mtime_ns")):
             return True
     return bool((fingerprint(path) or {}).get("sha256") == known["sha256"])
@@ -150,8 +146,8 @@ def folder_lock(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout:
-        said = f"{folder} is in use by another batch: wait for it, or give another"
-        raise FileError(said) from None
+        way_out = "wait for it, or give another"
+        raise FileError(f"{folder} is in use by another batch: {way_out}") from None
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise WriteError(f"{folder} cannot be written: {error.strerror}") from error

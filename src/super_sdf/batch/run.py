@@ -17,7 +17,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Generator, Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,10 +38,9 @@ MIN_BYTES_PER_WORKER = 3 * 10**8  # with less a worker cannot convert anything
 
 
 class Batch:
-    """A batch as it stands: each job has its state and, once there is one, its row.
+    """A batch as it stands, first as planned: each job has its state and, if there is one, a row.
 
-    Jobs are ``TO_DO``, or what earlier runs made of them still holds, or they are ``REFUSED``,
-    since their outputs may not be replaced.
+    Jobs that are ``REFUSED`` would replace what is not theirs.
     """
 
     def __init__(self, jobs: Sequence[Job], settings: Settings) -> None:
@@ -52,13 +51,9 @@ class Batch:
         self.has_failed, self.seconds = False, 0.0  # of the run, for those who measure it
         chosen = settings.options.network()
         path, turns = find_model(chosen["model"], chosen["precision"])
-        self.network = {
-            "version": __version__,
-            "network": (fingerprint(path) or {}).get("sha256"),
-            "turns": turns,  # of the grid, over which the network is averaged
-            "model": chosen["model"],
-            "precision": chosen["precision"],
-        }
+        self.network = {"version": __version__, "turns": turns}  # over which it is averaged
+        self.network["network"] = (fingerprint(path) or {}).get("sha256")
+        self.network |= {name: chosen[name] for name in ("model", "precision")}
         for job in jobs:
             self._plan(job)
 
@@ -74,7 +69,9 @@ class Batch:
     def run(self, progress: Progress | None = None) -> None:
         """Convert what is to be converted; call ``progress`` after each file is in the report."""
         for job in self.of(REFUSED):
-            if not job.wrong and job.row["reason"] != self.record.rows.get(job.target, {}).get("reason"):
+            if not job.wrong and job.row["reason"] != self.record.rows.get(job.target, {}).get(
+                "reason"
+            ):
                 self.record.add(job.row)
         left = sorted(self.of(TO_DO), key=lambda job: -expected_work(job))
         total, done, died = len(left), 0, set[str]()  # outputs whose worker died once
@@ -92,7 +89,7 @@ class Batch:
                     left.append(job)  # once more, after the others
                     continue
                 if isinstance(row, Death):
-                    row = job.failed(f"the process that converted it {row.cause}, twice")
+                    row = job.failed(f"the process that converted it {row}, twice")
                 self._keep(job, row, stage)
                 done += 1
                 if progress:
@@ -127,10 +124,7 @@ class Batch:
                 yield job, work(job)
 
     def _keep(self, job: Job, row: Row, stage: Path) -> None:
-        """Add the row of a finished job to the report, and move its files to their places.
-
-        If they may not be written, the row says why.
-        """
+        """Add the row of a finished job to the report, then move its files to their places."""
         folder, names = self.settings.folder, list(outputs_of(row))
         if why := self._why_not(job, names):
             row = job.failed(why, row["content"])
@@ -195,11 +189,7 @@ class Batch:
             self.changed[job.target] = sorted(changed - {"turns"})
 
     def _how(self, job: Job) -> Row:
-        """Return what a row says of how a mesh was made: enough to make it again.
-
-        Device, threads and memory do not count: the mesh asked for is the same. If the precision
-        follows the device, the network for the CPU counts.
-        """
+        """Return what a row says of how a mesh was made: enough to make it again."""
         asked, names = job.options.digest(), self.settings.names
         if job.options.labels is not None and names:  # a hash stands for the table
             asked["names"] = hashlib.sha256(json.dumps(names).encode()).hexdigest()
@@ -215,35 +205,32 @@ class Batch:
         from ..pages import html, items
 
         folder, jobs = self.settings.folder, {job.target: job for job in self.jobs}
-        rows = {
-            name: row
-            for name, row in (self.record.rows | {n: job.row for n, job in jobs.items()}).items()
-            if row.get("asked", {}).get("labels") is None
-            and (row.get("status") != "ok" or is_unchanged(folder / name, row["output"]))
-        }
+        rows = self.record.rows | {name: job.row for name, job in jobs.items()}
+        for name, row in list(rows.items()):
+            is_gone = row.get("status") == "ok" and not is_unchanged(folder / name, row["output"])
+            if is_gone or row.get("asked", {}).get("labels") is not None:
+                del rows[name]
 
         def draw(name: str) -> items.Item | None:
             if interrupted or name not in jobs:
                 return None
             return items.item_of_files(folder / name, jobs[name].source, jobs[name].options)
 
-        facts = {"title": f"Batch: {folder}", "lead": lead}
-        html.write_batch_page(path, facts, rows, draw, interrupted, force=self.settings.force)
+        left, why = len(self.of(TO_DO)), f", {interrupted}" * bool(interrupted)
+        alert = f"Incomplete{why}: {left} not finished; run it again to go on"
+        facts = {"title": f"Batch: {folder}", "lead": lead, "alert": alert if left or why else ""}
+        html.write_batch_page(path, facts, rows, draw, force=self.settings.force)
 
 
 def expected_work(job: Job) -> float:
     """Return the estimated work of a job: proportional to its surface, plus a constant."""
-    try:
+    with suppress(OSError):
         return 1000 + float(file_state(job.source)[0] ** (2 / 3))
-    except OSError:
-        return 1000
+    return 1000
 
 
 def count_workers(asked: int, device: str, jobs: int, max_memory: int | None = None) -> int:
-    """Return how many processes to use: those asked for, or one per core, but one on a GPU.
-
-    There are no more than cores, jobs, and what the memory allows.
-    """
+    """Return how many processes to use: as asked, or one per core; no more than there is to do."""
     if not asked and (device == "cuda" or (device == "auto" and "cuda" in available_devices())):
         return 1
     free, cores = max_memory or free_memory(), count_cores()

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from ..convert import Conversion, convert
 from ..errors import FileError, GridError, OptionError, SuperSdfError, WriteError
@@ -57,8 +57,7 @@ def convert_job(
 ) -> Row:
     """Convert a file to meshes in the folder ``stage``, by the names that they will have.
 
-    An error becomes a row, too. The network is loaded once in each process; what that raises is
-    raised here.
+    An error becomes a row, too, unless the network cannot be loaded, once in each process.
     """
     start, content = time.perf_counter(), fingerprint(job.source)
     bounds = [bound for bound in (memory, job.options.max_memory) if bound]
@@ -117,15 +116,11 @@ def _reason(error: Exception) -> str:
         return first
     if isinstance(error, MemoryError):
         return "out of memory: use a smaller --factor or grid"
-    if isinstance(error, OSError):  # no bug: a name too long, say
-        return f"the system refuses it: {error.strerror or error}"
     return f"{type(error).__name__}: {first}"
 
 
-class Death(NamedTuple):
-    """The result of a task whose worker died."""
-
-    cause: str  # a verb: "was killed by SIGKILL"
+class Death(str):
+    """The result of a task whose worker died: a verb, such as "was killed by SIGKILL"."""
 
 
 class Worker:
@@ -153,14 +148,8 @@ class Worker:
 def _serve(pipe: Connection, work: Callable[[Any], Any]) -> None:
     """Work at the tasks from a pipe, and end with the parent: an orphan would go on."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
-    parent = multiprocessing.parent_process()
-
-    def follow() -> None:
-        if parent:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
+    parent: Any = multiprocessing.parent_process()
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
     while True:
         task = pipe.recv()
         try:
@@ -174,8 +163,8 @@ def work_in_processes(
 ) -> Generator[tuple[Task, Any], None, None]:
     """Yield tasks with their results, or a Death, as ``count`` processes complete them.
 
-    ``take`` returns the next task, None while there is none; ``work`` is a function that can be
-    pickled. What it raises is raised here. SuperSdfError if processes only die.
+    ``take`` returns the next task, None while there is none. What ``work`` raises is raised here;
+    SuperSdfError if processes only die.
     """
     idle, running, deaths = list[Worker](), dict[Any, tuple[Worker, Task]](), 0
     try:
@@ -196,7 +185,7 @@ def work_in_processes(
                 except (EOFError, OSError):
                     result, error, deaths = worker.end(EXIT_SECONDS), None, deaths + 1
                     if deaths == MOST_DEATHS:
-                        last = f"{deaths} processes in a row ended; the last one {result.cause}"
+                        last = f"{deaths} processes in a row ended; the last one {result}"
                         error = SuperSdfError(f"{last}: try --jobs 1")
                 del running[pipe]
                 if error:

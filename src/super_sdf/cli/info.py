@@ -141,9 +141,7 @@ def run_checks(device: Device) -> Iterator[tuple[str, str, str]]:
 
 def check_network(name: str, device: Device) -> tuple[str, str, str]:
     """Refine a ball with a shipped network on a device."""
-    from ..grid.sdf_grid import make_grid
-    from ..network.network import load_network
-    from ..pipeline import reconstruct
+    from .. import load_network, make_grid, reconstruct
 
     values: Any = np.linalg.norm(np.indices((SAMPLES,) * 3) - CENTRE, axis=0) - RADIUS
     is_mask, what = name.startswith(MASK), f"network {name} on {device}"

@@ -41,7 +41,7 @@ def command(
     sources: tuple[str, ...], out: Path | None, force: bool, no_browser: bool, **given: Any
 ) -> None:
     """Write the page, print its address and open it."""
-    from ..network.network import load_network
+    from .. import load_network
     from ..pages.html import viewed_page, write_page
 
     if out:

@@ -40,19 +40,11 @@ VERSION = 1
 CHUNK = 1 << 20  # values at a time
 # Which kinds of numbers each array has, and its shape, where None is any length.
 ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
-    "version": ("iu", ()),
-    "shape": ("iu", (3,)),
-    "factor": ("iu", ()),
-    "spacing": ("f", (3,)),
-    "origin": ("f", (3,)),
-    "direction": ("f", (3, 3)),
-    "offset": ("f", ()),
-    "leaves": ("b", ()),
-    "values": ("f", (None, None, None, None)),
-    "voxels": ("i", (None, 3)),
-    "sample_voxels": ("i", (None, 3)),
-    "sample_distances": ("f", (None,)),
-    "border_inside": ("i", (None, 3)),
+    **dict.fromkeys(("version", "factor"), ("iu", ())),
+    **dict.fromkeys(("spacing", "origin"), ("f", (3,))),
+    **dict.fromkeys(("voxels", "sample_voxels", "border_inside"), ("i", (None, 3))),
+    **{"shape": ("iu", (3,)), "direction": ("f", (3, 3)), "offset": ("f", ()), "leaves": ("b", ())},
+    **{"values": ("f", (None,) * 4), "sample_distances": ("f", (None,))},
 }
 
 
@@ -147,14 +139,6 @@ def check_field_target(path: str | Path, *, force: bool = False) -> Path:
     return check_free(path, force=force)
 
 
-def check_field_fits(path: Path, shape: tuple[int, int, int]) -> None:
-    """Raise OutOfMemoryError if the fine lattice must be held for a file, and does not fit."""
-    if path.suffix.lower() == ".vti":
-        size = " x ".join(map(str, shape))
-        way_out = "write .npy, which is written plane by plane, or .npz, which is sparse"
-        check_fits(4 * prod(shape), f"{path}, {size} values,", way_out)
-
-
 @dataclass
 class FieldFile:
     """A file of a field that appears when all is done; ``report`` is what was written, for JSON."""
@@ -162,6 +146,14 @@ class FieldFile:
     path: Path
     part: Path
     report: dict[str, Any] = field(default_factory=dict)
+
+    def check_fits(self, shape: tuple[int, int, int], factor: int) -> None:
+        """Raise OutOfMemoryError if the fine lattice must be held, and does not fit."""
+        if self.path.suffix.lower() == ".vti":
+            nodes = lattice_shape(shape, factor)
+            way_out = "write .npy, which is written plane by plane, or .npz, which is sparse"
+            size = " x ".join(map(str, nodes))
+            check_fits(4 * prod(nodes), f"{self.path}, {size} values,", way_out)
 
     def write(self, field: FineField) -> None:
         """Write the field; errors name the file."""
@@ -197,8 +189,7 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     Raises
     ------
     OptionError
-        If the suffix is unknown, or the field was made without its grid; if voxels are too small
-        or too large for OpenVDB.
+        If the suffix is unknown, or voxels are too small or too large for OpenVDB.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; if the field is one from
         a file and the format is not .npz: others take the coarse samples.
@@ -208,8 +199,8 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
     path = check_field_target(path, force=force)
-    check_field_fits(path, lattice_shape(field.placed.shape, field.factor))
     with saving_field(path, force=force) as file:
+        file.check_fits(field.placed.shape, field.factor)
         file.write(field)
 
 
@@ -240,12 +231,9 @@ def read_field(path: str | Path) -> FineField:
 
     Raises
     ------
-    FileError
-        If the file is missing, damaged, truncated, or holds something else.
-    OutOfMemoryError
-        If the field does not fit in memory.
-    OptionError
-        If the suffix is not .npz.
+    FileError, OutOfMemoryError, OptionError
+        If the file is missing, damaged, or holds something else; if the field does not fit in
+        memory; if the suffix is not .npz.
     """
     path = check_path(path, "path")
     if path.suffix.lower() != ".npz":

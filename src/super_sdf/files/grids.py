@@ -46,16 +46,15 @@ def read_grid(
 ) -> SdfGrid:
     """Read a grid from a file of any format in ``formats.FORMATS``: see docs/guides/formats.md.
 
-    An ``.npy`` file is mapped into memory, unless its axes are in another order. Other files are
-    loaded.
+    An ``.npy`` file is mapped into memory, other files are loaded.
 
     Parameters
     ----------
     path : path
         The file; ``FILE:NAME`` names one of several arrays in a file.
     spacing, origin, direction : numbers, optional
-        Used instead of those in the file; see ``make_grid``. A direction goes with ``.npy``,
-        ``.npz``, TIFF, HDF5, NetCDF, MATLAB and Zarr.
+        Used instead of those in the file; see ``make_grid``. A direction goes with files that
+        state no axes.
     axes : {"xyz", "zyx"}, optional
         The axis order of an array whose file does not state one. Default: x, y, z in ``.npy``,
         ``.npz`` and MATLAB, else z, y, x.
@@ -68,11 +67,8 @@ def read_grid(
 
     Raises
     ------
-    FileError
-        If the file is missing, damaged, truncated or of another kind; if the library for its format
-        is missing.
-    OutOfMemoryError
-        If there is no room to load it.
+    FileError, OutOfMemoryError
+        If the file cannot be read, as its library is missing, say; if there is no room for it.
     GridError
         If its values are no usable grid, or its axes are not at right angles.
     OptionError
@@ -180,10 +176,9 @@ def grid_from_image(
 
     Raises
     ------
-    GridError
-        If there is no such array, or several and none is named; if it is no usable grid.
-    OptionError
-        If an option is unknown, or ``image`` is no image data (``OptionTypeError``).
+    GridError, OptionError
+        If there is no such array, or several and none is named; if it is no usable grid; if
+        ``image`` is no image data.
     """
     Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image

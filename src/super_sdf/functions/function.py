@@ -20,7 +20,6 @@ from ..errors import GridError, OptionError, OptionTypeError, seen
 from ..grid.derived import sample_near
 from ..grid.samples import as_triple, check_spacing
 from ..grid.sdf_grid import SdfGrid, check_grid, make_grid
-from ..options import SCALED
 
 Points = NDArray[np.float64]  # (n, 3)
 Numbers = NDArray[np.float64]  # (n,)
@@ -127,7 +126,7 @@ class DistanceFunction:
             return make()
         except GridError:  # the spacing is right: what contradicts it is no distance
             with suppress(GridError):
-                return make(field=SCALED)
+                return make(field="scaled")
             raise
 
 
@@ -154,8 +153,7 @@ def sampled(
     if grid is not None or function is None:
         if bounds is not None or spacing is not None:
             raise OptionError("bounds and spacing are for a function without a grid: give that")
-        check_grid(grid)
-        return cast(SdfGrid, grid)
+        return check_grid(grid)
     if bounds is None or spacing is None:
         raise OptionError("a function needs bounds and spacing, or a grid of its samples")
     reach = REACH * max(check_spacing(spacing)) + abs(offset)

@@ -15,16 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import pyvista
 
+from .. import SdfGrid, grid_from_image, reconstruct
 from ..errors import FileError, check_modules, how_to_install
-from ..files.grids import grid_from_image
-from ..grid.sdf_grid import SdfGrid
-from ..network.decoder import Decoder
 from ..options import AUTO, MesherName, Options, Quality, Values
-from ..pipeline import reconstruct
-from ..progress import Progress
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
+
+    from ..network.decoder import Decoder
+    from ..progress import Progress
 
 if not hasattr(pyvista, "register_dataset_accessor"):
     raise FileError(

@@ -17,10 +17,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, Numbers, Vectors, cross, dot, length, sums_at, unit
+from ..arrays import BoolArray, Numbers, Vectors, cross, dot, face_normals, length, sums_at, unit
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
-from ..options import EXACT
 from ..surface.mesh import Mesh
 from ..surface.sharp.folds import intersecting, overlapping_boxes
 from .function import DistanceFunction
@@ -70,7 +69,7 @@ def put_on_zero(
     margin = REACH / factor  # from the border of the grid, in spacings
     free: BoolArray = np.all((index > margin - 0.5) & (index < last - margin), axis=1)
     with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
-        points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.kind == EXACT)
+        points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.kind == "exact")
         points = put_on_edges(value, points, mesh.faces, free)
     points = without_folds(points, start, mesh.faces, rounded)
     return Mesh((middle + fine * points).astype(kind), mesh.faces)
@@ -260,12 +259,6 @@ def overlapping_in_plane(points: Vectors, first: NDArray[Any], second: NDArray[A
 def gradient(value: Value, points: Vectors, values: Numbers) -> Vectors:
     """Return the gradient at points (n, 3) with values (n,), by forward differences."""
     return np.stack([(value(points + STEP * axis) - values) / STEP for axis in np.eye(3)], 1)
-
-
-def face_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
-    """Return normals of triangles (m, 3), as long as twice their areas."""
-    a, b, c = (points[corner] for corner in faces.T)
-    return cross(b - a, c - a)
 
 
 def vertex_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:

@@ -293,22 +293,19 @@ def _around_surface(slab: NDArray[Any], at: int) -> Floats:
     return as_clamped(boxes[j, k])
 
 
+def _with_neighbours(slab: NDArray[Any], at: int) -> tuple[NDArray[Any], list[NDArray[Any]]]:
+    """Return the inner samples of the plane ``at``, and their six neighbours."""
+    plane, inner = slab[at], slice(1, -1)
+    sides = [slab[at - 1, inner, inner], slab[at + 1, inner, inner], plane[:-2, inner]]
+    sides += [plane[2:, inner], plane[inner, :-2], plane[inner, 2:]]
+    return plane[inner, inner], sides
+
+
 def _amid_equal(slab: NDArray[Any], at: int) -> tuple[tuple[Any, Any], list[int], int]:
     """Return the extremes of the plane ``at``, how many samples are amid these, and of all."""
-    middle, inner = slab[at], np.s_[BESIDE:-BESIDE, BESIDE:-BESIDE]
-    ends, counts = (middle.min(), middle.max()), []
-    for end in ends:
-        amid = middle == end
-        if amid.sum() > 6:  # else none is amid six
-            amid &= (slab[at - 1] == end) & (slab[at + 1] == end)
-            amid[1:-1] &= middle[2:] == end
-            amid[1:-1] &= middle[:-2] == end
-            amid[:, 1:-1] &= middle[:, 2:] == end
-            amid[:, 1:-1] &= middle[:, :-2] == end
-            counts.append(int(amid[inner].sum()))
-        else:
-            counts.append(0)
-    return ends, counts, middle[inner].size
+    ends, (centre, sides) = (slab[at].min(), slab[at].max()), _with_neighbours(slab, at)
+    amid = [np.logical_and.reduce([x == end for x in (centre, *sides)])[1:-1, 1:-1] for end in ends]
+    return ends, [int(x.sum()) for x in amid], amid[0].size
 
 
 def _at_boundaries(slab: NDArray[Any], at: int) -> tuple[Any, Any, Ints, float] | None:
@@ -317,25 +314,15 @@ def _at_boundaries(slab: NDArray[Any], at: int) -> tuple[Any, Any, Ints, float] 
     The counts, (3, 2), are of samples between a lower and a higher neighbour, and of those with
     another neighbour: all inner ones, the lowest, and the highest. None if some are not whole.
     """
-    middle = slab[at]
-    if middle.dtype.kind == "f" and not (middle == np.rint(middle)).all():
+    if slab.dtype.kind == "f" and not (slab[at] == np.rint(slab[at])).all():
         return None
-    centre = middle[1:-1, 1:-1]
-    sides = [
-        slab[at - 1, 1:-1, 1:-1],
-        slab[at + 1, 1:-1, 1:-1],
-        middle[:-2, 1:-1],
-        middle[2:, 1:-1],
-    ]
-    sides += [middle[1:-1, :-2], middle[1:-1, 2:]]
+    centre, sides = _with_neighbours(slab, at)
     lower = np.logical_or.reduce([side < centre for side in sides])
     higher = np.logical_or.reduce([side > centre for side in sides])
     jump = max(float(np.abs(np.subtract(x, centre, dtype=np.float64)).max()) for x in sides)
-    low, high = middle.min().item(), middle.max().item()
+    low, high = slab[at].min().item(), slab[at].max().item()
     groups = np.ones(centre.shape, bool), centre == low, centre == high
-    counts = [
-        [(group & lower & higher).sum(), (group & (lower | higher)).sum()] for group in groups
-    ]
+    counts = [[(g & lower & higher).sum(), (g & (lower | higher)).sum()] for g in groups]
     return low, high, np.array(counts), jump
 
 
@@ -515,9 +502,7 @@ class Regions:
     the runs of the planes before each.
     """
 
-    def __init__(
-        self, samples: SampleArray, is_marked: Callable[[NDArray[Any]], BoolArray]
-    ) -> None:
+    def __init__(self, samples: SampleArray, is_marked: IsMarked) -> None:
         self.is_marked, size = is_marked, samples.shape[1] * samples.shape[2]
         self.before = np.zeros(samples.shape[0] + 1, np.int64)
         none = np.empty(0, np.int64)
@@ -536,10 +521,10 @@ class Regions:
                 near = np.concatenate(positive), np.concatenate(negative)
                 parts.append((begins + i * size, sizes, np.concatenate(pairs, axis=1), *near))
             former = runs, plane
-        self.start, self.size, joined, *near = (np.concatenate(x, axis=-1) for x in zip(*parts))
+        self.start, self.size, joined, *beside = (np.concatenate(x, axis=-1) for x in zip(*parts))
         self.root = components(len(self.start), joined)
         has = np.zeros((2, len(self.root)), bool)
-        for row, side in zip(has, near):
+        for row, side in zip(has, beside):
             row[self.root[side]] = True
         self.positive, self.negative = has[:, self.root]
         self.unsure: BoolArray = self.positive == self.negative
@@ -564,12 +549,10 @@ def _beside(
     First those beside positive ones, then those beside others; each array is that of neighbours.
     """
     one, other = runs >= 0, other_runs >= 0
-    both = one & other
-    base = int(max(runs.max(initial=0), other_runs.max(initial=0))) + 1
+    base, both = int(max(runs.max(), other_runs.max(), 0)) + 1, one & other
     pairs = np.stack(np.divmod(np.unique(runs[both] * base + other_runs[both]), base))
-    lone, lone_other = one & ~other, other & ~one
-    mine = np.concatenate([runs[lone], other_runs[lone_other]])
-    theirs = np.concatenate([other_values[lone], values[lone_other]])
+    mine = np.concatenate([runs[one & ~other], other_runs[other & ~one]])
+    theirs = np.concatenate([other_values[one & ~other], values[other & ~one]])
     return pairs, np.unique(mine[theirs > 0]), np.unique(mine[theirs <= 0])
 
 

@@ -11,26 +11,15 @@ others, and no less than where it was cut off. A scaled field over its local slo
 first order.
 
 Between two samples of an axis that is resampled the values are those of a cubic polynomial
-(Hermite). Its slopes and its values obey the two laws of distances:
-
-- The gradient has length 1. So the differences across the line, to both neighbours of a sample,
-  tell how steep the field is along it: the slope is kept within what they allow. Near edges the two
-  are different, and allow much.
-- Two distances differ by no more than their points are apart. So the samples round a point bound
-  its value from both sides (McShane, Whitney). It is kept within, unless they contradict each
-  other, as those of a noisy field do.
-
-The slope is also kept near the differences along the line, so that a linear field which is no
-distance is reproduced. ``python -m lab figures --only kinds`` compares this with resampling by
-hand.
+(Hermite), which obeys the two laws of distances. The gradient has length 1, so the differences
+across the line tell how steep the field is along it: the slope is kept within what they allow, and
+near the differences along the line, so that a linear field which is no distance is reproduced. And
+two distances differ by no more than their points are apart, so the samples round a point bound its
+value (McShane, Whitney): it is kept within, unless they contradict each other, as noise does.
 
 A function is sampled in cells of 8^3 spacings first, then in their eighths. A cell is left out if
 even the steepest slope seen would not bring the values at its corners down to those of ``reach``
-within it.
-
-References: Felzenszwalb and Huttenlocher, "Distance Transforms of Sampled Functions", 2012, for
-taking the axes one after the other; Kalra and Barr, "Guaranteed ray intersections with implicit
-surfaces", 1989.
+within it (Kalra and Barr, "Guaranteed ray intersections with implicit surfaces", 1989).
 """
 
 from __future__ import annotations
@@ -44,7 +33,7 @@ from numpy.typing import NDArray
 
 from ..arrays import CORNERS, BoolArray, FloatArray, IntArray, Triple
 from ..threads import chunks_of
-from .census import Extremes, Floats
+from .census import Extremes, Floats, Ints
 from .samples import DerivedPlanes, SampleArray, SamplePlanes, in_spacings
 
 REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
@@ -80,6 +69,7 @@ MOST = 1e12  # spacings: larger values are cut off, so that squares do not overf
 
 At: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
 Cells: TypeAlias = NDArray[np.int32]  # (n, 3) the lowest sample of each
+Places: TypeAlias = tuple[NDArray[np.intp], ...]
 
 
 def mask_distances(inside: BoolArray) -> FloatArray:
@@ -144,26 +134,21 @@ def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> Derived
     Those are too far from the surface to matter, however near it they were cut off.
     """
 
-    def make(planes: NDArray[Any]) -> NDArray[np.float64]:
+    def make(planes: NDArray[Any]) -> Floats:
         raised = planes.astype(np.float64)
         for limit in limits:
             amid = planes == limit
             for _ in range(RINGS):
-                amid = _all_around(amid)
+                for axis in range(3):
+                    lines = np.moveaxis(amid, axis, 0)
+                    all_along = lines.copy()
+                    all_along[1:] &= lines[:-1]
+                    all_along[:-1] &= lines[1:]
+                    amid = np.moveaxis(all_along, 0, axis)
                 raised[amid] += np.sign(limit) * h
         return raised
 
     return DerivedPlanes(values, make, RINGS)
-
-
-def _all_around(marked: BoolArray) -> BoolArray:
-    for axis in range(3):
-        lines = np.moveaxis(marked, axis, 0)
-        among = lines.copy()
-        among[1:] &= lines[:-1]
-        among[:-1] &= lines[1:]
-        marked = np.moveaxis(among, 0, axis)
-    return marked
 
 
 def fill_in(values: FloatArray, low: float, high: float, steps: Triple = CUBES) -> FloatArray:
@@ -188,12 +173,14 @@ def _distance_to_feet(
     """Return the distance of each sample to the nearest foot point of the ``known``, (n, 3).
 
     It is ``FAR`` voxels at most. At a foot point the surface is taken as a disc: it goes on
-    between them.
+    between them. Of equally near ones the lower disc counts, so that the order is no matter.
     """
     far, reach = np.float32(FAR * max(steps)), _reach(steps)
     margin = [(n, n) for n in reach]
     nearest = np.pad(np.where(cut, far, np.float32(0)), margin)
     discs = np.pad(np.full(cut.shape, far, np.float32), margin)
+    flat, flat_discs = nearest.reshape(-1), discs.reshape(-1)
+    strides = np.array([nearest.shape[1] * nearest.shape[2], nearest.shape[2], 1])
     box = np.indices([2 * n + 1 for n in reach]).reshape(3, -1).T - np.array(reach)
     apart = np.sqrt(((box * np.array(steps)) ** 2).sum(1)) / max(steps)
     offsets = box[(apart > 0) & (apart**2 <= (FEET_REACH + 0.3) ** 2)].astype(np.int32)
@@ -205,39 +192,20 @@ def _distance_to_feet(
         foot = np.ascontiguousarray((-values[tuple(known[rows].T)][:, None] * normal).T)
         at = np.ravel_multi_index(tuple((known[rows] + np.array(reach, np.int32)).T), nearest.shape)
         for offset in offsets:
-            step = (offset * np.array(steps)).astype(np.float32)
-            _approach(nearest, discs, at, offset, step[:, None] - foot, normal.T)
+            step, place = (offset * np.array(steps)).astype(np.float32), at + int(offset @ strides)
+            x, y, z = step[:, None] - foot
+            apart = np.sqrt(x * x + y * y + z * z)
+            closer = np.flatnonzero(apart <= flat[place])
+            x, y, z, apart, where = x[closer], y[closer], z[closer], apart[closer], place[closer]
+            a, b, c = normal.T[:, closer]
+            height = x * a + y * b + z * c
+            aside = np.sqrt(np.maximum(apart**2 - height**2, 0))
+            disc = np.hypot(height, np.maximum(aside - DISC, 0))
+            lower = np.minimum(disc, flat_discs[where])
+            flat_discs[where] = np.where(apart == flat[where], lower, disc)
+            flat[where] = apart
     inner = tuple(slice(n, n + size) for n, size in zip(reach, cut.shape))
     return discs[inner]
-
-
-def _approach(
-    nearest: FloatArray,
-    discs: FloatArray,
-    at: NDArray[np.intp],
-    offset: IntArray,
-    way: FloatArray,
-    normal: FloatArray,
-) -> None:
-    """Bring samples at an ``offset`` from some ``at`` places nearer by the foot points of these.
-
-    Changes ``nearest`` and ``discs``, the distances to the nearest foot point so far and to its
-    disc. ``way`` (3, n) is from the foot points to the samples, ``normal`` their direction.
-    """
-    flat, flat_discs = nearest.reshape(-1), discs.reshape(-1)
-    strides = np.array([nearest.shape[1] * nearest.shape[2], nearest.shape[2], 1])
-    place = at + int(offset @ strides)
-    x, y, z = way
-    apart = np.sqrt(x * x + y * y + z * z)
-    closer = np.flatnonzero(apart <= flat[place])
-    x, y, z, apart = x[closer], y[closer], z[closer], apart[closer]
-    a, b, c = normal[:, closer]
-    height = x * a + y * b + z * c
-    aside = np.sqrt(np.maximum(apart**2 - height**2, 0))
-    disc, where = np.hypot(height, np.maximum(aside - DISC, 0)), place[closer]
-    alike = apart == flat[where]  # the lower disc, so that the order is no matter
-    flat_discs[where] = np.where(alike, np.minimum(disc, flat_discs[where]), disc)
-    flat[where] = apart
 
 
 def _gradient(
@@ -332,7 +300,12 @@ class Resampled(SamplePlanes):
     ) -> None:
         self.source, self.spacing, self.axis = source, spacing, axis
         self.step, self.level = step, level
-        self.places = new_places(source.shape[axis], spacing[axis], step)
+        # The last one lies as near to the last sample as it can, and takes its value beyond.
+        count, each = source.shape[axis], spacing[axis]
+        places = np.arange(round((count - 1) * each / step) + 1) * (step / each)
+        nearest = np.rint(places)
+        places = np.where(np.abs(places - nearest) <= ON_SAMPLE, nearest, places)
+        self.places: Floats = np.minimum(places, count - 1)
         self.on_sample: BoolArray = np.rint(self.places) == self.places
         self.shape = tuple(
             len(self.places) if other == axis else count for other, count in enumerate(source.shape)
@@ -343,13 +316,13 @@ class Resampled(SamplePlanes):
         out = np.empty((max(last - first, 0), *self.shape[1:]))
         if not len(out):
             return out
-        low, high, places, start = max(first - ACROSS, 0), last + ACROSS, self.places, first
+        low, high, places = max(first - ACROSS, 0), last + ACROSS, self.places
         if self.axis == 0:
-            places, start = places[first:last], 0
+            places = places[first:last]
             low, high = max(int(places[0]) - EXTRA, 0), int(places[-1]) + 2 + EXTRA
             places = places - low
         block = np.moveaxis(np.asarray(self.source[low:high]), self.axis, 0)
-        lines, start = np.moveaxis(out, self.axis, 0), start - low if self.axis else 0
+        lines, start = np.moveaxis(out, self.axis, 0), first - low if self.axis else 0
         h, across = self.spacing[self.axis], np.delete(self.spacing, self.axis)
         for rows in chunks_of(lines.shape[1], 2 * (len(lines) + len(block)) * lines.shape[2]):
             asked = slice(rows.start + start, rows.stop + start)
@@ -371,68 +344,53 @@ class Lines:
     def __init__(self, samples: Floats, asked: slice, h: float, steps: tuple[float, float]) -> None:
         self.samples, self.asked, self.h, self.steps = samples, asked, h, steps
         self.around = np.pad(samples, ((0, 0), *((ACROSS, ACROSS),) * 2), constant_values=np.nan)
+        own = samples[:, asked]  # continued linearly by two at both ends
+        first, last = own[0] - own[1], own[-1] - own[-2]
+        before, after = [own[0] + 2 * first, own[0] + first], [own[-1] + last, own[-1] + 2 * last]
+        self.continued = np.concatenate([before, own, after])
 
     def values_at(self, places: Floats, level: float, near: float) -> Floats:
         """Return the values (m, p, q) at places, within their bounds if ``near`` the ``level``."""
         cells = np.minimum(places.astype(int), len(self.samples) - 2)
         shares = places - cells
-        values = np.empty((len(places), *self.samples[0, self.asked].shape))
+        values = np.empty((len(places), *self.continued.shape[1:]))
         is_near = np.zeros(values.shape, bool)
-        before, slopes = -2, (values[0], values[0])
+        former, slopes = -2, (values[0], values[0])
         for n, (cell, share) in enumerate(zip(cells.tolist(), shares.tolist())):
-            low, high = self.samples[cell, self.asked], self.samples[cell + 1, self.asked]
+            before, low, high, after = self.continued[cell + 1 : cell + 5]
             if share in (0, 1):
                 values[n] = high if share else low
                 continue
-            if cell != before:
-                first = slopes[1] if cell == before + 1 else self.slope(cell)
-                before, slopes = cell, (first, self.slope(cell + 1))
+            if cell != former:
+                first = slopes[1] if cell == former + 1 else self.slope(cell)
+                former, slopes = cell, (first, self.slope(cell + 1))
             rest, (rise, rise_after) = 1 - share, (slope * self.h for slope in slopes)
             smooth = low * ((1 + 2 * share) * rest**2) + high * ((1 + 2 * rest) * share**2)
             smooth = smooth + (rise * rest - rise_after * share) * (share * rest)
-            values[n] = self._with_walls(cell, share, level, smooth)
             reach = near + share * self.h, near + (1 - share) * self.h
             is_near[n] = (np.abs(low - level) < reach[0]) & (np.abs(high - level) < reach[1])
+            # There is a thin wall if the field falls towards the surface, rises behind it, and the
+            # straight lines from both sides meet beyond it.
+            side = np.sign(low - level)
+            before, low, high, after = ((x - level) * side for x in (before, low, high, after))
+            falling, rising = np.minimum(before - low, self.h), np.minimum(after - high, self.h)
+            is_wall = (high > 0) & (np.minimum(falling, rising) > STEEP_WALL * self.h)
+            is_wall &= low * rising + high * falling <= falling * rising
+            wall = np.maximum(low - falling * share, high - rising * rest)
+            values[n] = np.where(is_wall, wall * side + level, smooth)
         which = np.nonzero(is_near)
         values[which] = self._bounded(values[which], cells[which[0]], shares[which[0]], which[1:])
         return values
 
-    def _with_walls(self, cell: int, share: float, level: float, smooth: Floats) -> Floats:
-        """Return values (p, q) after sample ``cell``: ``smooth`` unless there is a thin wall.
-
-        There is one if the field falls towards the surface, rises behind it, and the straight lines
-        from both sides meet beyond it.
-        """
-        before, low, high, after = (self._sample(cell + n) - level for n in range(-1, 3))
-        side = np.sign(low)
-        low, high = low * side, high * side
-        falling = np.minimum(before * side - low, self.h)
-        rising = np.minimum(after * side - high, self.h)
-        is_wall = (high > 0) & (np.minimum(falling, rising) > STEEP_WALL * self.h)
-        is_wall &= low * rising + high * falling <= falling * rising  # the lines meet beyond 0
-        wall = np.maximum(low - falling * share, high - rising * (1 - share))
-        walled: Floats = np.where(is_wall, wall * side + level, smooth)
-        return walled
-
     def slope(self, i: int) -> Floats:
         """Return the slope along the lines at sample i, (p, q), as distances allow it."""
-        two_before, before, middle, after, two_after = (self._sample(i + n) for n in range(-2, 3))
+        two_before, before, middle, after, two_after = self.continued[i : i + 5]
         slope = (8 * (after - before) - (two_after - two_before)) / (12 * self.h)
         least, most = self._steepness(i)
         slope = np.sign(slope) * np.clip(np.abs(slope), least, most)
         behind, ahead = (middle - before) / self.h, (after - middle) / self.h
         mean, half = (ahead + behind) / 2, MARGIN / 2 * np.abs(ahead - behind)
-        bounded: Floats = np.clip(slope, mean - half, mean + half)
-        return bounded
-
-    def _sample(self, i: int) -> Floats:
-        """Return sample i of the asked lines, extrapolated linearly beyond their ends."""
-        end = min(max(i, 0), len(self.samples) - 1)
-        inner = end + 1 if i < 0 else end - 1
-        sample: Floats = self.samples[end, self.asked]
-        if i != end:
-            sample = sample + abs(i - end) * (sample - self.samples[inner, self.asked])
-        return sample
+        return np.asarray(np.clip(slope, mean - half, mean + half))
 
     def _steepness(self, i: int) -> tuple[Floats, Floats]:
         """Return the least and the largest slope along the lines at sample i, where |grad| = 1."""
@@ -448,13 +406,7 @@ class Lines:
             most = most + (mean + half) ** 2
         return np.sqrt(np.maximum(1 - most, 0)), np.sqrt(np.maximum(1 - least, 0))
 
-    def _bounded(
-        self,
-        values: Floats,
-        cells: NDArray[np.int64],
-        shares: Floats,
-        across: tuple[NDArray[np.intp], ...],
-    ) -> Floats:
+    def _bounded(self, values: Floats, cells: Ints, shares: Floats, across: Places) -> Floats:
         """Return values between samples, (n,), kept within what the samples round them allow."""
         _, rows, width = self.around.shape
         at = (cells * rows + across[0] + self.asked.start + ACROSS) * width + across[1] + ACROSS
@@ -466,20 +418,7 @@ class Lines:
                 apart = np.sqrt(along + ((j * self.steps[0]) ** 2 + (k * self.steps[1]) ** 2))
                 np.fmax(low, sample - apart, out=low)
                 np.fmin(high, sample + apart, out=high)
-        kept: Floats = np.where(low <= high, np.clip(values, low, high), values)
-        return kept
-
-
-def new_places(count: int, h: float, step: float) -> Floats:
-    """Return where new samples lie along an axis, in old spacings.
-
-    The last one lies as near to the last sample as it can, and takes its value if it is beyond.
-    """
-    places = np.arange(round((count - 1) * h / step) + 1) * (step / h)
-    nearest = np.rint(places)
-    places = np.where(np.abs(places - nearest) <= ON_SAMPLE, nearest, places)
-    reached: Floats = np.minimum(places, count - 1)
-    return reached
+        return np.asarray(np.where(low <= high, np.clip(values, low, high), values))
 
 
 def sample_near(
@@ -494,7 +433,7 @@ def sample_near(
     at : callable
         Takes indices of samples, (n, 3), and returns the values there, (n,).
     shape : three int
-        FloatArray along each axis.
+        Samples along each axis.
     step : array, (3,)
         World distance between neighbouring samples along each axis.
     reach : float
@@ -514,7 +453,10 @@ def sample_near(
         steepest = max(steepest, _steepest(values, sizes * step))
         least = STEEPER * steepest * (reach + stride / 2 * float(np.linalg.norm(step)))
         far = np.abs(values).min(1) > least  # not where a value is unknown
-        _leave_out(samples, cells[far], stride, values[far, 0])
+        for offset in np.ndindex((stride + 1,) * 3):  # what is far from the surface gets its side
+            places = np.minimum(cells[far] + np.array(offset, np.int32), last)
+            new = np.isnan(samples[tuple(places.T)])
+            samples[tuple(places[new].T)] = np.copysign(np.inf, values[far, 0])[new]
         stride //= 2
         cells = (cells[~far, None] + stride * CORNERS).reshape(-1, 3)
         cells = cells[(cells < last).all(1)]
@@ -557,12 +499,3 @@ def _steepest(values: NDArray[Any], sizes: NDArray[Any]) -> float:
             slopes = np.abs(values[:, one] - values[:, other]) / length
         steepest = max(steepest, float(slopes[np.isfinite(slopes)].max(initial=0)))
     return steepest
-
-
-def _leave_out(samples: FloatArray, cells: Cells, stride: int, values: NDArray[Any]) -> None:
-    """Give the other samples of cells that lie far on one side of the surface that side."""
-    last, sides = np.array(samples.shape, np.int32) - 1, np.copysign(np.inf, values)
-    for offset in np.ndindex((stride + 1,) * 3):
-        places = np.minimum(cells + np.array(offset, np.int32), last)
-        new = np.isnan(samples[tuple(places.T)])
-        samples[tuple(places[new].T)] = sides[new]

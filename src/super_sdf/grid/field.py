@@ -8,26 +8,25 @@ noisy      distances with noise
 
 A distance field has slope 1 wherever it is smooth, in units of the spacing. It is bent only where
 its third and fourth differences show it: at a kink between samples, or where it is curved. So a
-slope that is off by more than these differences can explain belongs to a field that is no distance.
-So do samples that differ by more than they are apart, along diagonals too, and by more than noise
-of the size that fourth differences show: fast marching and other schemes make such fields. A
-truncated field is constant away from the surface. A noisy one changes by more than the samples are
-apart, and is bent there.
+slope that is off by more than these can explain belongs to a field that is no distance. So do
+samples that differ by more than they are apart, along diagonals too, and by more than noise of the
+size that fourth differences show: fast marching and other schemes make such fields. A truncated
+field is constant away from the surface. A noisy one changes by more than the samples are apart.
 
 The values of a distance transform of a mask follow from the sides of the samples: each is the
 distance to the nearest sample of another side, in the world or on the lattice, by whatever measure,
-perhaps squared, less half a voxel or a whole one, or clipped. Exact distances know where between
-two samples the surface is, so they are others. Only those to a solid with all its faces on samples
-are the same, in which the samples on the surface are 0. Then the surface of a mask shows by its
-steps: they are one sample high wherever it is not along the axes.
+perhaps squared, less half a voxel or a whole one, or clipped. Exact distances do not, as they know
+where between two samples the surface is, unless all faces of the solid are on samples, which are 0
+there. Then the surface of a mask shows by its steps: one sample high wherever it is not along the
+axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import permutations, product
+from itertools import chain, permutations, product
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -182,6 +181,11 @@ class Evidence(NamedTuple):
         """Whether values are cut off."""
         return self.cut_low or self.cut_high
 
+    def uncut(self, extremes: Extremes) -> Extremes:
+        """Return between which values none is cut off."""
+        low, high = extremes
+        return (low if self.cut_low else -np.inf), (high if self.cut_high else np.inf)
+
     @property
     def is_scaled(self) -> bool:
         """Whether the values are no distances in the unit of the spacing."""
@@ -193,18 +197,14 @@ class Evidence(NamedTuple):
         allowed = WRONG_SLOPES if np.isfinite(self.slope) else WRONG_IF_ROUGH
         uneven = abs(self.uneven) > max(UNEVEN, self.roughness, self.digit)
         is_wrong = self.wrong > allowed or uneven
-        return self.is_enough and (is_wrong or self.is_too_steep or self.is_contradictory)
+        return self.is_enough and (is_wrong or self.is_contradictory)
 
     @property
     def is_contradictory(self) -> bool:
-        """Whether samples contradict each other's distances, and noise does not explain it."""
-        return self.contradicting > CONTRADICTING and self.noisy <= NOISY_SHARE
-
-    @property
-    def is_too_steep(self) -> bool:
-        """Whether values change by more than distances can at more samples than noise explains."""
+        """Whether samples differ by more than distances can, at more than noise explains."""
         steep = self.noisy > max(NOISY_SHARE, MOST_BY_NOISE * self.roughness)
-        return steep and self.wrong > WRONG_SLOPES
+        contradicting = self.contradicting > CONTRADICTING and self.noisy <= NOISY_SHARE
+        return (steep and self.wrong > WRONG_SLOPES) or contradicting
 
     @property
     def is_noisy(self) -> bool:
@@ -394,10 +394,10 @@ def _of_both_sides(
 ) -> Transform | None:
     """Return the transform if values jump from one side to the other, by two voxels or by one."""
     sides = np.sign(patches)
-    for measure, step in (*_euclidean(steps, unit), *_others(steps, unit, weighted=True)):
+    for measure, step in chain.from_iterable(_measures(steps, unit)):
         if _follow(patches, sides, measure, (0, 0), clipped):
             return Transform(step, 0)
-    for measure, step in _euclidean(steps, 2 * unit):
+    for measure, step in _measures(steps, 2 * unit)[0]:
         seen = _follow(patches / 2, sides, measure, (0.5, 0.5), clipped / 2)
         if seen and seen.apart:
             return Transform(step, 0)
@@ -414,13 +414,13 @@ def _with_zeros(
     """
     signs = np.sign(patches)
     one_sided = clipped.min() == 0
-    euclidean = list(_euclidean(steps, unit))
-    for measure, step in (*euclidean, *_others(steps, unit, weighted=one_sided)):
+    euclidean, squares, others = _measures(steps, unit)
+    for measure, step in (*euclidean, *squares, *(others if one_sided else [])):
         seen = _follow(patches, signs, measure, (0, 0), clipped)
         if seen and one_sided and is_flat and not seen.apart:
             return None
         if seen and (seen.beyond or (measure, step) in euclidean):
-            is_mask = _count_lone(signs == 0) >= LEAST or _is_stepped(signs)
+            is_mask = _are_lone(signs == 0).sum() >= LEAST or _is_stepped(signs)
             zeros = side if one_sided else _side_of_zeros(signs)
             return Transform(step, zeros) if is_mask else None
     joined = np.where(signs == 0, side, signs)
@@ -431,24 +431,24 @@ def _with_zeros(
     return None
 
 
-def _euclidean(steps: Floats, unit: float) -> Iterator[tuple[Measure, float]]:
-    """Yield Euclidean measures, in the world and on the lattice, and the spacings they show."""
-    yield partial(_length, steps), unit
-    if steps.max() > 1 + ZERO:
-        yield partial(_length, np.ones(3)), unit
+def _measures(steps: Floats, unit: float) -> list[list[tuple[Measure, float]]]:
+    """Return measures and the spacings that they show: Euclidean ones, their squares, others.
+
+    Those are Euclidean in the world and on the lattice; the others chessboard, city-block, 3-4-5.
+    """
+    euclidean = [partial(_length, steps)]
+    euclidean += [partial(_length, np.ones(3))] if steps.max() > 1 + ZERO else []
+    squares = [partial(_length, each.args[0], power=2) for each in euclidean]
+    others = [(partial(_weighted, weight), unit) for weight in (0.0, 1.0)]
+    return [
+        [(measure, unit) for measure in euclidean],
+        [(measure, unit**0.5) for measure in squares],
+        [*others, (partial(_weighted, 1 / 3), unit / 3)],
+    ]
 
 
-def _others(steps: Floats, unit: float, *, weighted: bool) -> Iterator[tuple[Measure, float]]:
-    """Yield the squares of these, and ``weighted`` measures: chessboard, city-block and 3-4-5."""
-    for length, _ in _euclidean(steps, unit):
-        yield lambda offsets, length=length: length(offsets) ** 2, unit**0.5  # type: ignore[misc]
-    if weighted:
-        yield from ((partial(_weighted, weight), unit) for weight in (0.0, 1.0))
-        yield partial(_weighted, 1 / 3), unit / 3
-
-
-def _length(steps: Floats, offsets: NDArray[np.int64]) -> Floats:
-    lengths: Floats = np.linalg.norm(offsets * steps, axis=1)
+def _length(steps: Floats, offsets: NDArray[np.int64], power: int = 1) -> Floats:
+    lengths: Floats = np.linalg.norm(offsets * steps, axis=1) ** power
     return lengths
 
 
@@ -498,11 +498,10 @@ def _nearest(sides: Floats, measure: Measure) -> tuple[Floats, BoolArray]:
     return nearest, straight != 0
 
 
-def _count_lone(marked: BoolArray, centre: BoolArray | None = None) -> int:
-    """Count inner samples, those of ``centre`` if given, round which all are marked."""
+def _are_lone(marked: BoolArray) -> BoolArray:
+    """Return round which inner samples all are marked."""
     windows = np.lib.stride_tricks.sliding_window_view(marked, (3, 3, 3), axis=(1, 2, 3))
-    alone = windows.all((-3, -2, -1))
-    return int((alone if centre is None else alone & centre).sum())
+    return np.asarray(windows.all((-3, -2, -1)))
 
 
 def _is_stepped(sides: Floats) -> bool:
@@ -515,11 +514,12 @@ def _is_stepped(sides: Floats) -> bool:
     near = (sides == 0)[:, INNER, INNER, INNER]
     zero = np.concatenate([near[centre > 0], near[centre < 0][:, ::-1, ::-1, ::-1]])
     ways = [*np.eye(3, dtype=int), *-np.eye(3, dtype=int)]
-    next_to = [_at(zero, way) for way in ways]
+    next_to = [zero[(..., *(1 + way))] for way in ways]
     stepped, counts = np.zeros(len(zero), bool), np.zeros((6, 6), int)
     for i, j in permutations(range(6), 2):
         if i % 3 != j % 3:
-            goes_on = _at(zero, ways[i] - ways[j]) & _at(zero, ways[j] - ways[i])
+            one, other = ((..., *(1 + way)) for way in (ways[i] - ways[j], ways[j] - ways[i]))
+            goes_on = zero[one] & zero[other]
             steps = next_to[i] & next_to[j] & ~goes_on
             stepped |= steps
             counts[i, j] = steps.sum()
@@ -528,12 +528,8 @@ def _is_stepped(sides: Floats) -> bool:
     return bool(share > STEPPED and both_ways.any())
 
 
-def _at(patches: BoolArray, offset: NDArray[np.int64]) -> BoolArray:
-    return np.asarray(patches[(..., *(1 + offset))])
-
-
 def _side_of_zeros(sides: Floats) -> int:
     """Return the sign of the side that zeros border, with no neighbour there; 0 if unclear."""
     zero = sides[:, INNER, INNER, INNER] == 0
-    lone = [_count_lone(sides != sign, zero) for sign in (-1, 1)]
+    lone = [int((_are_lone(sides != sign) & zero).sum()) for sign in (-1, 1)]
     return int(np.sign(lone[1] - lone[0]))

@@ -1,25 +1,19 @@
 """From values of any kind to distances near the surface: what they are, and the best way there.
 
 The evidence is gathered once (``census``, ``field``); the user may overrule it. The zero level
-never moves. Values that change from sample to sample are exact, noisy, truncated or scaled: their
-sign and spacing are as given, or as the values show them. A scaled or closely truncated field is
-meshed by its cubic spline, which is the same whatever the spacings. So it becomes distances on its
-lattice, and unequal spacings are no matter.
+never moves. A scaled or closely truncated field is meshed by its cubic spline, which is the same
+whatever the spacings: it becomes distances on its lattice.
 
-Values that are refused may be labels, densities, unsigned distances, distances in another unit, or
-a field of another slope: the message names the one option to try next. Values without a sample
-inside are the hardest: thin solids, and what only looks like one. A wall thinner than the spacing
-may pass between the samples, which are then all outside. Their distances still show it: the sphere
-of each sample touches the wall and contains none of it. Other fields have no inside either:
-unsigned distances to a thick solid, and values that stay above 0.
+Of values that are refused, the message names the one option to try next. Those without a sample
+inside are the hardest. A wall thinner than the spacing may pass between the samples, which are then
+all outside, but the sphere of each touches the wall and contains none of it. Other fields have no
+inside either: unsigned distances to a thick solid, and values that stay above 0.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import replace
 from functools import partial
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -29,14 +23,8 @@ from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, Triple
 from ..errors import GridError
 from ..options import AUTO, EXACT, MASK, NOISY, SCALED, TRUNCATED, Options
 from ..threads import chunks_of
-from .census import CUT_OFF, ENOUGH, Census, Extremes, Floats, Gradients, Looked, not_finite
-from .derived import (
-    extremes_of_masks,
-    filled_planes,
-    mask_planes,
-    normalised_planes,
-    without_plateaus,
-)
+from . import derived
+from .census import CUT_OFF, ENOUGH, Census, Floats, Gradients, Looked, not_finite
 from .field import (
     NONE_EXACT,
     SLOPE_OFF,
@@ -81,7 +69,7 @@ SAME_SLOPE = 5e-5  # from 1: in words it is 1
 TOO_BENT = 0.1  # share of wrong slopes from which the network has no say in a field
 
 # Of what is refused. All lengths are in spacings, the coarsest one if they differ between axes.
-MARGIN = 1.05  # on half the diagonal of a voxel: so far is the nearest sample at most
+MARGIN = 1.05  # on half the diagonal of a voxel
 # Along a line of samples the field falls towards a wall and rises behind it, both at least so
 # steeply: lines that graze the wall do not tell where it is.
 STEEP = 0.25
@@ -111,6 +99,7 @@ ROUNDS, FEW = 20, 1 << 16  # of the search for a level; samples of a plane
 FAR = "every wall is nearer to some sample than that, so there is no surface"
 BEYOND = "only samples on the border of the grid are near 0, so no surface lies in it"
 UNSIGNED = "unsigned distances have no inside"
+APPROXIMATE = "from the values, so the size of the mesh is approximate (give --spacing)"
 
 
 def interpret(
@@ -120,12 +109,13 @@ def interpret(
     steps = None if spacing is None else check_spacing(spacing)
     check_kind(samples.dtype, samples.shape)
     notes: list[str] = []
+    if wanted.inside == AUTO and (wanted.label is not None or wanted.level is not None):
+        wanted = replace(wanted, inside="positive")
     if wanted.label is not None or samples.dtype == np.bool_:
         census = Census(samples) if wanted.label is None else labelled(samples, wanted.label)
         low, high = census.extremes
         if low == high:
             raise GridError(f"every value is {bool(low)}: a constant field has no surface")
-        wanted = wanted if wanted.label is None else _above_is_inside(wanted)
         case = Case(census.samples, census, wanted, steps, notes)
         taken = _of_mask(case, census.samples, census.border_shares()[2])
     else:
@@ -141,7 +131,6 @@ def _of_numbers(
         samples = changed(samples, partial(np.add, -float(wanted.level)))
         which = "below" if wanted.inside == "negative" else "above"
         notes.append(f"values {which} {wanted.level:g} are taken as inside (see --inside)")
-        wanted = _above_is_inside(wanted)
     if wanted.scale is not None:
         samples = changed(samples, partial(np.multiply, float(wanted.scale)))
     case = Case(samples, Census(samples), wanted, spacing, notes)
@@ -162,10 +151,6 @@ def _of_numbers(
     if known is None or known.unseen is None:
         return taken
     return taken.with_field(unseen=known.unseen, why_open=known.why_open)
-
-
-def _above_is_inside(wanted: Options) -> Options:
-    return replace(wanted, inside="positive") if wanted.inside == AUTO else wanted
 
 
 def _known(case: Case) -> tuple[Case, Transform | None, Filled | None]:
@@ -207,21 +192,17 @@ def _of_known(case: Case, transform: Transform | None) -> Interpreted:
     if not case.is_density and census.are_labels:
         raise GridError(f"no solid is chosen: {choose_label(census.samples)}")
     if wanted.field in (EXACT, NOISY):
-        return as_distances(case)
-    return _by_evidence(case)
-
-
-def _by_evidence(case: Case) -> Interpreted:
-    looked = case.census.looked
-    if case.is_density and case.wanted.field == AUTO and _is_step(looked):
+        return _as_distances(case)
+    looked = census.looked
+    if case.is_density and wanted.field == AUTO and _is_step(looked):
         case.notes.append("the densities jump from one side of the level to the other")
-        return _of_mask(case, _above(case.samples, 0), 1 - case.census.border_shares()[1])
+        return _of_mask(case, _above(case.samples, 0), 1 - census.border_shares()[1])
     if case.is_density:
         steps = case.with_spacing(1, "since densities show none (give --spacing)")
         case = replace(case, spacing=steps)
     if _has_other_slope(case):
-        return of_slope(case)
-    return by_kind(as_distances(case, is_cut=bool(looked.is_cut.any())), case)
+        return _of_slope(case)
+    return _by_kind(_as_distances(case, is_cut=bool(looked.is_cut.any())), case)
 
 
 def _has_other_slope(case: Case) -> bool:
@@ -229,11 +210,10 @@ def _has_other_slope(case: Case) -> bool:
     looked, spacing = case.census.looked, case.spacing
     if case.wanted.field == SCALED or spacing is None:
         return case.wanted.field == SCALED
-    other = is_normalised(looked, spacing) or is_projective(looked, spacing)
-    if other or not case.is_density:
-        return other
-    evidence = weigh(looked, spacing)
-    return not np.isfinite(evidence.slope) or evidence.is_scaled
+    if is_normalised(looked, spacing) or is_projective(looked, spacing):
+        return True
+    evidence = weigh(looked, spacing) if case.is_density else None
+    return bool(evidence and (not np.isfinite(evidence.slope) or evidence.is_scaled))
 
 
 def labelled(samples: SampleArray, label: int) -> Census:
@@ -311,7 +291,9 @@ def _of_mask(case: Case, mask: SampleArray, lower: float) -> Interpreted:
     )
     h = min(steps_of(spacing))
     field = Field(MASK, exact=NONE_EXACT, on_lattice=not is_cubic(spacing))
-    return Interpreted(mask_planes(mask, h), extremes_of_masks(h), spacing, False, field)
+    return Interpreted(
+        derived.mask_planes(mask, h), derived.extremes_of_masks(h), spacing, False, field
+    )
 
 
 def check_negative_inside(census: Census) -> None:
@@ -357,46 +339,31 @@ def choose_spacing(
     agree = len(everywhere.bend) < ENOUGH or everywhere.agree_with(everywhere.typical_length)
     each = everywhere.spacing if unequal or not agree else None
     if each is not None and each.max() > CLEARLY_UNEQUAL * each.min():
-        return _snap_axes(each)
+        each = each.copy()
+        for near in each.copy():  # axes that are equal but for the error of the estimate
+            alike = np.abs(each / near - 1) <= SNAP
+            each[alike] = each[alike].mean()
+        spacing = check_spacing(each)
+        shown = f"{', '.join(f'{h:.6g}' for h in spacing)} along x, y, z"
+        return spacing, [f"spacing not given: estimated as {shown} {APPROXIMATE}"]
     if unequal:
         steps = ", ".join(f"{step:.4g} along {name}" for name, step in unequal.items())
         raise GridError(
             f"spacing not given: the values change by {steps} from sample to sample, and do not "
             f"show it for all axes; {way_out(census)}"
         )
-    return _snap(_measure(everywhere, beside), census.shape)
-
-
-def _snap_axes(each: Floats) -> tuple[Triple, list[str]]:
-    """Return the estimated spacings of the axes, those that are nearly equal as one."""
-    each = each.copy()
-    for near in each.copy():  # axes that are equal but for the error of the estimate
-        alike = np.abs(each / near - 1) <= SNAP
-        each[alike] = each[alike].mean()
-    spacing = check_spacing(each)
-    return spacing, [
-        f"spacing not given: estimated as {', '.join(f'{h:.6g}' for h in spacing)} along x, y, z "
-        "from the values, so the size of the mesh is approximate (give --spacing)"
-    ]
-
-
-def _snap(measured: float, shape: tuple[int, ...]) -> tuple[Triple, list[str]]:
-    """Return the measured spacing, or a usual one close to it."""
+    measured, n = _measure(everywhere, beside), max(census.shape)
     if not LEAST_SPACING <= measured <= MOST_SPACING:
         raise GridError(
             f"spacing not given: the values change by {measured:.6g} from sample to sample; give "
             f"--spacing, in a unit in which it is between {LEAST_SPACING:g} and {MOST_SPACING:g}"
         )
-    n = max(shape)
     usual = {"1": 1.0} | {f"{a}/{b}": a / b for a in (1, 2) for b in (n, n - 1)}
     name = min(usual, key=lambda key: abs(np.log(usual[key] / measured)))
-    if abs(measured / usual[name] - 1) <= SNAP:
-        note = f"spacing not given: taken as {name}, the values show {measured:.6g}"
-        return (usual[name],) * 3, [note]
-    return (measured,) * 3, [
-        f"spacing not given: estimated as {measured:.6g} from the values, so the size of the mesh "
-        "is approximate (give --spacing)"
-    ]
+    if abs(measured / usual[name] - 1) > SNAP:
+        return (measured,) * 3, [f"spacing not given: estimated as {measured:.6g} {APPROXIMATE}"]
+    said = f"spacing not given: taken as {name}, the values show {measured:.6g}"
+    return (usual[name],) * 3, [said]
 
 
 def _measure(everywhere: Gradients, beside: Gradients) -> float:
@@ -454,7 +421,7 @@ def _check_axes(census: Census, gradients: Gradients, spacing: Triple) -> None:
         )
 
 
-def as_distances(case: Case, *, is_cut: bool = False) -> Interpreted:
+def _as_distances(case: Case, *, is_cut: bool = False) -> Interpreted:
     """Return values that are taken as distances, exact or noisy ones, some perhaps cut off."""
     census, positive = case.census, _is_positive_inside(case)
     spacing, notes = choose_spacing(census, case.spacing, is_cut=is_cut)
@@ -470,7 +437,7 @@ def as_distances(case: Case, *, is_cut: bool = False) -> Interpreted:
     return Interpreted(case.samples, census.extremes, spacing, positive, field)
 
 
-def by_kind(taken: Interpreted, case: Case) -> Interpreted:
+def _by_kind(taken: Interpreted, case: Case) -> Interpreted:
     """Return values that were taken as distances with the kind that the samples show."""
     looked = case.census.looked
     evidence = weigh(looked, taken.spacing)
@@ -510,7 +477,7 @@ def _in_another_unit(taken: Interpreted, evidence: Evidence, case: Case) -> Inte
     return taken.divided(unit).with_field(evidence=evidence.report())
 
 
-def of_slope(case: Case) -> Interpreted:
+def _of_slope(case: Case) -> Interpreted:
     """Return distances for a field of another slope; the given spacing is believed."""
     census, looked = case.census, case.census.looked
     if census.is_one_sided:
@@ -541,31 +508,24 @@ def of_slope(case: Case) -> Interpreted:
 
 def _cut_at(taken: Interpreted, evidence: Evidence) -> float:
     """Return at how many of the longest spacings values are cut off; infinite if they are not."""
-    low, high = _uncut(taken.extremes, evidence)
+    low, high = evidence.uncut(taken.extremes)
     return min(-low, high) / max(steps_of(taken.spacing))
-
-
-def _uncut(extremes: Extremes, evidence: Evidence) -> Extremes:
-    low, high = extremes
-    return (low if evidence.cut_low else -np.inf), (high if evidence.cut_high else np.inf)
 
 
 def _truncated(taken: Interpreted, evidence: Evidence, case: Case) -> Interpreted:
     """Return truncated distances, the missing ones filled in if that helps."""
-    at, (low, high) = _cut_at(taken, evidence), _uncut(taken.extremes, evidence)
+    at, (low, high) = _cut_at(taken, evidence), evidence.uncut(taken.extremes)
     exact = (-high, -low) if taken.positive_inside else (low, high)
     taken = replace(taken, field=Field(TRUNCATED, exact=exact, evidence=evidence.report()))
     if np.isfinite(at):
-        case.notes.append(
-            f"values taken as truncated (--field truncated): cut off {at:.3g} voxels from the "
-            "surface"
-        )
+        said = f"cut off {at:.3g} voxels from the surface"
+        case.notes.append(f"values taken as truncated (--field truncated): {said}")
     if at < TOO_NEAR:
         return _as_spline(taken)
-    if at < FILLED:
-        whole = filled_planes(taken.samples, steps_of(taken.spacing), taken.extremes)
-        return replace(taken, samples=whole)
-    return taken
+    if at >= FILLED:
+        return taken
+    steps = steps_of(taken.spacing)
+    return replace(taken, samples=derived.filled_planes(taken.samples, steps, taken.extremes))
 
 
 def _projective(taken: Interpreted, evidence: Evidence, case: Case) -> Interpreted:
@@ -582,7 +542,7 @@ def _as_spline(taken: Interpreted) -> Interpreted:
     """Return distances that were cut off too near the surface, to be meshed by their spline."""
     sign = -1.0 if taken.positive_inside else 1.0
     smooth = changed(taken.samples, lambda values: values * sign)
-    samples = without_plateaus(taken.samples, taken.extremes, min(steps_of(taken.spacing)))
+    samples = derived.without_plateaus(taken.samples, taken.extremes, min(steps_of(taken.spacing)))
     taken = replace(taken, samples=samples).with_field(smooth=smooth)
     if is_cubic(taken.spacing):
         return taken
@@ -609,18 +569,17 @@ def _scaled(taken: Interpreted, evidence: Evidence, case: Case) -> Interpreted:
     sign = (-1 if taken.positive_inside else 1) / slope
     steps, cubic = steps_of(taken.spacing), is_cubic(taken.spacing)
     step = steps[0] if cubic else float(np.exp(np.log(steps).mean()))
-    contradictory = evidence.is_too_steep or evidence.is_contradictory
     has_distances = evidence.is_enough and not evidence.is_cut and evidence.wrong < TOO_BENT
     field = Field(
         SCALED,
         exact=NONE_EXACT,
         smooth=changed(taken.samples, lambda values: values * sign),
-        has_kinks=has_distances and not contradictory and cubic,
+        has_kinks=has_distances and not evidence.is_contradictory and cubic,
         on_lattice=not cubic,
         evidence=evidence.report(),
     )
     low, high = (x / slope for x in taken.extremes)
-    samples = normalised_planes(taken.samples, min(steps), step * slope)
+    samples = derived.normalised_planes(taken.samples, min(steps), step * slope)
     return replace(taken, samples=samples, extremes=(low, high), field=field)
 
 
@@ -629,9 +588,14 @@ def find_fault(census: Census, spacing: Triple) -> str:
     extremes, values = census.extremes, census.samples
     steps = np.array(spacing) / max(spacing)
     scale = (1 if extremes[0] >= 0 else -1) / max(spacing)
-    if min(map(abs, extremes)) * abs(scale) > reach(steps):
+    near = float(np.linalg.norm(steps)) / 2 * MARGIN  # so far is the nearest sample of a point
+    if min(map(abs, extremes)) * abs(scale) > near:
         return FAR
-    patches, total, thin, coarse = _look_near_walls(values, scale, steps)
+    nth = 1  # of a large grid every n-th sample along each axis is looked at for regions
+    while np.prod([-(-count // nth) for count in values.shape], dtype=float) > MOST_FLOODED:
+        nth += 1
+    coarse = [np.asarray(values[i], np.float64)[::nth, ::nth] for i in range(0, len(values), nth)]
+    patches, total, thin = _look_near_walls(values, scale, steps, near)
     if not len(patches):
         return BEYOND
     change = np.abs(patches - patches[:, CENTRE, None])
@@ -641,65 +605,41 @@ def find_fault(census: Census, spacing: Triple) -> str:
         return UNSIGNED
     if len(thin) > UNSIGNED_SHARE * total:
         beyond = max(-float(np.quantile(thin, LEAST_THICKNESS)), 0.0)
-        if _is_cut_off(coarse, steps, FREE + beyond):
+        if _is_cut_off(np.array(coarse) * (scale / nth), steps, FREE + beyond):
             return UNSIGNED
     return ""
 
 
-def reach(steps: Floats) -> float:
-    """Return how far a point is from the nearest sample at most, with a margin."""
-    return float(np.linalg.norm(steps)) / 2 * MARGIN
-
-
 def _look_near_walls(
-    values: SampleArray, scale: float, steps: Floats
-) -> tuple[Floats, int, Floats, Floats]:
-    """Return what lies near 0, reading each plane once; ``scale`` makes outside positive.
+    values: SampleArray, scale: float, steps: Floats, near: float
+) -> tuple[Floats, int, Floats]:
+    """Return what lies near 0; ``scale`` makes outside positive.
 
     Distances round some of the inner samples, (n, 27); how many walls pass between samples, of all
-    lines along the axes; how thick those are that hardly have a thickness, less than 0 if a
-    constant was added; and every n-th sample along each axis, in n spacings.
+    lines along the axes; and how thick those are that hardly have a thickness, less than 0 if a
+    constant was added.
     """
-    nth = 1
-    while np.prod([-(-count // nth) for count in values.shape], dtype=float) > MOST_FLOODED:
-        nth += 1
-    count, near = 0, reach(steps)
-    patches: list[Floats] = []
-    thin: list[Floats] = [np.empty(0)]
-    coarse: list[Floats] = []
-    window: deque[Floats] = deque(maxlen=4)
-    for number, plane in enumerate(chain(values, [None])):
-        if plane is not None:
-            window.append(np.asarray(plane, np.float64) * scale)
-            if number % nth == 0:
-                coarse.append(window[-1][::nth, ::nth])
-        elif len(window) == 4:
-            window.popleft()
-        if number < 3:
-            continue
-        slab = np.stack(window)
+    count = 0
+    patches, thin = list[Floats](), [np.empty(0)]
+    for i in range(1, len(values) - 1):
+        slab = np.asarray(values[i - 1 : i + 3], np.float64) * scale
         if slab[1:3].min() <= near:
             for lines, step in zip((slab, slab[1], slab[1].T), steps):
                 for part in chunks_of(lines.shape[1], lines[:, 0].size):  # to save memory
                     thickness = find_walls(lines[:, part] / step)[1]
                     count += len(thickness)
                     thin.append(thickness[thickness < NO_THICKNESS])
-            patches += _patches_near(slab[:3], near)
+        inner = slab[1, 1:-1, 1:-1]
+        found = np.flatnonzero(inner <= near)
+        if len(found):
+            order = np.argsort(inner.ravel()[found])
+            spread = np.linspace(0, len(order) - 1, CANDIDATES_IN_PLANE).astype(int)
+            chosen = found[np.union1d(order[:CANDIDATES_IN_PLANE], order[spread])]
+            at = np.stack(np.unravel_index(chosen, inner.shape), 1)
+            patches += [slab[:3, j : j + 3, k : k + 3].reshape(27) for j, k in at]
     some = np.unique(np.linspace(0, max(len(patches) - 1, 0), CANDIDATES).astype(int))
     chosen = np.array([patches[n] for n in some] if patches else []).reshape(-1, 27)
-    return chosen, count, np.concatenate(thin), np.array(coarse) / nth
-
-
-def _patches_near(slab: Floats, limit: float) -> list[Floats]:
-    inner = slab[1, 1:-1, 1:-1]
-    near = np.flatnonzero(inner <= limit)
-    if not len(near):
-        return []
-    order = np.argsort(inner.ravel()[near])
-    spread = np.linspace(0, len(order) - 1, CANDIDATES_IN_PLANE).astype(int)
-    chosen = np.union1d(order[:CANDIDATES_IN_PLANE], order[spread])
-    at = np.stack(np.unravel_index(near[chosen], inner.shape), 1)
-    return [slab[:, j : j + 3, k : k + 3].reshape(27) for j, k in at]
+    return chosen, count, np.concatenate(thin)
 
 
 def find_walls(lines: Floats) -> tuple[BoolArray, Floats]:
@@ -745,18 +685,14 @@ def _is_cut_off(coarse: Floats, steps: Floats, free: float) -> bool:
     reached.flat[border.argmax()] = True
     before = 0
     while before != (before := int(reached.sum())):
-        for axis, step in enumerate(steps):
-            _spread(np.moveaxis(reached, axis, 0), np.moveaxis(coarse, axis, 0), free * step)
+        for axis, step in enumerate(steps):  # both ways along the axis
+            lines, samples = (np.moveaxis(x, axis, 0) for x in (reached, coarse))
+            is_free = samples[1:] + samples[:-1] > free * step
+            for i in range(len(is_free)):
+                lines[i + 1] |= lines[i] & is_free[i]
+            for i in reversed(range(len(is_free))):
+                lines[i] |= lines[i + 1] & is_free[i]
     return bool((coarse[~reached] >= DEEP).any())
-
-
-def _spread(reached: BoolArray, samples: Floats, limit: float) -> None:
-    """Extend what is reached along the first axis, both ways, where no wall passes between."""
-    free = samples[1:] + samples[:-1] > limit
-    for i in range(len(free)):
-        reached[i + 1] |= reached[i] & free[i]
-    for i in range(len(free) - 1, -1, -1):
-        reached[i] |= reached[i + 1] & free[i]
 
 
 def way_out(census: Census, spacing: Triple | None = None, fault: str = UNSIGNED) -> str:
@@ -887,12 +823,10 @@ def _between(samples: SampleArray) -> float:
     return float(f"{level:.3g}")
 
 
-def _steps(census: Census) -> NDArray[np.float64] | None:
+def _steps(census: Census) -> Floats | None:
     """Return the spacing of each axis with which values are distances; None if with none."""
     gradients = census.everywhere
-    if not len(gradients.bend):
-        return None
-    if gradients.spacing is not None:
-        return gradients.spacing
+    if not len(gradients.bend) or gradients.spacing is not None:
+        return gradients.spacing if len(gradients.bend) else None
     step = gradients.typical_length
     return np.full(3, step) if gradients.agree_with(step) else None

@@ -340,12 +340,7 @@ def placed(
     if isinstance(values, xarray.Dataset):
         names = ", ".join(map(str, values.data_vars)) or "none"
         raise GridError(f"values are a Dataset: give one of its arrays ({names})")
-    array = _axes_in_order(values)
-    check_kind(array.dtype, array.shape)
-    return _at_coordinates(array, spacing, origin)
-
-
-def _axes_in_order(array: Any) -> Any:
+    array: Any = values
     if array.ndim < len(AXES):
         check_kind(array.dtype, array.shape)  # raises
     wanted = UNNAMED if set(array.dims) == set(UNNAMED) else AXES
@@ -361,7 +356,9 @@ def _axes_in_order(array: Any) -> Any:
                 f"dimension {name!r} has length {array.sizes[name]:,}: choose one, such as "
                 f"array.isel({name}=0)"
             )
-    return array.isel(dict.fromkeys(extra, 0)).transpose(*wanted)
+    array = array.isel(dict.fromkeys(extra, 0)).transpose(*wanted)
+    check_kind(array.dtype, array.shape)
+    return _at_coordinates(array, spacing, origin)
 
 
 def _at_coordinates(array: Any, spacing: ArrayLike | None, origin: ArrayLike | None) -> Placed:
@@ -380,11 +377,8 @@ def _at_coordinates(array: Any, spacing: ArrayLike | None, origin: ArrayLike | N
     firsts, steps = zip(*(even_steps(name, array.coords[name].values) for name in names))
     samples = samples[tuple(slice(None, None, -1 if step < 0 else 1) for step in steps)]
     lowest = [first + min(step, 0) * (n - 1) for first, step, n in zip(firsts, steps, array.shape)]
-    return Placed(
-        samples,
-        np.abs(steps) if spacing is None else spacing,
-        lowest if origin is None else origin,
-    )
+    spacing = np.abs(steps) if spacing is None else spacing
+    return Placed(samples, spacing, lowest if origin is None else origin)
 
 
 def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
@@ -424,15 +418,12 @@ def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
     if hasattr(values, "chunks") and isinstance(getattr(values, "dtype", None), np.dtype):
         return LazyPlanes(values)  # of h5py, Zarr or Dask
     try:
-        samples = np.asanyarray(without_device(values))
+        samples: NDArray[Any] = np.asanyarray(without_device(values))
     except (TypeError, ValueError, RuntimeError):  # ragged lists
         raise GridError(f"values are {seen(values)}: give an array of three axes") from None
-    return _unmasked(samples) if hasattr(samples, "mask") else samples  # to name it takes 7 ms
-
-
-def _unmasked(samples: NDArray[Any]) -> NDArray[Any]:
-    """Return the data of a masked array, NaN where it is masked: unknown."""
-    masked = np.ma.getmaskarray(samples)
+    if not hasattr(samples, "mask"):
+        return samples
+    masked = np.ma.getmaskarray(samples)  # of a masked array: what is masked is unknown
     if not masked.any() or samples.dtype.kind not in "fiu":
         return np.asarray(np.ma.filled(samples, False) if masked.any() else samples.data)
     data = np.array(samples.data, np.result_type(samples.dtype, np.float32))

@@ -304,13 +304,14 @@ def make_grid(
     )
 
 
-def check_grid(grid: Any) -> None:
-    """Raise OptionTypeError if ``grid`` is not an ``SdfGrid``, but an array or a path, say."""
+def check_grid(grid: Any) -> SdfGrid:
+    """Return a grid; OptionTypeError if it is no ``SdfGrid``, but an array or a path, say."""
     if not isinstance(grid, SdfGrid):
         what = f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else seen(grid)
         raise OptionTypeError(
             f"grid is {what}: make one with make_grid(values, spacing=...) or read_grid(path)"
         )
+    return grid
 
 
 def _checked(samples: SampleArray) -> Census:
@@ -393,8 +394,15 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     accurate as they can be. GridError if there is an offset, and the values are no distances.
     """
     if grid.is_cubic or grid.field.on_lattice:
-        check_has_offsets(grid, offset)
-        return grid
+        if not offset or grid.is_cubic:
+            return grid
+        each = ", ".join(f"{h:g}" for h in grid.spacing)
+        raise GridError(
+            f"offset {offset:g}: the values are taken as {grid.field.kind}, and with the spacing "
+            f"{each} they are no distances by which an offset surface could be found; mesh the "
+            "solid itself (--offset 0), sample the mesh (super-sdf sample), and mesh that grid "
+            "with the offset"
+        )
     if grid.field.unseen is not None:
         raise GridError(
             "samples beside the surface are unknown, and the spacing differs between axes: mesh "
@@ -418,18 +426,6 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     )
     more = {"notes": (*grid.notes, note), "on_sample": tuple(known)}
     return with_fields(grid, samples=samples, spacing=(steps[0], steps[1], steps[2]), **more)
-
-
-def check_has_offsets(grid: SdfGrid, offset: float) -> None:
-    """Raise GridError if there is an offset, and no distances in the world to find it by."""
-    if offset and grid.field.on_lattice and not grid.is_cubic:
-        each = ", ".join(f"{h:g}" for h in grid.spacing)
-        raise GridError(
-            f"offset {offset:g}: the values are taken as {grid.field.kind}, and with the spacing "
-            f"{each} they are no distances by which an offset surface could be found; mesh the "
-            "solid itself (--offset 0), sample the mesh (super-sdf sample), and mesh that grid "
-            "with the offset"
-        )
 
 
 def sampled_places(grid: SdfGrid) -> NDArray[np.intp]:

@@ -189,7 +189,7 @@ def without_unseen(census: Census, notes: list[str]) -> Census:
     samples, all_known = census.samples, census.is_finite
     for value, steepest in _suspects(census.pairs, extremes):
         regions = Regions(samples, partial(np.equal, value))
-        unseen = _unseen_runs(samples, regions, value, steepest, extremes)
+        unseen = _unseen_runs(samples, regions, value, JUMP * steepest, extremes)
         if unseen.any():
             notes.append(
                 f"{int(regions.size[unseen].sum()):,} samples are exactly {value:g}, where no "
@@ -203,32 +203,31 @@ def without_unseen(census: Census, notes: list[str]) -> Census:
 
 def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
     """Return values that may stand for unseen samples, and the steepest change of the others."""
-    values, counts = np.unique(pairs[0][pairs[0] == pairs[1]], return_counts=True)
+    has_equal = np.count_nonzero(pairs[0] == pairs[1]) >= ENOUGH
+    values, counts = np.unique(pairs[0] if has_equal else (), return_counts=True)
     often = values[counts >= ENOUGH][np.argsort(counts[counts >= ENOUGH])[-FREQUENT:]]
     changes = np.abs(pairs[1] - pairs[0])
-    changes[np.isin(pairs, extremes).all(0)] = 0  # values that are cut off near the surface
+    is_extreme = np.isin(pairs, extremes)
+    changes[is_extreme.all(0)] = 0  # values that are cut off near the surface
+    crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
     suspects = []
     for value in sorted({0.0, *extremes, *often.tolist()}):
         has, is_often = pairs == value, value not in (0, *extremes)
         alike, beside = int((has[0] & has[1]).sum()), changes[has[0] != has[1]]
-        if is_often and alike < ALIKE * (alike + len(beside)):
-            continue
         largest = np.sort(beside)[-LEAST_JUMPS] if len(beside) >= LEAST_JUMPS else 0.0
         is_plateau = value == 0 and alike >= ENOUGH
-        if not (is_plateau or largest) or (value and _is_a_side(pairs, value)):
+        # Beside thin flat parts the sign changes mostly beside one value.
+        is_a_side = crossing.size and (crossing == value).any(0).mean() > A_SIDE
+        if not (is_plateau or largest) or (value and is_a_side):
             continue
-        steepest = _steepest(pairs, value, extremes)
+        if is_often and alike < ALIKE * (alike + len(beside)):
+            continue
+        steepest = _steepest(pairs, has, is_extreme)
         if value in extremes and _is_cut_near(pairs, value, steepest, extremes):
             continue
         if is_plateau or largest > JUMP * steepest:
             suspects.append((float(value), steepest))
     return suspects
-
-
-def _is_a_side(pairs: Floats, value: float) -> bool:
-    """Return whether the sign changes mostly beside a value, as beside thin flat parts."""
-    crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
-    return bool((crossing == value).any(0).mean() > A_SIDE) if crossing.size else False
 
 
 def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extremes) -> bool:
@@ -239,15 +238,14 @@ def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extreme
     return bool(near and np.isin(crossing, extremes).all(0).mean() > FILLED_IN)
 
 
-def _steepest(pairs: Floats, value: float, extremes: Extremes) -> float:
+def _steepest(pairs: Floats, has: BoolArray, is_extreme: BoolArray) -> float:
     """Return the steepest change of samples without a value, or all that they span, if few tell."""
-    is_inner = ~np.isin(pairs, (value, *extremes))
-    rest, inner = pairs[pairs != value], pairs[is_inner]
-    change = np.abs(pairs[1] - pairs[0])
-    changes = change[(pairs != value).all(0)]
+    is_inner, change = ~(has | is_extreme), np.abs(pairs[1] - pairs[0])
+    inner, changes = pairs[is_inner], change[~has.any(0)]
     span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
     changes = changes[(changes > 0) & (changes <= span)]
     if len(changes) < ENOUGH or len(np.unique(inner[:MANY])) < LEAST_VALUES:
+        rest = pairs[~has]
         low, high = rest.min(initial=0), rest.max(initial=0)
         return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
     # A field that levels off, or with far spacings along one axis, is steepest at the surface.
@@ -276,25 +274,12 @@ def _are_jumps(pairs: Floats, limit: float, extremes: Extremes) -> BoolArray:
 
 
 def _unseen_runs(
-    samples: SampleArray, regions: Regions, value: float, steepest: float, extremes: Extremes
+    samples: SampleArray, regions: Regions, value: float, limit: float, extremes: Extremes
 ) -> BoolArray:
-    """Return which runs of a value were never seen, (n,)."""
-    beside, jumps, above, amid = _count_beside(samples, regions, JUMP * steepest, extremes)
-    unseen = (jumps > UNSEEN * beside) & (jumps > 0)
-    unseen |= (beside == 0) & unseen.any()
-    if value == 0:  # no distance is 0 throughout, though on a surface it is at corners of steps
-        unseen |= amid > 0
-        unseen |= ((above == 0) | (above == beside)) & unseen.any()
-    return np.asarray(unseen[regions.root])
+    """Return which runs of a value were never seen, (n,): beside those values jump by over a limit.
 
-
-def _count_beside(
-    samples: SampleArray, regions: Regions, limit: float, extremes: Extremes
-) -> NDArray[np.int64]:
-    """Count, by the first run of each region, the pairs of its samples with others, (4, n).
-
-    All but those of both extremes; those that differ by more than a limit; those with one above 0;
-    and samples that have only others of the region round them.
+    Counted by region are the pairs of its samples with others, all but those of both extremes;
+    those that jump; those with one above 0; and samples with only others of the region round them.
     """
     counts = np.zeros((4, len(regions.root)), np.int64)
 
@@ -320,4 +305,10 @@ def _count_beside(
             amid = amid[:, 2:] & amid[:, 1:-1] & amid[:, :-2]
             count(3, before[1][0][1:-1, 1:-1][amid])
         before.append((runs, plane))
-    return counts
+    beside, jumps, above, among = counts
+    unseen = (jumps > UNSEEN * beside) & (jumps > 0)
+    unseen |= (beside == 0) & unseen.any()
+    if value == 0:  # no distance is 0 throughout, though on a surface it is at corners of steps
+        unseen |= among > 0
+        unseen |= ((above == 0) | (above == beside)) & unseen.any()
+    return np.asarray(unseen[regions.root])

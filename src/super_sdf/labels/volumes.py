@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CORNERS, Vectors, dot, length, sums_at
+from ..arrays import CORNERS, Vectors, dot, face_normals, length, sums_at
 from ..errors import OptionError
-from ..functions.zero import face_normals
 from ..grid.sdf_grid import SdfGrid
 from ..options import MASK
 from ..surface.mesh import Mesh

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from ..arrays import CORNERS, FloatArray, IntArray
 from ..refine.nodes import VoxelIndex, block_ijk
-from ..surface.cell_cases import EDGE_AXIS, EDGE_BETWEEN, EDGE_START, FACES, segments, triangulate
-from ..surface.marching import CAP_HEIGHT, cells_low_nodes, strides
+from ..surface.cell_cases import EDGE_BETWEEN, segments, triangulate
+from ..surface.marching import CAP_HEIGHT, EDGE_AXIS, EDGE_START, FACES, cells_low_nodes, strides
 from ..surface.mesh import CLEARANCE
 
 EDGES = tuple(zip(EDGE_START, EDGE_AXIS))

@@ -15,7 +15,7 @@ from datetime import datetime
 from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from .. import __version__
@@ -24,25 +24,19 @@ from ..convert import convert
 from ..errors import SuperSdfError
 from ..files.formats import is_grid
 from ..files.output import replacing
-from ..network.decoder import Decoder
-from ..options import Options
-from ..truth.mesh_files import read_mesh
-from .items import (
-    Entry,
-    Item,
-    entry_of,
-    entry_of_report,
-    find_item,
-    item_of_files,
-    item_path,
-    items_folder,
-    keep_item,
-    numbers,
-)
+from ..truth.solid import read_mesh
+from . import items
+from .items import Entry, Item, entry_of_report, item_of_files
+
+if TYPE_CHECKING:
+    from ..network.decoder import Decoder
+    from ..options import Options
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")
+COLOURS = ("touching", "pierced", "unknown", "apart", "full")
 GENERATOR = "super-sdf"
+EMPTY = {"lead": "", "alert": "", "summary": [], "notes": []}
 HEAD_BYTES = 4096  # of a page, in which its generator is looked for
 MARKUP = {ord(c): f"\\u{ord(c):04x}" for c in "<>&"}  # of JSON in which a tag could be read
 
@@ -52,34 +46,24 @@ def make_page(
 ) -> str:
     """Return a page of ``meshes``, packed and by the id of their entry.
 
-    ``facts`` are ``title``, ``lead`` (a sentence), ``alert`` (a sentence or ""), ``summary`` (rows
-    of label and text), ``notes`` and ``files``, entries. If ``beside``, the page may load scripts
-    from beside it, with the meshes that are not in it.
+    ``facts`` are ``title``, ``files``, which are entries, and some of ``EMPTY``. If ``beside``, the
+    page may load scripts from beside it, with the meshes that are not in it.
     """
 
     def hash_of(text: str) -> str:
-        """Return the hash by which a policy names an inline script or style."""
         digest = hashlib.sha256(text.encode("utf-8")).digest()
         return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
     def safe(value: Any) -> str:
-        """Return JSON in ASCII in which the characters of markup are escaped."""
         return json.dumps(value, ensure_ascii=True, allow_nan=False).translate(MARKUP)
 
     style = (HOME / "page.css").read_text("utf-8")
     scripts = [(HOME / name).read_text("utf-8") for name in SCRIPTS]
     own = " ".join(map(hash_of, scripts)) + (" 'self' file:" if beside else "")
-    known = {
-        "version": __version__,
-        "made": datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z"),
-        "colours": {
-            "touching": check.TOUCHING,
-            "pierced": check.PIERCED,
-            "unknown": check.UNKNOWN,
-            "apart": check.NOT_TOUCHING,
-            "full": check.FULL,
-        },
-    }
+    values = check.TOUCHING, check.PIERCED, check.UNKNOWN, check.NOT_TOUCHING, check.FULL
+    colours = dict(zip(COLOURS, values))
+    made = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
+    known = {"version": __version__, "made": made, "colours": colours}
     blocks = [  # their names are ours, never a file's
         f'<script type="application/json" id="meshes-{name}">{safe(packed)}</script>'
         for name, packed in (meshes or {}).items()
@@ -89,7 +73,7 @@ def make_page(
         "img-src data:; base-uri 'none'; form-action 'none'",
         generator=GENERATOR,
         style=style,
-        facts=safe({**facts, **known}),
+        facts=safe({**EMPTY, **facts, **known}),
         meshes="\n".join(blocks),
         scripts="\n".join(f"<script>{script}</script>" for script in scripts),
     )
@@ -103,12 +87,9 @@ def write_page(text: str, path: Path, *, force: bool = False) -> None:
 
 def is_page(path: Path) -> bool:
     """Return whether a file is a page that super-sdf has written."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-    except OSError:
-        return False
-    return f'<meta name="generator" content="{GENERATOR}">'.encode() in head
+    with suppress(OSError), path.open("rb") as file:
+        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(HEAD_BYTES)
+    return False
 
 
 def page_of_conversion(
@@ -117,12 +98,7 @@ def page_of_conversion(
     made: Any = None,
     certificate: check.Certificate | None = None,
 ) -> str:
-    """Return the page of a conversion.
-
-    ``report`` is what ``upsample --json`` prints, with ``input`` and ``output``; these are read
-    unless what was ``made`` has ``mesh`` and ``grid``. The mesh is checked unless there is a
-    certificate already.
-    """
+    """Return the page of a conversion by what ``upsample --json`` says; see ``item_of_files``."""
     item = item_of_files(report["output"], report["input"], options, made, certificate)
     name = Path(report["output"]).name
     entry = entry_of_report(name, report, item)
@@ -133,11 +109,7 @@ def page_of_conversion(
 
 
 def viewed_page(sources: Sequence[str], load: Callable[[], Decoder], options: Options) -> str:
-    """Return the page of some mesh files and grid files; all that it shows is within it.
-
-    ``load`` returns the network, and is called if there is a grid; ``options`` say how that is
-    refined.
-    """
+    """Return the page of mesh files, and of grid files, for which ``load`` loads a network."""
     network = load() if any(map(is_grid, sources)) else None
     shown = []
     for source in sources:
@@ -147,18 +119,17 @@ def viewed_page(sources: Sequence[str], load: Callable[[], Decoder], options: Op
                 target = Path(folder, "mesh.ply")
                 done = convert(source, target, network, options)
                 item = item_of_files(target, source, options, done)
-            said = {"input": source, "asked": options.digest(), "seconds": done.seconds}
-            shown.append((entry_of_report(name, {**done.report(), **said}, item), item))
-            continue
-        mesh, item = read_mesh(source), Item()
-        item.show(name, mesh)
-        low, high = (numbers(corner(axis=0)) for corner in (mesh.vertices.min, mesh.vertices.max))
-        bounds = ["bounds", f"({low}) to ({high})"]
-        facts = [["mesh", source], ["vertices", f"{len(mesh.vertices):,}"], bounds]
-        line = f"{len(mesh.faces):,} triangles, {'closed' if mesh.is_closed() else 'open'}"
-        shown.append((entry_of(name, line=line, facts=facts, remarks=item.remarks), item))
+            report = {**done.report(), "input": source, "asked": options.digest()}
+            report["seconds"] = done.seconds
+        else:
+            mesh, item = read_mesh(source), Item()
+            item.show(name, mesh)
+            report = {"output": source, "vertices": len(mesh.vertices)}
+            report |= {"triangles": len(mesh.faces), "closed": mesh.is_closed()}
+            report["bounds"] = [mesh.vertices.min(0), mesh.vertices.max(0)]
+        shown.append((entry_of_report(name, report, item), item))
     title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
-    return _whole_page(title, shown, [])
+    return _whole_page(title, shown)
 
 
 def write_batch_page(
@@ -166,62 +137,52 @@ def write_batch_page(
     facts: Mapping[str, Any],
     rows: Mapping[str, Mapping[str, Any]],
     draw: Callable[[str], Item | None],
-    interrupted: str = "",
     *,
     force: bool = False,
 ) -> None:
     """Write the page of a batch, files that failed first; their meshes are beside it.
 
-    ``facts`` are title and lead; ``rows`` are of its report, by their output, empty while they are
-    not finished. ``draw`` makes an item that is missing; ``interrupted`` says what ended the batch
-    before its time.
+    ``rows`` are lines of the report by their output, empty of what is not finished; ``draw`` makes
+    the item of an output if its file is missing.
     """
-    folder, entries = items_folder(path), list[Entry]()
+    folder, entries = items.items_folder(path), list[Entry]()
     for name, row in rows.items():
-        if not row:
-            entries.append(entry_of(name, "waiting", line="not finished"))
-        elif row["status"] != "ok":
-            of = [["grid", row["in"]], ["mesh", name]]
-            entries.append(entry_of(name, "failed", reason=row["reason"], facts=of))
-        else:
-            digest, file = row["output"]["sha256"], item_path(folder, name)
-            item = find_item(folder, name, digest)
-            if item is None:
-                with suppress(SuperSdfError):  # then it is not shown
-                    if made := draw(name):
-                        keep_item(made, folder, name, digest)
-                item = find_item(folder, name, digest)
-            report = {**row, "input": row["in"], "output": name}
-            entry = entry_of_report(name, report, item) | {"id": file.stem}
-            if item and item.size:
-                entry["meshes"] = quote(f"{folder.name}/{file.name}")
-            entries.append(entry)
-    kinds = {"failed": 0, "waiting": 1, "ok": 3}
-    entries.sort(
-        key=lambda e: (2 if e["faults"] or e["warnings"] else kinds[e["status"]], e["name"])
-    )
-    counts = {
-        "files": len(entries),
-        "failed": sum(entry["status"] == "failed" for entry in entries),
-        "not finished": sum(entry["status"] == "waiting" for entry in entries),
-        "with faults": sum(bool(entry["faults"]) for entry in entries),
-        "with warnings": sum(bool(entry["warnings"]) for entry in entries),
-    }
-    summary = [[k, f"{count:,}"] for k, count in counts.items() if count or k == "files"]
-    left, why = counts["not finished"], f", {interrupted}" if interrupted else ""
-    alert = f"Incomplete{why}: {left} not finished; run it again to go on" if left or why else ""
-    said = {**facts, "alert": alert, "notes": [], "summary": summary, "files": entries}
-    write_page(make_page(said, beside=True), path, force=force or is_page(path))
+        if row.get("status") != "ok":
+            known = {"line": "not finished"}
+            if row:
+                known = {"reason": row["reason"], "facts": [["grid", row["in"]], ["mesh", name]]}
+            entries.append(items.entry_of(name, row.get("status", "waiting"), **known))
+            continue
+        digest, file = row["output"]["sha256"], items.item_path(folder, name)
+        item = items.find_item(folder, name, digest)
+        with suppress(SuperSdfError):  # then it is not shown
+            if item is None and (made := draw(name)):
+                items.keep_item(made, folder, name, digest)
+                item = items.find_item(folder, name, digest)
+        entries.append(entry_of_report(name, {**row, "output": name}, item) | {"id": file.stem})
+        if item and item.size:
+            entries[-1]["meshes"] = quote(f"{folder.name}/{file.name}")
+    kinds = {"failed": 0, "waiting": 1, "doubtful": 2, "ok": 3}
+    of = {e["name"]: "doubtful" if e["faults"] or e["warnings"] else e["status"] for e in entries}
+    entries.sort(key=lambda entry: (kinds[of[entry["name"]]], entry["name"]))
+    counts = {"files": len(entries)}
+    for words, key in (
+        ("failed", "reason"),
+        ("with faults", "faults"),
+        ("with warnings", "warnings"),
+    ):
+        counts[words] = sum(bool(entry[key]) for entry in entries)
+    summary = [[words, f"{count:,}"] for words, count in counts.items() if count]
+    page = make_page({**facts, "summary": summary, "files": entries}, beside=True)
+    write_page(page, path, force=force or is_page(path))
 
 
 def _whole_page(
-    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]]
+    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]] = ()
 ) -> str:
     """Return a page with the meshes of its entries; ``summary`` are rows of label and text."""
-    meshes = {str(number): item.meshes for number, (_, item) in enumerate(shown)}
-    entries = [
-        entry | {"id": str(number), "meshes": "page" if item.meshes else None}
-        for number, (entry, item) in enumerate(shown)
-    ]
-    facts = {"title": title, "lead": "", "alert": "", "notes": [], "files": entries}
-    return make_page({**facts, "summary": summary}, meshes)
+    for number, (entry, item) in enumerate(shown):
+        entry |= {"id": str(number), "meshes": "page" if item.meshes else None}
+    meshes = {entry["id"]: item.meshes for entry, item in shown}
+    facts = {"title": title, "summary": summary, "files": [entry for entry, _ in shown]}
+    return make_page(facts, meshes)

@@ -1,27 +1,39 @@
 """What a page shows of each result: its entry, labels and texts, and its item, all the rest.
 
-The file of an item is a script, since a page that was opened from a file may load scripts and
-nothing else. Its first line is a comment with all but the meshes, so that a page of many files is
-made without reading these; the second one hands the meshes to the page.
+The file of an item is a script, since a page that was opened from a file may load nothing else. Its
+first line is a comment with all but the meshes, so that a page of many files is made without
+reading these; the second one hands the meshes to the page.
+
+Meshes are compressed, in base64: differences of consecutive x, then y, then z, in steps of 1/65535
+of their box, modulo 2^16; of consecutive corners of the triangles, modulo 2^32; then a signed byte
+for each residual, 127 for ``FULL`` voxels, -128 if unknown. ``viewer.js`` unpacks them.
 """
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import json
+import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from ..check.check import Certificate, check_mesh, read_for_check
+import numpy as np
+
+from ..check.check import FULL, Certificate, check_mesh, read_for_check
 from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
 from ..grid.sdf_grid import cubic_grid
-from ..options import Options
+from ..surface.extract import coarse_surface
 from ..surface.mesh import Mesh
-from .meshes import coarse_surface, packed_mesh
 
+if TYPE_CHECKING:
+    from ..options import Options
+
+MOST_TRIANGLES = 500_000  # of a mesh in a page: 3 to 5 MB
+STEPS = 65535  # along the longest side of the box
 RESULT, COARSE = "super-sdf", "marching cubes of the samples"
 LONGEST_HEAD = 1 << 20  # bytes of a file's first line
 COMMENT = b"// "
@@ -31,16 +43,10 @@ COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxe
 NOT_DRAWN = "not drawn: run the command again for its meshes"
 
 Entry = dict[str, Any]
-"""A file in the JSON of a page.
-
-id : what its meshes are found by
-name : what it is
-status : "ok", "failed" or "waiting"; of a failed one ``reason``
-line : counts in one line
-seconds, residual : for sorting; None if unknown
-facts, certificate, stages : lists of label and text
-faults, notes, warnings, remarks : lists of sentences
-meshes : "page", "beside" or None: where its meshes are
+"""A file in the JSON of a page: ``id``, by which its meshes are found, and ``name``; ``status``,
+"ok", "failed" or "waiting", and the ``reason`` of a failure; ``line``, counts in one line;
+``seconds`` and ``residual``, for sorting, None if unknown; lists of label and text, or of
+sentences, see ``LISTS``; ``meshes``, where they are: "page", a file beside it, or None.
 """
 
 
@@ -69,16 +75,12 @@ def item_of_files(
     made: Any = None,
     certificate: Certificate | None = None,
 ) -> Item:
-    """Return the item of a mesh and its grid; what cannot be made is said in it.
-
-    The files are read unless what was ``made`` has the ``mesh`` and the ``grid``. The mesh is
-    checked unless there is a certificate already.
-    """
+    """Return the item of a mesh and its grid, read unless ``made`` has both. Errors are in it."""
     try:
         shown, samples = read_for_check(mesh, grid, options, made)
     except SuperSdfError as error:
         return Item(certificate={"error": str(error)}, remarks=[f"not shown: {error}"])
-    item, checked = Item(), None
+    item = Item()
     try:
         check_modules("a check of the mesh, with residuals,", "report", ("igl",))
         certificate = certificate or check_mesh(shown, samples, options)
@@ -90,11 +92,35 @@ def item_of_files(
     known = lattice.field.unseen is None  # beside what is unknown, a coarse surface is made up
     coarse = coarse_surface(lattice, options.offset) if known else None
     if coarse and len(coarse.faces):
-        if certificate:
-            checked = check_mesh(coarse, samples, options, intersections=False)
+        checked = certificate and check_mesh(coarse, samples, options, intersections=False)
         title = COARSE + (", made equally spaced" if lattice.shape != samples.shape else "")
         item.show(title, coarse, checked)
     return item
+
+
+def packed_mesh(title: str, mesh: Mesh, certificate: Certificate | None = None) -> dict[str, Any]:
+    """Return a mesh in the JSON of a page, simplified if large; with residuals, if known."""
+    caption = f"{title}: {len(mesh.faces):,} triangles"
+    if len(mesh.faces) > MOST_TRIANGLES:  # in one pass, unlike ``simplify_mesh``: only to be seen
+        check_modules(f"a view of more than {MOST_TRIANGLES:,} triangles", "simplify", ("pyfqmr",))
+        from ..simplify.collapsing import collapse_to
+
+        mesh = collapse_to(mesh, np.zeros(len(mesh.faces), bool), MOST_TRIANGLES)
+        caption += f", shown simplified to {len(mesh.faces):,}"
+    vertices = mesh.vertices.astype(np.float64)
+    low, high = (vertices.min(0), vertices.max(0)) if len(vertices) else np.zeros((2, 3))
+    step = float((high - low).max()) / STEPS or 1.0
+    places = np.rint((vertices - low) / step).astype("<u2")
+    flat = places.T.ravel(), mesh.faces.astype("<u4").ravel()
+    parts = [np.diff(each, prepend=each.dtype.type(0)) for each in flat]
+    if shaded := certificate is not None and certificate.has_evidence:
+        share = certificate.residuals_at(mesh.vertices) / FULL
+        known = np.rint(np.clip(share, -1, 1) * 127)
+        parts.append(np.where(np.isnan(share), -128, known).astype(np.int8))
+    data = zlib.compress(b"".join(part.tobytes() for part in parts), 6)
+    counts = {"vertices": len(vertices), "triangles": len(mesh.faces), "residuals": shaded}
+    placed = {"low": low.tolist(), "step": step, "data": base64.b64encode(data).decode("ascii")}
+    return {"caption": caption, **counts, **placed}
 
 
 def items_folder(page: Path) -> Path:
@@ -138,11 +164,7 @@ def entry_of(name: str, status: str = "ok", **known: Any) -> Entry:
 
 
 def entry_of_report(name: str, report: Mapping[str, Any], item: Item | None) -> Entry:
-    """Return the entry of a mesh by its report, as ``Conversion.report`` has it, and its item.
-
-    ``report`` may also have ``seconds``, in all or per stage; ``stages``; ``check``, a certificate;
-    and ``input``, ``output``, ``model`` and the like.
-    """
+    """Return the entry of a mesh by its report, as ``upsample --json`` or ``batch`` has it."""
     stages = report["stages"] if "stages" in report else report.get("seconds", {})
     certificate = report.get("check") or (item.certificate if item else None) or {}
     shape = " x ".join(map(str, report.get("shape", ())))
@@ -161,16 +183,12 @@ def entry_of_report(name: str, report: Mapping[str, Any], item: Item | None) -> 
         "bounds": " to ".join(f"({numbers(corner)})" for corner in report.get("bounds", ())),
     }
     if simplified := report.get("simplified"):
-        off = simplified["deviation"]
-        facts["simplified"] = (
-            f"from {simplified['triangles_before']:,} triangles; largest distance "
-            f"{off['largest']:.4f} voxels, {off['largest_back']:.4f} back; "
-            f"a voxel is {simplified['voxel_size']:.6g}"
-        )
+        count, off = simplified["triangles_before"], simplified["deviation"]["largest"]
+        facts["simplified"] = f"from {count:,} triangles, by {off:.4f} voxels at most"
     return entry_of(
         name,
         line=", ".join([*said, f"from {shape} samples"] if shape else said),
-        seconds=report["seconds"] if "stages" in report else sum(stages.values()),
+        seconds=report["seconds"] if "stages" in report else sum(stages.values()) or None,
         residual=(certificate.get("residual") or {}).get("mean"),
         facts=[[label, str(text)] for label, text in facts.items() if text not in (None, "")],
         stages=[[stage, f"{spent:.2f} s"] for stage, spent in stages.items()],
@@ -184,10 +202,8 @@ def entry_of_report(name: str, report: Mapping[str, Any], item: Item | None) -> 
 
 def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
     """Return what a certificate says, label by label; or why there is none."""
-    if "error" in found:
-        return [["not checked", found["error"]]]
-    if not found:
-        return []
+    if "error" in found or not found:
+        return [["not checked", why] for why in found.values()]
     surface, residual = found["surface"], found["residual"]
     kinds, pairs = ("closed", "oriented", "manifold"), surface["self_intersections"]
     facts = {"checked": f"{found['samples']['exact']:,} exact samples near the surface"}
@@ -202,7 +218,7 @@ def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
     facts["self-intersections"] = "not counted" if pairs is None else f"{pairs:,}"
     facts["components"] = f"{surface['components']:,}"
     facts["volume, area"] = f"{surface['volume']:.6g}, {surface['area']:.6g}"
-    return [[label, text] for label, text in facts.items()]
+    return list(map(list, facts.items()))
 
 
 def numbers(values: Iterable[float]) -> str:

@@ -15,12 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, IntArray
+from ..arrays import CENTRE, FloatArray, IntArray
 from ..errors import OptionError
 from ..grid.field import NONE_EXACT, Field
 from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..options import EXACT, NOISY
 from ..threads import chunks_of
 from .band import rescale
 from .nodes import (
@@ -45,6 +44,13 @@ class SampleSpheres:
     shape: tuple[int, int, int]  # samples of the grid along each axis
     voxel_ijk: IntArray  # (m, 3), the samples, in C order
     distance: FloatArray  # (m,), signed, in half voxels
+
+    @classmethod
+    def of(
+        cls, shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray
+    ) -> SampleSpheres:
+        """Return the spheres of voxels (m, 3), given their patches (m, 27)."""
+        return cls(shape, voxel_ijk, patches[:, CENTRE].copy())
 
     @cached_property
     def index(self) -> VoxelIndex:
@@ -321,7 +327,7 @@ def fine_grid(field: FineField) -> SdfGrid:
     lowest, highest = field.in_world_units(ends).tolist()
     extremes = min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)
     origin = grid.to_world([-0.5, -0.5, -0.5])
-    kind = Field() if grid.field.kind == EXACT else Field(NOISY, True, NONE_EXACT)
+    kind = Field() if grid.field.kind == "exact" else Field("noisy", True, NONE_EXACT)
     kind = replace(kind, on_lattice=grid.field.on_lattice)
     return SdfGrid.trusted(
         lattice,

@@ -10,7 +10,7 @@ out, so that the bits of a result do not depend on how the grid was cut.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -20,7 +20,6 @@ from ..arrays import FloatArray, IntArray
 from ..grid.derived import local_slopes
 from ..grid.samples import SampleArray, in_spacings
 from ..network.decoder import Adapter, decode
-from ..progress import ShareCallback
 from .band import plane_blocks
 from .nodes import block_offsets
 from .survey import Band
@@ -44,7 +43,7 @@ def predict(
     network: Adapter,
     factor: int,
     threads: int = 1,
-    progress: ShareCallback | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> FloatArray:
     """Return the network's values in some voxels (D,), rows of a band, as blocks (Q, D + 1).
 

@@ -14,7 +14,6 @@ from ..errors import NoSurfaceError
 from ..grid.field import Field
 from ..grid.samples import let_go, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
-from ..options import MASK
 from ..threads import over_threads
 from .band import (
     Jumps,
@@ -288,7 +287,7 @@ def _is_decoded(kind: Field, patches: FloatArray, lipschitz: BoolArray) -> BoolA
     """Return which voxels of a field are decoded; of a mask those with samples on both sides."""
     if kind.smooth is not None:  # no distances: what they say of the voxels is not certain
         return np.ones(len(patches), bool)
-    return has_both_sides(patches) if kind.kind == MASK else can_hold_surface(patches, lipschitz)
+    return has_both_sides(patches) if kind.kind == "mask" else can_hold_surface(patches, lipschitz)
 
 
 def _exact_between(grid: SdfGrid, offset: float) -> tuple[float, float]:

@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pyfqmr import Simplify
 
-from ..arrays import BoolArray
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid
 from .measuring import Original, mean_side
@@ -44,7 +43,7 @@ NEAR_END = 1.2  # ratio of the largest error that is of use to one that need not
 MARGIN = 1.06
 ANYWHERE: Points = np.zeros((0, 3))
 
-Collapse = Callable[[Mesh, BoolArray], Mesh]
+Collapse = Callable[[Mesh, NDArray[np.bool_]], Mesh]
 """Collapses edges of a mesh, but those of the triangles in a mask, (m,)."""
 
 
@@ -63,7 +62,7 @@ class Passes:
     ) -> None:
         self.passes, self.original, self.error = passes, original, error
         self.solids, self.meshes = [Solid(mesh)], [mesh]
-        self.kept: list[BoolArray] = []  # triangles of each mesh but the last
+        self.kept: list[NDArray[np.bool_]] = []  # triangles of each mesh but the last
         self.places, self.since = ANYWHERE, np.zeros(0, np.intp)  # and the first pass to keep them
 
     def result(self, count_round: Callable[[], None]) -> Mesh | None:
@@ -95,7 +94,7 @@ class Passes:
             base, near = self.meshes[number], self.places[self.since <= number]
             if not len(base.faces):
                 return
-            chosen: BoolArray = np.zeros(len(base.vertices), bool)
+            chosen: NDArray[np.bool_] = np.zeros(len(base.vertices), bool)
             chosen[base.faces[self.solids[number].nearest_face(near)]] = True
             self.kept.append(np.any(chosen[base.faces], axis=1))
             self.meshes.append(collapse(base, self.kept[number]))
@@ -239,7 +238,7 @@ def same_topology(one: Mesh, other: Mesh) -> bool:
     return np.array_equal(euler_numbers(one), euler_numbers(other))
 
 
-def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
+def collapse_within(mesh: Mesh, kept: NDArray[np.bool_], distance: float) -> Mesh:
     """Collapse the edges whose new vertex is within a distance of the planes around it.
 
     That is the root of the sum of squared distances, in world units. The triangles that are
@@ -251,7 +250,7 @@ def collapse_within(mesh: Mesh, kept: BoolArray, distance: float) -> Mesh:
     return _collapse(mesh, kept, distance, {"target_count": 0, "max_iterations": rounds, **rising})
 
 
-def collapse_to(mesh: Mesh, kept: BoolArray, triangles: int) -> Mesh:
+def collapse_to(mesh: Mesh, kept: NDArray[np.bool_], triangles: int) -> Mesh:
     """Collapse edges until no more than a number of triangles is left; see ``collapse_within``.
 
     More are left where the shape, the kept triangles, or open edges do not allow fewer.
@@ -260,7 +259,7 @@ def collapse_to(mesh: Mesh, kept: BoolArray, triangles: int) -> Mesh:
     return _collapse(mesh, kept, mean_side(mesh), {"target_count": target, "update_rate": 1})
 
 
-def _collapse(mesh: Mesh, kept: BoolArray, unit: float, options: dict[str, Any]) -> Mesh:
+def _collapse(mesh: Mesh, kept: NDArray[np.bool_], unit: float, options: dict[str, Any]) -> Mesh:
     """Return the mesh with the edges between triangles that are not kept collapsed.
 
     The triangles that are not kept are a mesh of its own, whose open edges pyfqmr keeps: there it

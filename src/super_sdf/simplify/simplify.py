@@ -8,12 +8,12 @@ The modules that do it are imported when they are needed: they need the extra ``
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from ..errors import OutOfMemoryError, check_modules
 from ..options import OPTIONS, check_goal
-from ..progress import ShareCallback
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import give_back, held_memory, in_words, memory_bound
 
@@ -63,7 +63,7 @@ def simplify_mesh(
     error: float | None = None,
     triangles: int | None = None,
     max_memory: int | None = None,
-    progress: ShareCallback | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> Simplified:
     """Simplify a mesh within a distance, or to a number of triangles.
 

@@ -2,39 +2,32 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import IntArray, Vectors
-from ..grid.sdf_grid import SdfGrid
-from ..options import AUTO, MARCHING, OPTIONS, SHARP, MesherName
+from ..arrays import CORNERS, IntArray, Vectors
+from ..grid.sdf_grid import SdfGrid, with_fields
+from ..refine.band import neighbour_table, rescale
 from ..refine.field import FineField
-from ..refine.nodes import block_ijk
+from ..refine.nodes import block_ijk, share_parts
 from ..threads import check_count, map_chunks
 from . import marching
 from .cap import close
 from .mesh import Mesh, vertex_type
+
+if TYPE_CHECKING:
+    from ..options import MesherName
 
 TEMPORARIES = 16  # numbers per vertex in the computation of its position
 KEYS_PER_NODE = 16  # its three edges, and the features of the cell above it
 FIRST_FEATURE = 3
 
 
-def choose_mesher(name: Any, *, exact: bool) -> MesherName:
-    """Return the mesher with a name; by itself ``sharp`` if samples are exact distances.
-
-    Without such samples it finds no edges, and its mesh is that of marching cubes.
-    """
-    automatic: MesherName = SHARP if exact else MARCHING
-    chosen = OPTIONS["mesher"].check(name)
-    return automatic if chosen == AUTO else chosen
-
-
 def reach_in_voxels(mesher: MesherName, factor: int) -> int:
     """Return how many voxels to every side a vertex and its triangles depend on."""
-    if mesher == MARCHING:
+    if mesher == "marching":
         return 1
     from .sharp.features import REACH_IN_CELLS, REACH_IN_VOXELS
 
@@ -63,7 +56,7 @@ def extract(
         The field's samples: it is from ``cubic_grid``. Mirrored axes turn triangles inward, so
         these are turned over.
     mesher : str
-        From ``choose_mesher``.
+        "marching" or "sharp".
     cap : bool
         Close a surface that leaves the whole grid.
     first, shape : three ints
@@ -91,7 +84,7 @@ def extract(
     field = close(field, cap=cap, border=border)
     crossings = marching.find_crossings(field, threads)
     features = None
-    if mesher == SHARP and field.spheres is not None and len(field.spheres.distance):
+    if mesher == "sharp" and field.spheres is not None and len(field.spheres.distance):
         from .sharp.features import find_features
 
         features = find_features(field, crossings, border, rounded, threads)
@@ -128,3 +121,18 @@ def keys_of(node_ijk: IntArray, shape: NDArray[Any], factor: int) -> NDArray[np.
     _, ny, nz = (factor * (shape + 2) + 1).tolist()
     i, j, k = node_ijk.T.astype(np.int64) + factor
     return np.asarray(KEYS_PER_NODE * ((i * ny + j) * nz + k))
+
+
+def coarse_surface(grid: SdfGrid, offset: float = 0.0) -> Mesh:
+    """Return marching cubes of a grid's samples: every cell is a block of factor 1."""
+    values = rescale(grid, offset)
+    some = every = values <= 0
+    for axis in range(3):
+        low, high = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)
+        some, every = some[low] | some[high], every[low] & every[high]
+    cell_ijk = np.argwhere(some & ~every).astype(np.int32)
+    blocks = np.stack([values[tuple((cell_ijk + corner).T)] for corner in CORNERS])
+    parts = share_parts(neighbour_table(cell_ijk, some.shape))
+    field = FineField(some.shape, 1, cell_ijk, blocks, parts)
+    middle = tuple(grid.to_world([0.5, 0.5, 0.5]).tolist())
+    return extract(field, with_fields(grid, origin=middle), mesher="marching", cap=False)[0]

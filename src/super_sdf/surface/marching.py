@@ -21,7 +21,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +31,58 @@ from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, IntArra
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, part_of_node
 from ..threads import map_chunks, map_threads, rows_in_chunk, worthwhile_threads
-from .cell_cases import EDGE_AXIS, EDGE_START, FACES, tables
 from .mesh import CLEARANCE
 
 # Nodes beyond the grid's border (of a cap, see ``cap.close``) are placed this far outside it,
 # in fine spacings: enough for distinct vertices.
 CAP_HEIGHT = 0.02
+# A cell has 8 corners, numbered 4 x + 2 y + z, and 12 edges: edge e runs from corner EDGE_START[e]
+# one step along EDGE_AXIS[e].
+EDGE_START = (0, 1, 2, 3, 0, 1, 4, 5, 0, 2, 4, 6)
+EDGE_AXIS = (0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2)
+# The corners of each face in counter-clockwise order, seen from outside the cell: the lower and the
+# upper face along x, then along y and z.
+FACES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+LOOPS = ("loops", "sides", "edges", "places")
+CASES = Path(__file__).with_name("cell_cases.npz")
+
+
+class Tables(NamedTuple):
+    """The cases: their loops, each of which is a patch of the surface in a cell, and triangles."""
+
+    ambiguous: NDArray[np.uint8]  # (256,), a bit for each of ``FACES``: whether it is ambiguous
+    # (256, 64), the case for the same bits, set where an ambiguous face joins its inside corners.
+    # Bits of other faces must be 0. Where no face joins them it is the number of the row
+    number: NDArray[np.int16]
+    loops: NDArray[np.int64]  # (C,), how many loops a case has ...
+    first_loop: NDArray[np.int64]  # (C,), ... and which is its first; loops come case by case
+    sides: NDArray[np.int64]  # (L,), how many edges a loop has
+    edges: NDArray[np.int8]  # (L, S), in order, counter-clockwise from outside; -1 after the last
+    places: NDArray[np.int8]  # (L, T, 3), its ``sides - 2`` triangles as places in the loop
+    times: NDArray[np.int64]  # (C,), how many triangles a case has ...
+    first: NDArray[np.int64]  # (C,), ... and which is its first
+    triangles: NDArray[np.int64]  # (n, 3), the edges of all triangles, case by case
+
+
+@lru_cache(maxsize=1)
+def tables() -> Tables:
+    """Return the tables from the file."""
+    with np.load(CASES) as file:
+        return with_triangles(*(file[name] for name in ("ambiguous", "number", *LOOPS)))
+
+
+def with_triangles(
+    ambiguous: NDArray[Any], number: NDArray[Any], loops: NDArray[Any], *of_loops: NDArray[Any]
+) -> Tables:
+    """Return the tables, given those that the file has."""
+    loops, (sides, edges, places) = loops.astype(np.int64), of_loops  # in the file: int8
+    first_loop = np.cumsum(loops) - loops
+    used = np.arange(places.shape[1]) < sides[:, None] - 2
+    loop = np.nonzero(used)[0]
+    times = np.bincount(np.repeat(np.arange(len(loops)), loops)[loop], minlength=len(loops))
+    of_loops = loops, first_loop, sides.astype(np.int64), edges, places
+    triangles = edges[loop[:, None], places[used]].astype(np.int64)
+    return Tables(ambiguous, number, *of_loops, times, np.cumsum(times) - times, triangles)
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,7 @@ import numpy as np
 from ...arrays import BoolArray, Index, IntArray, Numbers, Vectors, dot, length, unit
 from ...refine.field import FineField, SampleSpheres
 from ...threads import map_chunks
-from ..cell_cases import tables
-from ..marching import CAP_HEIGHT, Crossings
+from ..marching import CAP_HEIGHT, Crossings, tables
 from ..mesh import CLEARANCE
 from .folds import REACH, Rounding, without_folds
 from .patches import (

@@ -39,8 +39,7 @@ from ...arrays import (
 from ...refine.field import FineField
 from ...refine.nodes import block_ijk
 from ...threads import map_chunks
-from ..cell_cases import tables
-from ..marching import Crossings, cells_low_nodes, edge_steps, edge_table, owners_of
+from ..marching import Crossings, cells_low_nodes, edge_steps, edge_table, owners_of, tables
 
 NEAR_SURFACE = 1.0  # fine spacings: slopes count at nodes that are nearer
 BEND = 0.3  # change of the slopes at a node, 1 for a distance, from which there may be an edge
