@@ -57,7 +57,7 @@ class Job:
 
     def failed(self, reason: str, content: Any = None) -> Row:
         """Return the row of the job if it failed, and is to be tried again."""
-        row = {"in": os.path.abspath(self.source), "out": self.target, "status": "failed"}
+        row: Row = {"in": os.path.abspath(self.source), "out": self.target, "status": "failed"}
         row |= {"reason": reason, "retry": True, "content": content}
         return {**row, "output": None, "seconds": 0.0}
 

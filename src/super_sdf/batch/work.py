@@ -177,17 +177,15 @@ def work_in_processes(
             if not running:
                 return
             for pipe in wait(list(running)):
-                worker, task = running[pipe]
+                worker, task = running.pop(pipe)
                 try:
-                    result, error = pipe.recv()
+                    result, error = worker.pipe.recv()
                     idle.append(worker)
                     deaths = 0
                 except (EOFError, OSError):
-                    result, error, deaths = worker.end(EXIT_SECONDS), None, deaths + 1
-                    if deaths == MOST_DEATHS:
-                        last = f"{deaths} processes in a row ended; the last one {result}"
-                        error = SuperSdfError(f"{last}: try --jobs 1")
-                del running[pipe]
+                    result, deaths = worker.end(EXIT_SECONDS), deaths + 1
+                    last = f"{deaths} processes in a row ended; the last one {result}"
+                    error = deaths == MOST_DEATHS and SuperSdfError(f"{last}: try --jobs 1")
                 if error:
                     raise error
                 yield task, result

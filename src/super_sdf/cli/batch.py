@@ -68,7 +68,8 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     options = main.chosen_options(given)
     from ..batch.inputs import find_jobs
     from ..batch.record import folder_lock
-    from ..batch.run import Batch, Settings
+    from ..batch.run import Batch
+    from ..batch.work import Settings
     from ..files.regular import files_of
     from ..labels.files import check_options, read_names
 

@@ -148,7 +148,7 @@ def write_batch_page(
     folder, entries = items.items_folder(path), list[Entry]()
     for name, row in rows.items():
         if row.get("status") != "ok":
-            known = {"line": "not finished"}
+            known: dict[str, Any] = {"line": "not finished"}
             if row:
                 known = {"reason": row["reason"], "facts": [["grid", row["in"]], ["mesh", name]]}
             entries.append(items.entry_of(name, row.get("status", "waiting"), **known))
