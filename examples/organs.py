@@ -14,8 +14,7 @@ import nibabel
 import numpy as np
 
 from super_sdf import load_network
-from super_sdf.labels.files import convert_labels
-from super_sdf.labels.files import read_names
+from super_sdf.labels.files import convert_labels, read_names
 
 TABLE = """\
 1 liver 221 130 101 255

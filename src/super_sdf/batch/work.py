@@ -96,12 +96,13 @@ def convert_job(
 
 def _check(job: Job, settings: Settings, mesh: Path, made: Conversion, sha256: str) -> Row:
     """Return the certificate of a mesh, or why there is none; keep what a page shows of it."""
-    from ..check.check import check_files
+    from ..check.check import check_mesh, read_for_check
     from ..pages.items import item_of_files, keep_item
 
     try:
         if settings.items is None:
-            return check_files(mesh, job.source, job.options, made=made).report()
+            both = read_for_check(mesh, job.source, job.options, made)
+            return check_mesh(*both, job.options).report()
         item = item_of_files(mesh, job.source, job.options, made)
         keep_item(item, settings.items, job.target, sha256)
         return item.certificate or {}
