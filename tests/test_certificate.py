@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from batches import rows
-from conftest import ball
 from solids import cube, inverted, joined, saved
 
 from super_sdf import Mesh, SdfGrid
-from super_sdf import errors as extras
 from super_sdf.check import check
 from super_sdf.check.check import LIMITS, check_mesh, exceeded
 from super_sdf.files import mesh_writers
@@ -51,24 +48,24 @@ def moved(mesh: Mesh, x: float) -> Mesh:
 
 def test_a_sphere_touches_the_balls_of_its_own_grid_also_inside_out(ball_mesh):
     found = check_mesh(ball_mesh, GRID)
-    figures = found.touching.summary()
-    assert len(found.touching.values) > 3000 and found.touching.noisy == 0
+    figures = found.figures()
+    assert len(found.values) > 3000 and found.samples["noisy"] == 0
     assert figures["largest"] < 0.005 and figures["share_above_tenth"] == 0
     assert found.faults() == []
     assert found.surface.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=1e-3)
     assert found.surface.area == pytest.approx(4 * np.pi * RADIUS**2, rel=1e-3)
     assert (found.surface.components, found.surface.self_intersections) == (1, 0)
     found = check_mesh(inverted(ball_mesh), GRID)
-    assert found.touching.summary()["largest"] < 0.005  # its triangles are where they should be
+    assert found.figures()["largest"] < 0.005  # its triangles are where they should be
     assert not found.surface.report()["oriented"] and found.surface.volume < 0
-    assert found.touching.wrong_side[found.touching.values < -0.1].all()
+    assert found.wrong_side[found.values < -0.1].all()
     assert "triangles that face inward" in found.faults()
 
 
 def test_a_shift_is_its_cosine_and_so_are_the_colours(ball_mesh):
     """Along x by a: a sample in direction n is off by a n_x, the mean of its absolute a / 2."""
     whole = check_mesh(moved(ball_mesh, 0.1 * H), GRID)
-    found, figures = whole.touching, whole.touching.summary()
+    found, figures = whole, whole.figures()
     assert figures["largest"] == pytest.approx(0.1, abs=0.01)
     assert figures["mean"] == pytest.approx(0.05, abs=0.005)
     cosine = found.points[:, 0] / np.linalg.norm(found.points, axis=1)
@@ -84,17 +81,6 @@ def test_a_shift_is_its_cosine_and_so_are_the_colours(ball_mesh):
     said = check.colours(np.array([0, -1, -0.05, np.nan], np.float32))
     assert [tuple(row) for row in said[[0, 1, 3]]] == [check.TOUCHING, check.PIERCED, check.UNKNOWN]
     np.testing.assert_allclose(said[2], (np.array(check.TOUCHING) + check.PIERCED) / 2, atol=1)
-
-
-def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
-    found = check_mesh(round_mesh(RADIUS - 0.2 * H), GRID).touching
-    clear, outside = np.abs(found.values) > 0.3, found.values > 0
-    np.testing.assert_allclose(found.residuals[clear & outside], 0.2, atol=0.01)
-    np.testing.assert_allclose(found.residuals[clear & ~outside], -0.2, atol=0.01)
-    between = (found.values < -0.001) & (found.values > -0.19)  # inside, the mesh says outside
-    distance = np.abs(found.values)
-    expected = between & (distance + np.abs(found.residuals + distance) > 0.1)
-    assert np.array_equal(found.wrong_side, expected) and found.wrong_side.any()
 
 
 def test_holes_components_and_twists_are_counted():
@@ -138,36 +124,47 @@ def test_a_vertex_shared_by_two_pieces_is_pinched():
     assert not found.report()["manifold"] and found.report()["closed"]
 
 
+def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
+    found = check_mesh(round_mesh(RADIUS - 0.2 * H), GRID)
+    clear, outside = np.abs(found.values) > 0.3, found.values > 0
+    np.testing.assert_allclose(found.residuals[clear & outside], 0.2, atol=0.01)
+    np.testing.assert_allclose(found.residuals[clear & ~outside], -0.2, atol=0.01)
+    between = (found.values < -0.001) & (found.values > -0.19)  # inside, the mesh says outside
+    distance = np.abs(found.values)
+    expected = between & (distance + np.abs(found.residuals + distance) > 0.1)
+    assert np.array_equal(found.wrong_side, expected) and found.wrong_side.any()
+
+
 def test_sides_of_a_mesh_that_meets_itself_are_by_winding_number(ball_mesh):
     """A point in both balls is behind one sheet and nearest to the inner one, seen from inside."""
     found = check_mesh(joined(ball_mesh, round_mesh(0.5 * RADIUS, 3)), GRID)
     assert found.surface.components == 2
-    assert not found.touching.wrong_side.any()
+    assert not found.wrong_side.any()
 
 
 def test_a_piece_far_from_every_sample_is_noticed():
     """The samples near the surface see nothing of it, but those round it promise empty balls."""
     ball_mesh, speck = round_mesh(subdivisions=4), round_mesh(0.02, 2)
     found = check_mesh(joined(ball_mesh, speck), GRID)
-    assert found.touching.summary()["largest"] < 0.02
-    assert found.strays.count == len(speck.vertices)
-    assert found.strays.deepest == pytest.approx((RADIUS - 0.02) / H, abs=1)
+    assert found.figures()["largest"] < 0.02
+    assert found.strays["count"] == len(speck.vertices)
+    assert found.strays["deepest"] == pytest.approx((RADIUS - 0.02) / H, abs=1)
     outside = check_mesh(joined(ball_mesh, moved(ball_mesh, 2.0)), GRID)
-    assert outside.strays.beyond == len(ball_mesh.vertices)
+    assert outside.strays["beyond"] == len(ball_mesh.vertices)
 
 
 def test_truncated_and_noisy_samples_promise_nothing(ball_mesh):
     near, early = (
-        check_mesh(ball_mesh, grid_of(np.clip(sphere_values(), -limit * H, limit * H))).touching
+        check_mesh(ball_mesh, grid_of(np.clip(sphere_values(), -limit * H, limit * H)))
         for limit in (1.5, 0.9)
     )
-    whole = check_mesh(ball_mesh, GRID).touching
+    whole = check_mesh(ball_mesh, GRID)
     assert len(near.values) == len(whole.values)  # beyond 1.4 voxels none counts anyway
-    assert np.abs(early.values).max() < 0.9 and early.cut_off > 1000
-    assert early.summary()["largest"] < 0.005
+    assert np.abs(early.values).max() < 0.9 and early.samples["cut_off"] > 1000
+    assert early.figures()["largest"] < 0.005
     noise = np.random.default_rng(0).uniform(-1, 1, sphere_values().shape) * H
     found = check_mesh(ball_mesh, grid_of(sphere_values() + noise))
-    assert len(found.touching.values) == 0 and found.touching.noisy > 3000
+    assert len(found.values) == 0 and found.samples["noisy"] > 3000
     assert found.report()["residual"] is None and found.strays is None
     assert "residual: unknown, since no sample is exact" in found.lines()
     none = dict.fromkeys(LIMITS)
@@ -198,7 +195,7 @@ def test_limits(ball_mesh):
     largest, world, mean, share = exceeded(found, dict(zip(names, (0.1, 0.1 * H, 0.05, 0.01))))
     assert largest.startswith("the largest residual is 0.1")
     assert largest.endswith(" voxels, --max-residual is 0.1")
-    worst = found.touching.summary()["largest"] * H
+    worst = found.figures()["largest"] * H
     assert world == (
         f"the largest residual is {worst:.4g} in world units, --tolerance is {0.1 * H:g}"
     )
@@ -248,16 +245,6 @@ def test_the_offset_is_that_of_the_mesh(here, command):
     assert command(*words)[0] == 1
 
 
-def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
-    monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
-    before = sorted(os.listdir())
-    line = "needs igl: pip install -e '.[report]' in a clone of super-sdf"
-    assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}\n")
-    for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
-        assert command(*words, "--check")[::2] == (1, f"Error: --check {line}\n")
-    assert sorted(os.listdir()) == before
-
-
 def test_the_coloured_mesh_is_a_mesh_with_residuals_whole_or_not_there(here, command, monkeypatch):
     assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "-q") == (0, "", "")
     mesh = trimesh.load("c.ply", process=False)
@@ -300,23 +287,3 @@ def test_errors_are_one_line_and_leave_nothing(here, command, words, code, messa
     assert (found, out) == (code, "")
     assert len(err.splitlines()) == 1 and message in err, err
     assert sorted(os.listdir()) == before
-
-
-def test_upsample_checks_what_it_wrote(here, command):
-    words = ("upsample", "ball.npz", "new.ply", "--factor", 2, "--check", "--json")
-    code, out, err = command(*words)
-    report, last = json.loads(out)["check"], err.splitlines()[-1]
-    assert code == 0 and report["residual"]["mean"] < 0.02 and report["surface"]["closed"]
-    assert last.startswith("Check: residual 0.00") and last.endswith("; no faults")
-
-
-def test_batch_records_certificates_and_makes_those_that_are_missing(here, run_batch):
-    Path("in").mkdir()
-    np.savez("in/a.npz", values=ball(16, 5.0).values, spacing=1.0)
-    assert run_batch("in")[0] == 0
-    code, _, err = run_batch("in", "--check")
-    check = rows()[-1]["check"]
-    assert code == 0 and check["residual"]["largest"] < 0.2 and check["surface"]["closed"]
-    assert "1 done, 0 failed" in err and "Check: mean residual 0.0" in err
-    for flags in (("--check",), ()):  # now it is there
-        assert "nothing to do: 1 done before" in run_batch("in", *flags)[2]
