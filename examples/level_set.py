@@ -10,7 +10,15 @@ import sys
 
 import numpy as np
 
-from super_sdf import (extract_mesh, load_network, make_grid, read_grid, upsample, write_field, write_mesh)
+from super_sdf import (
+    extract_mesh,
+    load_network,
+    make_grid,
+    read_grid,
+    upsample,
+    write_field,
+    write_mesh,
+)
 
 SPACING, LEVEL = 0.1, 0.5
 BALLS = [((0, 0, 0), 0.9), ((0.8, 0.3, 0.1), 0.6), ((-0.8, 0.2, 0), 0.65), ((0.1, 0.7, 0.2), 0.6)]

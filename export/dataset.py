@@ -35,7 +35,7 @@ from export.shapes.solid import FAMILIES, random_solid
 from super_sdf import Mesh
 from super_sdf.errors import FileError
 from super_sdf.refine import band, nodes
-from super_sdf.truth import mesh_files, sampling, solid
+from super_sdf.truth import sampling, solid
 
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 per corner, 28 in all
 SIZES = 7.0, 100.0  # voxels along a shape's diagonal
@@ -233,7 +233,7 @@ def mesh_order(folder: Path | None, count: int, seed: int) -> list[Path]:
 
 def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
     """Read a mesh; some are bent by smooth waves, so that few faces stay flat or parallel."""
-    mesh = mesh_files.read_mesh(path)
+    mesh = solid.read_mesh(path)
     if rng.random() >= SWAYED:
         return mesh
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))

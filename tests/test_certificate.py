@@ -14,7 +14,7 @@ from solids import cube, inverted, joined, saved
 
 from super_sdf import Mesh, SdfGrid
 from super_sdf import errors as extras
-from super_sdf.check import check, evidence
+from super_sdf.check import check
 from super_sdf.check.check import LIMITS, check_mesh, exceeded
 from super_sdf.files import mesh_writers
 
@@ -99,27 +99,27 @@ def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
 
 def test_holes_components_and_twists_are_counted():
     ball_mesh = round_mesh(subdivisions=2)
-    lidless = evidence.examine_surface(Mesh(ball_mesh.vertices, ball_mesh.faces[1:]))
+    lidless = check.examine_surface(Mesh(ball_mesh.vertices, ball_mesh.faces[1:]))
     assert lidless.open_edges == 3
     assert lidless.report()["manifold"] and lidless.report()["oriented"]
-    two = evidence.examine_surface(joined(ball_mesh, moved(ball_mesh, 1.0)))
+    two = check.examine_surface(joined(ball_mesh, moved(ball_mesh, 1.0)))
     assert two.components == 2 and two.faults() == []
-    assert "3 pairs of triangles that intersect" in evidence.examine_surface(cube(), 3).faults()
+    assert "3 pairs of triangles that intersect" in check.examine_surface(cube(), 3).faults()
     faces = cube().faces.copy()
     faces[0] = faces[0][::-1]
-    twisted = evidence.examine_surface(Mesh(cube().vertices, faces))
+    twisted = check.examine_surface(Mesh(cube().vertices, faces))
     assert twisted.flipped_edges == 3 and not twisted.report()["oriented"]
-    doubled = evidence.examine_surface(Mesh(cube().vertices, np.concatenate([faces, faces[5:6]])))
+    doubled = check.examine_surface(Mesh(cube().vertices, np.concatenate([faces, faces[5:6]])))
     assert doubled.crowded_edges == 3 and not doubled.report()["manifold"]
     collapsed = np.concatenate([cube().faces, [[0, 0, 1]]]).astype(np.int32)
-    assert evidence.examine_surface(Mesh(cube().vertices, collapsed)).faults() == []
+    assert check.examine_surface(Mesh(cube().vertices, collapsed)).faults() == []
 
 
 def test_pairs_of_triangles_that_intersect_are_counted():
     corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.5], [0.3, 0.2, 0.5], [0.2, 0.3, 0.5]]
     crossed = Mesh(np.array(corners, np.float64), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
-    assert evidence.self_intersections(crossed) == 1
-    assert evidence.self_intersections(cube()) == 0
+    assert check.self_intersections(crossed) == 1
+    assert check.self_intersections(cube()) == 0
 
 
 def test_a_vertex_shared_by_two_pieces_is_pinched():
@@ -128,7 +128,7 @@ def test_a_vertex_shared_by_two_pieces_is_pinched():
     opposite = np.flatnonzero((other.vertices == -0.5).all(1))[0]
     faces = other.faces + 8
     faces[faces == opposite + 8] = corner
-    found = evidence.examine_surface(
+    found = check.examine_surface(
         Mesh(
             np.concatenate([cube().vertices, other.vertices + 1]),
             np.concatenate([cube().faces, faces]),
@@ -136,23 +136,6 @@ def test_a_vertex_shared_by_two_pieces_is_pinched():
     )
     assert (found.pinched_vertices, found.open_edges, found.components) == (1, 0, 1)
     assert not found.report()["manifold"] and found.report()["closed"]
-
-
-def test_what_is_found_does_not_depend_on_the_slabs(monkeypatch):
-    random = np.random.default_rng(3)
-    vertices = random.random((90, 3))
-    faces = random.integers(0, 90, (120, 3)).astype(np.int32)
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
-    points = random.uniform(-0.5, 1.5, (200, 3))
-    mesh = Mesh(vertices, faces)
-    whole = evidence.search(mesh, points, 0.1, intersections=True)
-    assert whole[3] > 100
-    monkeypatch.setattr(evidence, "FACES_IN_SLAB", 7)
-    cut = evidence.search(mesh, points, 0.1, intersections=True)
-    assert cut[3] == whole[3]
-    np.testing.assert_allclose(cut[0], whole[0], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(cut[1], whole[1], rtol=0, atol=1e-7)
-    assert (whole[0] > 0.1).any()  # some points have to be looked up in the whole mesh
 
 
 def test_sides_of_a_mesh_that_meets_itself_are_by_winding_number(ball_mesh):

@@ -17,7 +17,7 @@ from super_sdf import write_mesh
 from super_sdf.cli import main as cli
 from super_sdf.files.formats import GRID_SUFFIXES
 from super_sdf.files.meshes import MESH_SUFFIXES
-from super_sdf.options import MESH_FORMATS, OPTIONS, Options, parse_size
+from super_sdf.options import MESH_FORMATS, OPTIONS, Options
 
 
 @pytest.fixture
@@ -71,14 +71,6 @@ def test_a_surface_that_leaves_the_grid_is_reported_and_capped(here, command):
         and "Note: the solid runs out of the grid: its surface is closed" in err
     )
     assert trimesh.load("closed.ply").is_watertight
-
-
-def test_noise_is_told(here, command):
-    values = ball().values + np.random.default_rng(0).uniform(-0.3, 0.3, (20, 20, 20))
-    np.save("noisy.npy", values)
-    code, out, err = command("upsample", "noisy.npy", "out.ply", "--spacing", "1", "--json")
-    assert code == 0 and json.loads(out)["noisy_voxels"] > 0
-    assert " % of the band the values differ by more than distances can: they are taken" in err
 
 
 def test_version_help_info_and_usage_errors(command):
@@ -163,11 +155,6 @@ def test_bad_input_is_one_line_and_no_file(here, command, words):
     assert (code, out) == (1 if words in CASES else 2, "")
     assert err.startswith(f"Error: {want}") and err.count("\n") == 1
     assert sorted(os.listdir()) == before
-
-
-def test_sizes_have_units():
-    sizes = {"1500M": 15 * 10**8, "4g": 4 * 10**9, "123": 123}
-    assert {text: parse_size(text) for text in sizes} == sizes
 
 
 OWN_INPUTS = {

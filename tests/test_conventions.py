@@ -85,16 +85,6 @@ def box_with_unequal_spacing() -> np.ndarray:
     return np.maximum(x - 12, np.maximum(y - 9, z - 14))[:, :, ::2]
 
 
-def test_the_spacing_of_each_axis_is_estimated_if_they_differ():
-    grid = make_grid(box_with_unequal_spacing(), origin=0)
-    assert grid.spacing == pytest.approx((1, 1, 2), rel=0.005)
-    (note,) = grid.notes
-    assert note.startswith("spacing not given: estimated as 1.0")
-    assert note.endswith(
-        " along x, y, z from the values, so the size of the mesh is approximate (give --spacing)"
-    )
-
-
 def test_a_spacing_that_the_values_contradict_on_one_axis_is_refused():
     values = box_with_unequal_spacing()
     assert refusal(GridError, make_grid, values, spacing=1) == (

@@ -12,8 +12,7 @@ from solids import cube, sphere
 
 from super_sdf import Mesh
 from super_sdf.errors import SuperSdfError
-from super_sdf.truth.mesh_files import merged, read_mesh
-from super_sdf.truth.solid import load_solid
+from super_sdf.truth.solid import load_solid, merged, read_mesh
 
 
 @pytest.mark.parametrize("kind", ["ply", "stl", "stl_ascii", "obj", "off", "glb"])

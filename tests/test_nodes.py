@@ -5,7 +5,14 @@ import pytest
 
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField
-from super_sdf.refine.nodes import (average_shared, block_ijk, block_offsets, pin_to_skipped, share_parts, signs_of_skipped)
+from super_sdf.refine.nodes import (
+    average_shared,
+    block_ijk,
+    block_offsets,
+    pin_to_skipped,
+    share_parts,
+    signs_of_skipped,
+)
 
 
 def some_voxels(seed, density=0.4, shape=(6, 5, 7)):

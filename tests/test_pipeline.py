@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
 from super_sdf.errors import GridError
-from super_sdf.surface.mesh import CLEARANCE
 from super_sdf.refine import survey
 from super_sdf.refine.band import find_band
 from super_sdf.refine.nodes import block_ijk
+from super_sdf.surface.mesh import CLEARANCE
 
 
 @pytest.mark.parametrize("factor", [2, 8])

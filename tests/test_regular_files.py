@@ -9,7 +9,7 @@ import trimesh
 
 from super_sdf.errors import FileError
 from super_sdf.files.regular import check_regular_file
-from super_sdf.truth.mesh_files import read_mesh
+from super_sdf.truth.solid import read_mesh
 
 
 @pytest.fixture(autouse=True)

@@ -11,10 +11,10 @@ from test_isosurface import dense_field
 
 from lab.methods import sharp_isosurface
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
-from super_sdf.check.evidence import self_intersections
+from super_sdf.check.check import self_intersections
 from super_sdf.surface.sharp import features
 from super_sdf.surface.sharp.folds import intersecting, without_folds
-from super_sdf.truth.mesh_files import read_mesh
+from super_sdf.truth.solid import read_mesh
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 BOX = np.array([6.2, 5.1, 4.3])

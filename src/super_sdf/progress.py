@@ -48,10 +48,6 @@ class Stopwatch:
             self.seconds[stage] = self.seconds.get(stage, 0.0) + more
         self.clock = time.perf_counter()
 
-    def rounded(self) -> dict[str, float]:
-        """Return the seconds of each stage as reports have them."""
-        return {stage: round(spent, 4) for stage, spent in self.seconds.items()}
-
 
 class StepCounter(Stopwatch):
     """Reports progress and measures time, step by step; ``finish`` ends each step."""

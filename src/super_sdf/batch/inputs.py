@@ -22,8 +22,7 @@ from ..errors import FileError, OptionError
 from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix
 from ..files.regular import is_store, reason_of
-from ..labels.files import with_numbers
-from ..labels.files import Names
+from ..labels.files import Names, with_numbers
 from ..options import BATCH_LISTS, GOALS, OPTIONS, Options
 from .job import Job
 from .record import OWN_NAMES

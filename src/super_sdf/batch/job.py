@@ -15,8 +15,7 @@ from ..errors import FileError, GridError, OptionError, WriteError
 from ..files.meshes import format_of
 from ..files.output import naming
 from ..files.regular import check_grid_file
-from ..labels.files import convert_labels
-from ..labels.files import Names
+from ..labels.files import Names, convert_labels
 from ..network.network import Network, load_network
 from ..options import AUTO, Device, Options, Precision
 from .record import Row, fingerprint

@@ -1,5 +1,9 @@
 """The certificate of a mesh: its faults as a surface, and how well it fits its grid's samples.
 
+An exact sample is the radius of an empty ball that touches the surface. Its residual is its
+distance to the mesh minus that radius: positive if the mesh does not reach the ball, negative if it
+pierces it. All lengths are in voxels unless they are named otherwise.
+
 >>> from super_sdf.check.check import check_files
 >>> check_files("part.ply", "part.npz").report()                         # doctest: +SKIP
 """
@@ -14,28 +18,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray
+from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import OptionError, OutOfMemoryError
 from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
 from ..grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from ..options import LENGTHS, MASK, Options
+from ..refine.band import plane_blocks, rescale
+from ..refine.nodes import VoxelIndex
 from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh
-from ..threads import give_back, held_memory, in_words, memory_bound, useful_threads
-from ..truth.mesh_files import merged, read_mesh
-from .evidence import NOTICEABLE, Strays, Surface, Touching, find_strays, touch, vertex_residuals
+from ..threads import chunks_of, give_back, held_memory, in_words, memory_bound, useful_threads
+from ..truth.solid import Points, Solid, merged, read_mesh
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
-BYTES_PER_TRIANGLE = 420
+BYTES_PER_TRIANGLE = 650
 BYTES_PER_SAMPLE = 150
-OFF_OF_MASKS = 0.5  # voxels by which the distances that are made of a mask may be off
-NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
-AS_GIVEN = Options()
-FULL = 0.1  # voxels: residual at which a colour is saturated
+OFF_OF_MASKS = 0.5  # by which the distances that are made of a mask may be off
+CLEAR = 0.5  # cosine to the nearest triangle's normal above which that tells the side
+NOTICEABLE = 0.1  # a residual that is counted as large
+STRAY = 0.5  # within a ball, from which on a vertex is counted
+NEAREST_FEET = 8  # foot points that a vertex looks at
+SMOOTHING = 0.02  # distance of a foot point that halves its weight
+FARTHEST = 1.5  # foot points farther away say nothing of a vertex
+FULL = 0.1  # residual at which a colour is saturated
 TOUCHING, PIERCED = (240, 240, 240), (190, 20, 30)
 NOT_TOUCHING, UNKNOWN = (20, 70, 190), (120, 120, 60)
+NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
 WORLD = "in world units"
 LIMITS = {
     "max_residual": ("largest", "the largest residual is", "voxels"),
@@ -44,6 +54,91 @@ LIMITS = {
     "max_share": ("share_above_tenth", "above 0.1 voxel is", ""),
 }
 """Options, the figures that they limit, and how these are named, with their unit."""
+AS_GIVEN = Options()
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What a mesh is as a surface; triangles that have the same vertex twice are left out."""
+
+    open_edges: int  # of an odd number of triangles
+    crowded_edges: int  # of more than two triangles: not manifold
+    flipped_edges: int  # of two triangles that pass them in the same direction
+    vertices: int
+    triangles: int
+    pinched_vertices: int  # at which several fans of triangles meet: not manifold
+    components: int  # that share no vertex
+    self_intersections: int | None  # pairs that meet off a common vertex or edge; None: not counted
+    volume: float  # in cubic world units, negative if the triangles face inward
+    area: float
+
+    def faults(self) -> list[str]:
+        """Return what keeps the mesh from being the boundary of a solid, in words."""
+        counts = {
+            "open edges": self.open_edges,
+            "edges of more than two triangles": self.crowded_edges,
+            "edges between triangles of opposite orientation": self.flipped_edges,
+            "vertices where several fans of triangles meet": self.pinched_vertices,
+            "pairs of triangles that intersect": self.self_intersections or 0,
+        }
+        found = [f"{count:,} {what}" for what, count in counts.items() if count]
+        return found + ["triangles that face inward"] * (self.volume <= 0)
+
+    def report(self) -> dict[str, Any]:
+        """Return the figures as they stand in JSON."""
+        return {
+            "closed": self.open_edges == 0,
+            "oriented": self.flipped_edges == 0 and self.volume > 0,
+            "manifold": self.crowded_edges == 0 and self.pinched_vertices == 0,
+            **asdict(self),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Touching:
+    """The exact samples of a grid near the surface, and where their balls meet the mesh.
+
+    Samples that promise nothing are counted and left out: cut off at the limit of truncated values
+    or at the band's edge; and noisy ones, which differ from a neighbour by more than distances can,
+    together with the rest if they are many.
+    """
+
+    cut_off: int
+    noisy: int
+    voxel_ijk: IntArray  # (n, 3)
+    points: Points  # (n, 3), in world units
+    values: FloatArray  # (n,), negative inside
+    residuals: FloatArray  # (n,): distance to the mesh minus absolute value
+    feet: Points  # (n, 3): the nearest points of the mesh, in world units
+    wrong_side: BoolArray  # (n,): mesh and sample disagree on it by more than ``NOTICEABLE``
+
+    def summary(self) -> dict[str, Any]:
+        """Return mean, 99th percentile and maximum of the absolute residuals, and where it is."""
+        size = np.abs(self.residuals)
+        worst = int(size.argmax())
+        return {
+            "mean": float(size.mean(dtype=np.float64)),
+            "p99": float(np.quantile(size, 0.99)),
+            "largest": float(size[worst]),
+            "largest_signed": float(self.residuals[worst]),
+            "largest_at": [float(x) for x in self.points[worst]],
+            "share_above_tenth": float((size > NOTICEABLE).mean()),
+            "share_not_touching": float((self.residuals > NOTICEABLE).mean()),
+            "share_pierced": float((self.residuals < -NOTICEABLE).mean()),
+        }
+
+
+@dataclass(frozen=True)
+class Strays:
+    """Vertices that lie where the nearest sample says that no surface is.
+
+    The samples near the surface see nothing of a piece that lies far from it. But every sample,
+    however far away, promises a ball without surface, also if its value was truncated.
+    """
+
+    count: int  # vertices more than ``STRAY`` inside the ball of their nearest sample
+    beyond: int  # vertices more than half a voxel from the outermost samples
+    deepest: float  # of a vertex in the ball of its nearest sample; 0 if there is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,22 +153,21 @@ class Certificate:
     sample_volume: float | None = None  # of a mask: of its samples inside, each of which is a box
 
     @property
-    def voxel_size(self) -> float:
-        """The spacing of the grid, in world units."""
-        return self.grid.voxel_size
-
-    @property
     def has_evidence(self) -> bool:
         """Whether any sample is exact."""
         return len(self.touching.values) > 0
 
     def report(self) -> dict[str, Any]:
         """Return the certificate as it stands in JSON; residuals and depths are in voxels."""
+        touching, known = self.touching, self.has_evidence
+        samples = len(touching.values), touching.cut_off, touching.noisy
         return {
-            "voxel_size": self.voxel_size,
+            "voxel_size": self.grid.voxel_size,
             "surface": self.surface.report(),
-            **self.touching.report(),
-            "strays": None if self.strays is None else asdict(self.strays),
+            "samples": dict(zip(("exact", "cut_off", "noisy"), samples)),
+            "residual": touching.summary() if known else None,
+            "wrong_side": int(touching.wrong_side.sum()) if known else None,
+            "strays": asdict(self.strays) if self.strays else None,
             "sample_volume": self.sample_volume,
             "faults": self.faults(),
             "inferred": list(self.grid.notes),
@@ -88,7 +182,7 @@ class Certificate:
 
     def lines(self) -> list[str]:
         """Return the certificate as lines for users."""
-        surface, touching, faults = self.surface, self.touching, self.faults()
+        surface, touching = self.surface, self.touching
         pieces = f"{surface.components:,} component" + "s" * (surface.components != 1)
         lines = [
             f"mesh: {surface.vertices:,} vertices, {surface.triangles:,} triangles, {pieces}, "
@@ -102,7 +196,7 @@ class Certificate:
             lines += [
                 f"residual in voxels: mean {figures['mean']:.4f}, 99th percentile "
                 f"{figures['p99']:.4f}, largest {figures['largest_signed']:+.4f} at ({at}), "
-                f"{figures['largest'] * self.voxel_size:.4g} in world units",
+                f"{figures['largest'] * self.grid.voxel_size:.4g} in world units",
                 f"above {NOTICEABLE:g} voxel: {figures['share_above_tenth']:.2%} of the samples "
                 f"({figures['share_not_touching']:.2%} not touching, "
                 f"{figures['share_pierced']:.2%} pierced)",
@@ -113,7 +207,7 @@ class Certificate:
             lines.append(f"volume of the samples inside: {self.sample_volume:.6g}; {self._off()}")
         counted = surface.self_intersections is not None
         sound = "closed, oriented, manifold" + ", no self-intersections" * counted
-        lines.append("faults: " + "; ".join(faults or [f"none ({sound})"]))
+        lines.append("faults: " + "; ".join(self.faults() or [f"none ({sound})"]))
         lines += ["self-intersections: not counted"] * (not counted)
         if self.strays and self.strays.beyond:
             lines.append(f"{self.strays.beyond:,} vertices lie beyond the grid and are unchecked")
@@ -127,8 +221,7 @@ class Certificate:
         """Return the certificate in one line."""
         if not self.has_evidence:
             said = ["no sample is exact, so the residual is unknown"]
-            said += [self._off()] if self.sample_volume else []
-            return "; ".join([*said, *self.faults()])
+            return "; ".join(said + [self._off()] * bool(self.sample_volume) + self.faults())
         figures = self.touching.summary()
         residual = (
             f"residual {figures['mean']:.4f} voxels in the mean, {figures['largest']:.4f} at most, "
@@ -138,8 +231,29 @@ class Certificate:
         return "; ".join([residual, *(self.faults() or ["no faults"])])
 
     def residuals_at(self, vertices: NDArray[Any]) -> FloatArray:
-        """Return ``vertex_residuals`` at positions on the mesh."""
-        return vertex_residuals(vertices, self.touching, self.grid)
+        """Return the residual at positions on the mesh, (n,); NaN where no foot point is near.
+
+        Its size is the mean of the absolute residuals at the nearest foot points of the samples
+        around, each weighted by the inverse of its distance; its sign is that of the mean with
+        signs.
+        """
+        touching, grid = self.touching, self.grid
+        residuals = np.full(len(vertices), np.nan, np.float32)
+        index = VoxelIndex(touching.voxel_ijk, grid.shape)
+        count = len(vertices) if self.has_evidence else 0
+        for chunk in chunks_of(count, 8 * len(NEIGHBOURHOOD)):
+            some = np.asarray(vertices[chunk], np.float64)
+            nearest = np.rint(grid.to_index(some)).astype(np.int64)
+            rows = index.find(nearest[:, None] + NEIGHBOURHOOD)
+            away = np.linalg.norm(some[:, None] - touching.feet[rows], axis=2) / grid.voxel_size
+            away[rows < 0] = np.inf
+            limit = np.partition(away, NEAREST_FEET - 1, axis=1)[:, NEAREST_FEET - 1, None]
+            weight = np.where(away <= np.minimum(limit, FARTHEST), 1 / (away + SMOOTHING), 0)
+            there = touching.residuals[rows]
+            with np.errstate(invalid="ignore"):
+                size = (weight * np.abs(there)).sum(1) / weight.sum(1)
+            residuals[chunk] = np.copysign(size, (weight * there).sum(1))
+        return residuals
 
 
 def check_limits(limits: Mapping[str, float | None]) -> None:
@@ -160,7 +274,7 @@ def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> li
     figures, found = certificate.touching.summary() if asked else {}, []
     for name, limit in asked.items():
         key, words, unit = LIMITS[name]
-        figure = figures[key] * (certificate.voxel_size if unit == WORLD else 1)
+        figure = figures[key] * (certificate.grid.voxel_size if unit == WORLD else 1)
         if figure > limit:
             value = f"{figure:.4g} {unit}".rstrip()
             found.append(f"{words} {value}, --{name.replace('_', '-')} is {limit:g}")
@@ -206,7 +320,11 @@ def check_mesh(
     GridError if the grid has no surface at the offset; OutOfMemoryError if the search trees would
     not fit in memory.
     """
-    band, offset = band_of(grid, options), options.offset
+    offset = options.offset
+    lattice = cubic_grid(grid, offset)
+    band = survey(lattice, offset, threads=useful_threads(0))
+    if not len(band.voxel_ijk):
+        raise no_surface(grid, offset)
     bound, triangles = memory_bound(options.max_memory), len(mesh.faces)
     need = triangles * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
     need += held_memory() or 0
@@ -215,8 +333,8 @@ def check_mesh(
             f"checking {triangles:,} triangles needs {in_words(need)} of memory, "
             f"{in_words(bound)} may be taken in all; allow more (--max-memory)"
         )
-    lattice = cubic_grid(grid, offset)
-    touching, surface = touch(mesh, band, lattice, intersections=intersections)
+    surface = examine_surface(mesh, self_intersections(mesh) if intersections else None)
+    touching = touch(mesh, band, lattice, surface)
     give_back()
     is_mask, strays = lattice.field.kind == MASK, None
     if is_mask or len(touching.values):
@@ -225,13 +343,79 @@ def check_mesh(
     return Certificate(mesh, lattice, surface, touching, strays, volume)
 
 
-def band_of(grid: SdfGrid, options: Options = AS_GIVEN) -> Band:
-    """Return the band of a grid on its cubic lattice; NoSurfaceError if it has none."""
-    offset = options.offset
-    band = survey(cubic_grid(grid, offset), offset, threads=useful_threads(0))
-    if not len(band.voxel_ijk):
-        raise no_surface(grid, offset)
-    return band
+def examine_surface(mesh: Mesh, crossing: int | None = None) -> Surface:
+    """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
+    a, b, c = mesh.faces.T
+    whole = Mesh(mesh.vertices, mesh.faces[(a != b) & (b != c) & (c != a)])
+    opposite, uses, flipped = whole.pair_edges()
+    pinched = int(np.count_nonzero(whole.count_fans(opposite) > 1))
+    edges = int((uses % 2).sum()), int((uses > 2).sum()), flipped
+    counts = len(whole.vertices), len(whole.faces), pinched, whole.components()[0]
+    return Surface(*edges, *counts, crossing, whole.volume(), whole.area())
+
+
+def self_intersections(mesh: Mesh) -> int | None:
+    """Return the number of pairs of a mesh's triangles that intersect; None if libigl has no test.
+
+    Vertices at the same position must be one vertex.
+    """
+    import igl.predicates  # here, so that pages are made without it
+
+    if not hasattr(igl.predicates, "find_self_intersections"):
+        return None
+    faces = mesh.faces.astype(np.int64)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    return len(igl.predicates.find_self_intersections(mesh.vertices.astype(np.float64), faces)[1])
+
+
+def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Touching:
+    """Return where the balls of the exact samples of a band meet a mesh.
+
+    On which side of the mesh a sample lies is by its winding number; but if the mesh is one closed
+    sheet that does not meet itself, not where the nearest triangle agrees with the sample.
+    """
+    values = band.patches[:, CENTRE]
+    # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
+    trusted = band.exact & (values > values.min()) & (values < values.max())
+    sampled = np.ones(len(values), bool) if band.sampled is None else band.sampled
+    rows = np.flatnonzero(trusted & sampled)  # what is interpolated promises nothing
+    # if none is exact, too many are no distances for any to be taken for one
+    noisy = band.count_noisy() if len(rows) else int(np.count_nonzero(sampled))
+    cut_off = int(np.count_nonzero(sampled)) - len(rows) - noisy
+    ijk, values = band.voxel_ijk[rows], values[rows] * np.float32(0.5)
+    points, solid = grid.to_world(ijk), Solid(mesh)
+    found, faces, feet = solid.nearest(points)
+    a, b, c = solid.mesh.vertices[mesh.faces[faces].T]
+    normals = np.cross(b - a, c - a)  # and the cosines to them of the ways from the feet
+    sizes, dots = np.linalg.norm(normals, axis=1) * found, ((points - feet) * normals).sum(1)
+    cosines = np.divide(dots, sizes, out=np.zeros(len(points)), where=sizes > 0)
+    distances, size = found / grid.voxel_size, np.abs(values)
+    residuals, wrong = (distances - size).astype(np.float32), np.zeros(len(size), bool)
+    is_sheet = surface.components == 1 and surface.self_intersections == 0 and not surface.faults()
+    agreed = is_sheet & (np.where(values > 0, 1, -1) * cosines > CLEAR)
+    apart = np.flatnonzero((distances + size > NOTICEABLE) & ~agreed)  # where the side matters
+    wrong[apart] = solid.is_inside(points[apart]) != (values[apart] <= 0)
+    return Touching(cut_off, noisy, ijk, points, values, residuals, feet, wrong)
+
+
+def find_strays(vertices: NDArray[Any], grid: SdfGrid, offset: float, slack: float) -> Strays:
+    """Look up the nearest sample of each vertex, (n, 3) in world units.
+
+    A sample's value may be off by ``slack``, as those of masks are.
+    """
+    position = grid.to_index(vertices)
+    nearest = np.rint(position).astype(np.int64)
+    inside = ((nearest >= 0) & (nearest < grid.shape)).all(1)
+    position, nearest = position[inside], nearest[inside]
+    values = np.zeros(len(nearest))
+    for first, last in plane_blocks(grid.shape):
+        rows = np.flatnonzero((nearest[:, 0] >= first) & (nearest[:, 0] < last))
+        if len(rows):
+            i, j, k = nearest[rows].T
+            values[rows] = rescale(grid, offset, first, last)[i - first, j, k]
+    depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1) - slack
+    count, beyond = np.count_nonzero(depth > STRAY), np.count_nonzero(~inside)
+    return Strays(int(count), int(beyond), float(depth.max(initial=0)))
 
 
 def check_coloured(path: Path, *, force: bool = False) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from contextlib import ExitStack
 from typing import Any
 
@@ -12,7 +13,6 @@ from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..files.formats import NAMED, list_formats
 from ..options import MESH_FORMATS, OPTIONS
-from ..progress import Stopwatch
 from . import main
 from .main import SHARED, option, table_option
 
@@ -52,7 +52,7 @@ TAKES = (
 @main.make_command("Refine a grid and write its surface as a mesh.", HELP, *TAKES)
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
-    options, watch = main.chosen_options(given), Stopwatch()
+    options, start = main.chosen_options(given), time.perf_counter()
     if given["names"] and options.labels is None:
         raise OptionError(f"--names {given['names']} is for --labels: give that, too")
     if given["report"]:
@@ -63,8 +63,8 @@ def command(source: str, target: str, **given: Any) -> None:
     from ..network.network import load_network
 
     network = load_network(**options.network())
-    watch.lap("load network")
     done: Any
+    seconds: dict[str, float] = {"load network": time.perf_counter() - start}
     force, how = given["force"], dict[str, Any]()
     with ExitStack() as stack:
         how["progress"] = stack.enter_context(main.progress_bar("upsampling", given["quiet"]))
@@ -86,7 +86,7 @@ def command(source: str, target: str, **given: Any) -> None:
             check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
             how["names"] = read_names(given["names"]) if given["names"] else None
             done = convert_labels(source, target, network, options, force=force, **how)
-    watch.take(done.seconds)
+    seconds |= done.seconds
     model, notes = options.network()["model"], [*done.remarks(), *network.notes]
     report = {
         "input": source,
@@ -104,20 +104,22 @@ def command(source: str, target: str, **given: Any) -> None:
     if given["check"]:
         from ..check.check import check_files
 
+        start = time.perf_counter()
         try:
             certificate = check_files(target, source, options, made=done)
         except SuperSdfError as error:
             raise type(error)(f"{error}; {target} is written, but not checked") from error
         report["check"] = certificate.report()
-        watch.lap("check")
+        seconds["check"] = time.perf_counter() - start
     if given["report"]:
         from ..pages.html import page_of_conversion, write_page
 
-        said = {**report, "seconds": watch.rounded(), "notes": notes}
+        start = time.perf_counter()
+        said = {**report, "seconds": seconds, "notes": notes}
         text = page_of_conversion(said, options, done, certificate)
         write_page(text, given["report"], force=force)
-        watch.lap("page")
-    report["seconds"] = watch.rounded()
+        seconds["page"] = time.perf_counter() - start
+    report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
     if given["as_json"]:
         main.print_stdout(report, f"{target} is written")
     if given["quiet"]:
@@ -127,9 +129,9 @@ def command(source: str, target: str, **given: Any) -> None:
     if given["verbose"]:
         keys = ("shape", "spacing", "origin", "device", "band_voxels", "nodes")
         lines += [f"{key.replace('_', ' ')}: {report[key]}" for key in keys if key in report]
-        lines += [f"{stage}: {seconds:.3f} s" for stage, seconds in watch.seconds.items()]
+        lines += [f"{stage}: {spent:.3f} s" for stage, spent in seconds.items()]
     describe = describe_mesh if options.labels is None else describe_labels
-    lines += describe(report, f"{sum(watch.seconds.values()):.1f} s")
+    lines += describe(report, f"{sum(seconds.values()):.1f} s")
     lines += [f"Check: {certificate.summary()}"] if certificate else []
     main.print_stderr(*lines, *[f"Report: {given['report']}"] * bool(given["report"]))
 

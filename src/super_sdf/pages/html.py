@@ -22,7 +22,7 @@ from ..check import check
 from ..convert import convert
 from ..files.formats import is_grid
 from ..files.output import replacing
-from ..truth.mesh_files import read_mesh
+from ..truth.solid import read_mesh
 from .items import Entry, Item, entry_of_report, item_of_files
 
 if TYPE_CHECKING:

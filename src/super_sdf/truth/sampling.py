@@ -27,7 +27,6 @@ EXACT_SAMPLES = 1 << 24  # up to 256^3 every sample is exact unless a band is gi
 BIG_GRID_BAND = 4.0  # voxels; upsampling uses none beyond 1.5 + sqrt(3)
 LEAST_BAND = 1.5  # voxels; the band of the pipeline
 MOST_ALONG_AXIS = 1e9  # samples; a larger number can only be a mistake
-SMALLEST, LARGEST = 1e-30, 1e30  # spacing and extent that float32 holds at full precision
 POSITION_ERROR = 1e-4  # largest error of a sample's position, over the spacing
 WORK_BYTES = 500_000_000  # for search trees and chunks, besides the values
 
@@ -81,7 +80,7 @@ def fitted_layout(
     if steps.max() >= MOST_ALONG_AXIS:
         raise OptionError(
             f"a spacing of {spacing:g} and a padding of {padding:g} voxels make {steps.max():.3g} "
-            f"samples along an axis of a mesh {(high - low).max():g} long: give fewer"
+            "samples along an axis: give fewer"
         )
     nx, ny, nz = (int(count) + 1 for count in steps)
     return (nx, ny, nz), spacing, origin
@@ -108,25 +107,20 @@ def sample_grid(
 ) -> NDArray[np.float32]:
     """Return the signed distance at every sample of a grid, (nx, ny, nz) float32, negative inside.
 
-    ``band`` is the distance in voxels up to which values are exact (to float32); they are clamped
-    there. ``progress`` is called with (cubes done, all cubes). OptionError if the band is under 1.5
-    voxels, which the pipeline needs; MeshError if float32 cannot hold the distances, or float64 the
-    positions; OutOfMemoryError.
+    ``band`` is the distance in voxels up to which values are exact (to float32), at least 1.5; they
+    are clamped there. ``progress`` is called with (cubes done, all cubes). MeshError if floating
+    point cannot hold the distances or the positions; OutOfMemoryError.
     """
     shape, spacing, origin = layout
     check_numbers(band=band)
-    reach = spacing * max(shape)
-    if not (spacing > SMALLEST and reach < LARGEST):
-        said = f"a spacing of {spacing:g} and an extent of {reach:g}"
-        raise MeshError(f"{said} are beyond what float32 holds: scale the mesh")
-    away = float(np.abs(origin).max()) + reach
-    if np.spacing(away) > POSITION_ERROR * spacing:
+    away = float(np.abs(origin).max()) + spacing * max(shape)
+    if not (spacing > 1e-30 and away < 1e30 and np.spacing(away) <= POSITION_ERROR * spacing):
         raise MeshError(
-            f"the grid reaches to {away:g}, where numbers are {np.spacing(away):.2g} apart: too "
-            f"coarse for a spacing of {spacing:g}; move the mesh to the origin"
+            f"a grid with a spacing of {spacing:g} that reaches to {away:g} cannot be held in "
+            "floating point: scale the mesh, or move it to the origin"
         )
-    size = " x ".join(map(str, shape))
-    check_fits(prod(shape) * 4 + WORK_BYTES, f"a grid of {size}", "take fewer samples")
+    need, size = prod(shape) * 4 + WORK_BYTES, " x ".join(map(str, shape))
+    check_fits(need, f"a grid of {size}", "take fewer samples")
     values = np.empty(shape, np.float32)
     corners = np.argwhere(np.ones([-(-n // EDGE) for n in shape], bool)) * EDGE
     for start in range(0, len(corners), CHUNK):

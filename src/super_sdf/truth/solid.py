@@ -1,4 +1,4 @@
-"""Meshes as ground truth: exact distances to them, and whether they bound a solid.
+"""Meshes as ground truth: read from files, with exact distances and sides.
 
 The distance is that to the nearest triangle. The sign comes from the winding number (Barill et al.,
 Fast Winding Numbers for Soups and Clouds, 2018), because the pseudonormal of the nearest triangle
@@ -7,16 +7,21 @@ gives the wrong sign on meshes that intersect themselves, as real ones do.
 
 from __future__ import annotations
 
+import logging
+import math
+import warnings
+import zipfile
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import MeshError
+from ..errors import FileError, MeshError, OutOfMemoryError
+from ..files.regular import check_regular_file
 from ..surface.mesh import Mesh
-from .mesh_files import read_mesh
+from ..threads import held_memory, in_words, memory_bound
 
 if TYPE_CHECKING:
     import igl
@@ -24,8 +29,81 @@ if TYPE_CHECKING:
 Points = NDArray[np.float64]
 Distances = NDArray[np.float64]
 
-# Distance from a face at which the winding number of its sides is evaluated, over the box diagonal.
-SIDE_STEP = 1e-5
+LARGEST_COORDINATE = 1e30  # products and squares of larger ones overflow
+MERGE_DISTANCE = 1e-8  # vertices closer than this are merged
+SMALLEST_STEP = 1e-18  # of the largest coordinate, so that multiples of it fit in 64 bits
+XML_BYTES = 20  # of memory that trimesh takes for each byte of XML in a .3mf
+SIDE_STEP = 1e-5  # from a face to where the winding number is taken, over the box diagonal
+
+
+def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
+    """Read any mesh file that trimesh reads, with merged float64 vertices.
+
+    ``max_memory`` is how many bytes this process may hold, by default a share of the free memory.
+    FileError if no mesh can be read from the file; OutOfMemoryError if it is an archive, such as
+    ``.3mf``, that unpacks to more than fits in memory; MeshError if it has no triangles, faces with
+    missing vertices, or coordinates that are not finite or larger than ``LARGEST_COORDINATE``.
+    """
+    path = check_regular_file(path)
+    try:
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                need = XML_BYTES * sum(info.file_size for info in archive.infolist())
+            left = (memory_bound(max_memory) or math.inf) - (held_memory() or 0)
+            if need > left:
+                raise OutOfMemoryError(
+                    f"{path}: to read it takes {in_words(need)} of memory, "
+                    f"{in_words(int(max(left, 0)))} are left; save it as .ply or .stl"
+                )
+        import trimesh
+
+        logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python prints them
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # unprocessed: otherwise faces with non-finite vertices would be dropped silently
+            found = trimesh.load_mesh(path, process=False, skip_materials=True)
+            vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
+            faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
+    except OutOfMemoryError:
+        raise
+    except Exception as error:  # the readers of trimesh raise all kinds of errors
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+        raise FileError(f"{path} cannot be read as a mesh: {reason}") from error
+    if not len(faces):
+        raise MeshError(f"{path} holds no triangle: give a surface mesh")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError(f"{path} has a face of a vertex that it does not hold: repair it")
+    mesh = without_unused(vertices, faces)
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError(f"{path} holds coordinates that are not finite: repair it first")
+    if (largest := np.abs(mesh.vertices).max()) > LARGEST_COORDINATE:
+        raise MeshError(f"{path} reaches to {largest:.3g}: scale it to coordinates under 1e30")
+    return merged(mesh)
+
+
+def without_unused(vertices: NDArray[Any], faces: NDArray[Any]) -> Mesh:
+    """Return a mesh of these faces, and of the vertices that are corners of them, in order."""
+    used = np.zeros(len(vertices), bool)
+    used[faces] = True
+    return Mesh(vertices[used], (np.cumsum(used, dtype=np.int32) - 1)[faces])
+
+
+def merged(mesh: Mesh) -> Mesh:
+    """Merge vertices within ``MERGE_DISTANCE``, for meshes under 1 that share of their size.
+
+    Unlike in trimesh, normals and textures do not keep vertices separate: a mesh is not open along
+    its seams. Unused vertices are dropped.
+    """
+    from trimesh.grouping import unique_rows
+
+    mesh = without_unused(mesh.vertices, mesh.faces)
+    step = MERGE_DISTANCE * min(1.0, float(np.ptp(mesh.vertices, axis=0).max()))
+    step = max(step, float(np.abs(mesh.vertices).max()) * SMALLEST_STEP) or 1.0
+    places = np.round(mesh.vertices / step).astype(np.int64)
+    first, place = unique_rows(places, keep_order=True)
+    if len(first) == len(mesh.vertices):
+        return mesh
+    return Mesh(mesh.vertices[first], place.astype(np.int32)[mesh.faces])
 
 
 def normalise(mesh: Mesh) -> Mesh:
@@ -39,7 +117,7 @@ class Solid:
     """The solid that a mesh, facing outward, encloses, with search trees for fast queries.
 
     Where pieces overlap the solid is their union, but distances are to the nearest triangle even if
-    that is inside another piece.
+    that is inside another piece. Points are (n, 3).
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -78,32 +156,32 @@ class Solid:
         """Whether the mesh is closed, so that the winding number changes at the surface only."""
         return self.unbalanced_edges == 0
 
-    def distance(self, points: Points) -> Distances:
-        """Return the unsigned distance, (n,), of points (n, 3) to the nearest triangle."""
-        return self.nearest(points)[0]
-
-    def nearest_face(self, points: Points) -> NDArray[np.int64]:
-        """Return the index of the nearest triangle, (n,), of points (n, 3)."""
-        return self.nearest(points)[1]
-
     def nearest(self, points: Points) -> tuple[Distances, NDArray[np.int64], Points]:
-        """Return distance, triangle and nearest point of points (n, 3)."""
+        """Return the distance to the nearest triangle, that triangle, and its nearest point."""
         if not len(points):
             return np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))
         mesh = self.mesh
         squared, face, feet = self._triangles.squared_distance(mesh.vertices, mesh.faces, points)
         return np.sqrt(squared), np.ravel(face), feet
 
+    def distance(self, points: Points) -> Distances:
+        """Return the unsigned distance, (n,), to the nearest triangle."""
+        return self.nearest(points)[0]
+
+    def nearest_face(self, points: Points) -> NDArray[np.int64]:
+        """Return the index of the nearest triangle, (n,)."""
+        return self.nearest(points)[1]
+
     def winding_number(self, points: Points) -> Distances:
-        """Return the winding number of points (n, 3), (n,): 1 inside, 0 outside."""
+        """Return the winding number, (n,): 1 inside, 0 outside."""
         return self._winding.winding_number(points) if len(points) else np.zeros(0)
 
     def is_inside(self, points: Points) -> NDArray[np.bool_]:
-        """Return a mask, (n,), of the points (n, 3) inside the solid."""
+        """Return a mask, (n,), of the points inside the solid."""
         return self.winding_number(points) > 0.5
 
     def signed_distance(self, points: Points) -> Distances:
-        """Return the signed distance, (n,), of points (n, 3), negative inside."""
+        """Return the signed distance, (n,), negative inside."""
         found = self.distance(points)
         return np.where(self.is_inside(points), -found, found)
 
@@ -133,13 +211,12 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
     from the generalised winding number, a guess near the holes.
     """
     solid, notes = Solid(read_mesh(path)), []
-    mesh, open_edges = solid.mesh, solid.unbalanced_edges
+    mesh, open_edges, volume = solid.mesh, solid.unbalanced_edges, solid.mesh.volume()
     if open_edges and not allow_open:
         raise MeshError(
             f"{path} is open: {open_edges:,} edges have no partner, so it has no inside; "
             "close it, or use --allow-open to guess its inside"
         )
-    volume = mesh.volume()
     if not np.ptp(mesh.vertices, axis=0).all() or volume == 0:
         raise MeshError(f"{path} is flat: it encloses no volume")
     if open_edges:
@@ -149,8 +226,7 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
         solid = Solid(Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1])))
     if overlapping := solid.count_overlapping():
         notes.append(
-            f"pieces overlap, fold over or are inverted at {overlapping:,} of "
-            f"{len(mesh.faces):,} faces: inside is by winding number, and distances are to "
-            "inner walls, too"
+            f"pieces overlap, fold over or are inverted at {overlapping:,} of {len(mesh.faces):,} "
+            "faces: inside is by winding number, and distances are to inner walls, too"
         )
     return solid, notes
