@@ -51,24 +51,24 @@ def moved(mesh: Mesh, x: float) -> Mesh:
 
 def test_a_sphere_touches_the_balls_of_its_own_grid_also_inside_out(ball_mesh):
     found = check_mesh(ball_mesh, GRID)
-    figures = found.touching.summary()
-    assert len(found.touching.values) > 3000 and found.touching.noisy == 0
+    figures = found.figures()
+    assert len(found.values) > 3000 and found.samples["noisy"] == 0
     assert figures["largest"] < 0.005 and figures["share_above_tenth"] == 0
     assert found.faults() == []
     assert found.surface.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=1e-3)
     assert found.surface.area == pytest.approx(4 * np.pi * RADIUS**2, rel=1e-3)
     assert (found.surface.components, found.surface.self_intersections) == (1, 0)
     found = check_mesh(inverted(ball_mesh), GRID)
-    assert found.touching.summary()["largest"] < 0.005  # its triangles are where they should be
+    assert found.figures()["largest"] < 0.005  # its triangles are where they should be
     assert not found.surface.report()["oriented"] and found.surface.volume < 0
-    assert found.touching.wrong_side[found.touching.values < -0.1].all()
+    assert found.wrong_side[found.values < -0.1].all()
     assert "triangles that face inward" in found.faults()
 
 
 def test_a_shift_is_its_cosine_and_so_are_the_colours(ball_mesh):
     """Along x by a: a sample in direction n is off by a n_x, the mean of its absolute a / 2."""
     whole = check_mesh(moved(ball_mesh, 0.1 * H), GRID)
-    found, figures = whole.touching, whole.touching.summary()
+    found, figures = whole, whole.figures()
     assert figures["largest"] == pytest.approx(0.1, abs=0.01)
     assert figures["mean"] == pytest.approx(0.05, abs=0.005)
     cosine = found.points[:, 0] / np.linalg.norm(found.points, axis=1)
@@ -87,7 +87,7 @@ def test_a_shift_is_its_cosine_and_so_are_the_colours(ball_mesh):
 
 
 def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
-    found = check_mesh(round_mesh(RADIUS - 0.2 * H), GRID).touching
+    found = check_mesh(round_mesh(RADIUS - 0.2 * H), GRID)
     clear, outside = np.abs(found.values) > 0.3, found.values > 0
     np.testing.assert_allclose(found.residuals[clear & outside], 0.2, atol=0.01)
     np.testing.assert_allclose(found.residuals[clear & ~outside], -0.2, atol=0.01)
@@ -142,32 +142,32 @@ def test_sides_of_a_mesh_that_meets_itself_are_by_winding_number(ball_mesh):
     """A point in both balls is behind one sheet and nearest to the inner one, seen from inside."""
     found = check_mesh(joined(ball_mesh, round_mesh(0.5 * RADIUS, 3)), GRID)
     assert found.surface.components == 2
-    assert not found.touching.wrong_side.any()
+    assert not found.wrong_side.any()
 
 
 def test_a_piece_far_from_every_sample_is_noticed():
     """The samples near the surface see nothing of it, but those round it promise empty balls."""
     ball_mesh, speck = round_mesh(subdivisions=4), round_mesh(0.02, 2)
     found = check_mesh(joined(ball_mesh, speck), GRID)
-    assert found.touching.summary()["largest"] < 0.02
-    assert found.strays.count == len(speck.vertices)
-    assert found.strays.deepest == pytest.approx((RADIUS - 0.02) / H, abs=1)
+    assert found.figures()["largest"] < 0.02
+    assert found.strays["count"] == len(speck.vertices)
+    assert found.strays["deepest"] == pytest.approx((RADIUS - 0.02) / H, abs=1)
     outside = check_mesh(joined(ball_mesh, moved(ball_mesh, 2.0)), GRID)
-    assert outside.strays.beyond == len(ball_mesh.vertices)
+    assert outside.strays["beyond"] == len(ball_mesh.vertices)
 
 
 def test_truncated_and_noisy_samples_promise_nothing(ball_mesh):
     near, early = (
-        check_mesh(ball_mesh, grid_of(np.clip(sphere_values(), -limit * H, limit * H))).touching
+        check_mesh(ball_mesh, grid_of(np.clip(sphere_values(), -limit * H, limit * H)))
         for limit in (1.5, 0.9)
     )
-    whole = check_mesh(ball_mesh, GRID).touching
+    whole = check_mesh(ball_mesh, GRID)
     assert len(near.values) == len(whole.values)  # beyond 1.4 voxels none counts anyway
-    assert np.abs(early.values).max() < 0.9 and early.cut_off > 1000
-    assert early.summary()["largest"] < 0.005
+    assert np.abs(early.values).max() < 0.9 and early.samples["cut_off"] > 1000
+    assert early.figures()["largest"] < 0.005
     noise = np.random.default_rng(0).uniform(-1, 1, sphere_values().shape) * H
     found = check_mesh(ball_mesh, grid_of(sphere_values() + noise))
-    assert len(found.touching.values) == 0 and found.touching.noisy > 3000
+    assert len(found.values) == 0 and found.samples["noisy"] > 3000
     assert found.report()["residual"] is None and found.strays is None
     assert "residual: unknown, since no sample is exact" in found.lines()
     none = dict.fromkeys(LIMITS)
@@ -198,7 +198,7 @@ def test_limits(ball_mesh):
     largest, world, mean, share = exceeded(found, dict(zip(names, (0.1, 0.1 * H, 0.05, 0.01))))
     assert largest.startswith("the largest residual is 0.1")
     assert largest.endswith(" voxels, --max-residual is 0.1")
-    worst = found.touching.summary()["largest"] * H
+    worst = found.figures()["largest"] * H
     assert world == (
         f"the largest residual is {worst:.4g} in world units, --tolerance is {0.1 * H:g}"
     )

@@ -5,8 +5,9 @@ import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
+from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.bounds import keep_within_bounds
-from super_sdf.refine.nodes import VoxelIndex, average_shared, block_ijk, rows_among, share_parts
+from super_sdf.refine.nodes import VoxelIndex, average_shared, block_ijk, share_parts
 from super_sdf.refine.spheres import find_foot_points, fit_to_spheres, spheres_of_band
 from super_sdf.refine.survey import survey
 
@@ -18,13 +19,10 @@ class Fields:
 
     def __init__(self, grid, factor=4):
         self.band, self.factor = survey(grid), factor
-        patches, table, voxels = self.band.network_inputs()
-        self.ijk = self.band.voxel_ijk[voxels]
-        self.parts = share_parts(rows_among(voxels, len(table))[table[voxels]])
+        self.ijk = self.band.voxel_ijk[self.band.decoded]
+        self.parts = share_parts(neighbour_table(self.ijk, grid.shape))
         self.index = VoxelIndex(self.ijk, grid.shape)
-        exact, shape = np.flatnonzero(self.band.exact), self.band.shape
-        samples = self.band.voxel_ijk, patches, exact
-        self.spheres = spheres_of_band(*samples, shape, self.band.limits)
+        self.spheres = spheres_of_band(self.band)
         node = self.ijk + block_ijk(factor)[:, None] / factor - 0.5
         away = 2 * (np.linalg.norm(node - MIDDLE, axis=2) - 6)
         self.exact = np.pad(away.astype(np.float32), ((0, 0), (0, 1)))

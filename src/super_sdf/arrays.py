@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float32]
 IntArray: TypeAlias = NDArray[np.int32]
 BoolArray: TypeAlias = NDArray[np.bool_]
-Signs: TypeAlias = NDArray[np.int8]
-"""1 outside, -1 inside, 0 unknown."""
 Triple: TypeAlias = tuple[float, float, float]
 """One number per axis: x, y, z."""
 

@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,6 +27,7 @@ from .network.network import load_network, network_for
 from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
+from .refine.band import neighbour_table
 from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.prediction import interpolate, predict
@@ -61,8 +62,7 @@ def refine(
     if whole is None and not band.decoded.any():
         raise no_surface(grid, offset)
     steps.finish("band")
-    field = refine_band(band, adapt(network), factor, threads, steps)
-    return replace(field, grid=grid, offset=offset)
+    return refine_band(band, adapt(network), factor, threads, steps)
 
 
 def refine_band(
@@ -74,36 +74,41 @@ def refine_band(
 ) -> FineField:
     """Return the fine field of a band: the steps from the network to the final values."""
     steps = steps or StepCounter()
-    patches, table, voxels = band.network_inputs()
-    own_ijk, exact = band.voxel_ijk[voxels], np.flatnonzero(band.exact)
-    if band.field.smooth is None:
+    grid, patches = band.grid, band.patches
+    table = neighbour_table(band.voxel_ijk, grid.shape)
+    voxels = np.flatnonzero(band.decoded).astype(np.int32)
+    own_ijk = band.voxel_ijk[voxels]
+    if grid.field.smooth is None:
         blocks = predict(band, table, voxels, network, factor, threads, steps.within("network"))
     else:
         blocks = interpolate(band, table, voxels, network, factor, threads)
     steps.finish("network")
 
-    parts = nodes.share_parts(nodes.rows_among(voxels, len(table))[table[voxels]])
+    row_of = np.full(len(table) + 1, -1, np.int32)  # of each voxel of the band, if it is decoded
+    row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
+    parts = nodes.share_parts(row_of[table[voxels]])
     del table
-    index = nodes.VoxelIndex(own_ijk, band.shape)
     nodes.average_shared(blocks, parts, factor, threads)  # Eq. 7
-    spheres = spheres_of_band(band.voxel_ijk, patches, exact, band.shape, band.limits, threads)
-    fit_to_spheres(blocks, parts, factor, spheres, index, threads)
-    del spheres
+    index = nodes.VoxelIndex(own_ijk, grid.shape)
+    fit_to_spheres(blocks, parts, factor, spheres_of_band(band, threads), index, threads)
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
-    if band.field.kind == options.MASK:
+    if grid.field.kind == options.MASK:
         nodes.hold_sides(blocks, factor, patches, voxels)
-    skipped = nodes.signs_of_skipped(parts, own_ijk, patches, voxels, band.shape)
-    pinned = nodes.pin_to_skipped(blocks[:, :-1], parts, factor, skipped)
+    pinned = nodes.pin_to_skipped(
+        blocks[:, :-1], parts, factor, own_ijk, patches, voxels, grid.shape
+    )
     steps.finish("nodes")
-    unseen = band.field.unseen
+    unseen = grid.field.unseen
     return FineField(
-        band.shape,
+        grid.shape,
         factor,
         own_ijk,
         blocks[:, :-1],
         parts,
-        spheres=SampleSpheres.of(band.shape, band.voxel_ijk[exact], patches[exact]),
-        leaves=band.leaves,
+        grid,
+        band.offset,
+        SampleSpheres.of(grid.shape, band.voxel_ijk[band.exact], patches[band.exact]),
+        band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
         counts={
             "band_voxels": len(patches),
@@ -410,7 +415,6 @@ def make_tile(
     if not band.decoded.any():
         return Part.without_surface(tile)
     field = refine_band(band, network, factor, task.threads, steps)
-    field = replace(field, grid=task.grid, offset=chosen.offset)
     del band
     if save_field:
         save_field(field)

@@ -120,11 +120,11 @@ def _make_mesh(job: Job, settings: Settings, stage: Path, network: Network) -> R
     row = {"output": fingerprint(target), **done.report(), "stages": stages}
     if not keep:
         return row
-    from ..check.check import check_files
+    from ..check.check import check_mesh, read_for_check
 
     try:
         if settings.items is None:
-            found = check_files(target, job.source, job.options, made=done)
+            found = check_mesh(*read_for_check(target, job.source, job.options, done), job.options)
             return {**row, "check": found.report()}
         from ..pages.items import item_of_files, keep_item
 

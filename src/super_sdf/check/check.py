@@ -4,14 +4,14 @@ An exact sample is the radius of an empty ball that touches the surface. Its res
 distance to the mesh minus that radius: positive if the mesh does not reach the ball, negative if it
 pierces it. All lengths are in voxels unless they are named otherwise.
 
->>> from super_sdf.check.check import check_files
->>> check_files("part.ply", "part.npz").report()                         # doctest: +SKIP
+>>> from super_sdf.check.check import check_mesh
+>>> check_mesh(mesh, grid).report()                                      # doctest: +SKIP
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +33,7 @@ from ..threads import chunks_of, give_back, held_memory, in_words, memory_bound,
 from ..truth.solid import Points, Solid, merged, read_mesh
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
-BYTES_PER_TRIANGLE = 650
-BYTES_PER_SAMPLE = 150
+BYTES_PER_TRIANGLE, BYTES_PER_SAMPLE = 650, 150
 OFF_OF_MASKS = 0.5  # by which the distances that are made of a mask may be off
 CLEAR = 0.5  # cosine to the nearest triangle's normal above which that tells the side
 NOTICEABLE = 0.1  # a residual that is counted as large
@@ -95,24 +94,37 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class Touching:
-    """The exact samples of a grid near the surface, and where their balls meet the mesh.
+class Certificate:
+    """What is certain of a mesh without the true surface: its surface, samples, and strays.
 
     Samples that promise nothing are counted and left out: cut off at the limit of truncated values
     or at the band's edge; and noisy ones, which differ from a neighbour by more than distances can,
-    together with the rest if they are many.
+    together with the rest if they are many. The exact samples near the surface see nothing of a
+    piece that lies far from it, but every sample, also if its value was truncated, promises a ball
+    without surface. A stray is a vertex in the ball of its nearest sample.
     """
 
-    cut_off: int
-    noisy: int
-    voxel_ijk: IntArray  # (n, 3)
+    mesh: Mesh  # vertices at the same position are one
+    grid: SdfGrid  # on its cubic lattice
+    surface: Surface
+    samples: dict[str, int]  # exact (n), cut_off, noisy
+    voxel_ijk: IntArray  # (n, 3), of the exact samples
     points: Points  # (n, 3), in world units
     values: FloatArray  # (n,), negative inside
     residuals: FloatArray  # (n,): distance to the mesh minus absolute value
     feet: Points  # (n, 3): the nearest points of the mesh, in world units
     wrong_side: BoolArray  # (n,): mesh and sample disagree on it by more than ``NOTICEABLE``
+    # vertices more than ``STRAY`` deep, those beyond the grid, and how deep the deepest is; None if
+    # no sample is exact, and it is no mask
+    strays: dict[str, Any] | None = None
+    sample_volume: float | None = None  # of a mask: of its samples inside, each of which is a box
 
-    def summary(self) -> dict[str, Any]:
+    @property
+    def has_evidence(self) -> bool:
+        """Whether any sample is exact."""
+        return len(self.values) > 0
+
+    def figures(self) -> dict[str, Any]:
         """Return mean, 99th percentile and maximum of the absolute residuals, and where it is."""
         size = np.abs(self.residuals)
         worst = int(size.argmax())
@@ -127,47 +139,15 @@ class Touching:
             "share_pierced": float((self.residuals < -NOTICEABLE).mean()),
         }
 
-
-@dataclass(frozen=True)
-class Strays:
-    """Vertices that lie where the nearest sample says that no surface is.
-
-    The samples near the surface see nothing of a piece that lies far from it. But every sample,
-    however far away, promises a ball without surface, also if its value was truncated.
-    """
-
-    count: int  # vertices more than ``STRAY`` inside the ball of their nearest sample
-    beyond: int  # vertices more than half a voxel from the outermost samples
-    deepest: float  # of a vertex in the ball of its nearest sample; 0 if there is none
-
-
-@dataclass(frozen=True, eq=False)
-class Certificate:
-    """What is certain of a mesh without the true surface."""
-
-    mesh: Mesh  # vertices at the same position are one
-    grid: SdfGrid  # on its cubic lattice
-    surface: Surface
-    touching: Touching
-    strays: Strays | None  # None if no sample is exact, and it is no mask
-    sample_volume: float | None = None  # of a mask: of its samples inside, each of which is a box
-
-    @property
-    def has_evidence(self) -> bool:
-        """Whether any sample is exact."""
-        return len(self.touching.values) > 0
-
     def report(self) -> dict[str, Any]:
         """Return the certificate as it stands in JSON; residuals and depths are in voxels."""
-        touching, known = self.touching, self.has_evidence
-        samples = len(touching.values), touching.cut_off, touching.noisy
         return {
             "voxel_size": self.grid.voxel_size,
             "surface": self.surface.report(),
-            "samples": dict(zip(("exact", "cut_off", "noisy"), samples)),
-            "residual": touching.summary() if known else None,
-            "wrong_side": int(touching.wrong_side.sum()) if known else None,
-            "strays": asdict(self.strays) if self.strays else None,
+            "samples": self.samples,
+            "residual": self.figures() if self.has_evidence else None,
+            "wrong_side": int(self.wrong_side.sum()) if self.has_evidence else None,
+            "strays": self.strays,
             "sample_volume": self.sample_volume,
             "faults": self.faults(),
             "inferred": list(self.grid.notes),
@@ -175,42 +155,41 @@ class Certificate:
 
     def faults(self) -> list[str]:
         """Return what is wrong with the mesh whatever the limits, in words."""
-        wrong, strays = int(self.touching.wrong_side.sum()), self.strays.count if self.strays else 0
+        wrong, strays = int(self.wrong_side.sum()), self.strays["count"] if self.strays else 0
         found = [f"{wrong:,} samples on the wrong side"] * (wrong > 0)
         found += [f"{strays:,} vertices where the grid has no surface"] * (strays > 0)
         return self.surface.faults() + found
 
     def lines(self) -> list[str]:
         """Return the certificate as lines for users."""
-        surface, touching = self.surface, self.touching
-        pieces = f"{surface.components:,} component" + "s" * (surface.components != 1)
+        of, samples = self.surface, self.samples
         lines = [
-            f"mesh: {surface.vertices:,} vertices, {surface.triangles:,} triangles, {pieces}, "
-            f"volume {surface.volume:.6g}, area {surface.area:.6g}",
-            f"samples: {len(touching.values):,} exact near the surface, {touching.cut_off:,} cut "
-            f"off and {touching.noisy:,} noisy left out",
+            f"mesh: {of.vertices:,} vertices, {of.triangles:,} triangles, {of.components:,} "
+            f"component{'s' * (of.components != 1)}, volume {of.volume:.6g}, area {of.area:.6g}",
+            f"samples: {samples['exact']:,} exact near the surface, {samples['cut_off']:,} cut off "
+            f"and {samples['noisy']:,} noisy left out",
         ]
         if self.has_evidence:
-            figures = touching.summary()
+            figures, h = self.figures(), self.grid.voxel_size
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
             lines += [
-                f"residual in voxels: mean {figures['mean']:.4f}, 99th percentile "
-                f"{figures['p99']:.4f}, largest {figures['largest_signed']:+.4f} at ({at}), "
-                f"{figures['largest'] * self.grid.voxel_size:.4g} in world units",
-                f"above {NOTICEABLE:g} voxel: {figures['share_above_tenth']:.2%} of the samples "
-                f"({figures['share_not_touching']:.2%} not touching, "
-                f"{figures['share_pierced']:.2%} pierced)",
+                "residual in voxels: mean {mean:.4f}, 99th percentile {p99:.4f}, largest "
+                "{largest_signed:+.4f} at ".format(**figures)
+                + f"({at}), {figures['largest'] * h:.4g} in world units",
+                f"above {NOTICEABLE:g} voxel: "
+                "{share_above_tenth:.2%} of the samples ({share_not_touching:.2%} not touching, "
+                "{share_pierced:.2%} pierced)".format(**figures),
             ]
         else:
             lines.append("residual: unknown, since no sample is exact")
         if self.sample_volume:
             lines.append(f"volume of the samples inside: {self.sample_volume:.6g}; {self._off()}")
-        counted = surface.self_intersections is not None
+        counted = of.self_intersections is not None
         sound = "closed, oriented, manifold" + ", no self-intersections" * counted
         lines.append("faults: " + "; ".join(self.faults() or [f"none ({sound})"]))
         lines += ["self-intersections: not counted"] * (not counted)
-        if self.strays and self.strays.beyond:
-            lines.append(f"{self.strays.beyond:,} vertices lie beyond the grid and are unchecked")
+        if self.strays and self.strays["beyond"]:
+            lines.append(f"{self.strays['beyond']:,} vertices lie beyond the grid, unchecked")
         return lines
 
     def _off(self) -> str:
@@ -222,13 +201,13 @@ class Certificate:
         if not self.has_evidence:
             said = ["no sample is exact, so the residual is unknown"]
             return "; ".join(said + [self._off()] * bool(self.sample_volume) + self.faults())
-        figures = self.touching.summary()
-        residual = (
-            f"residual {figures['mean']:.4f} voxels in the mean, {figures['largest']:.4f} at most, "
-            f"{figures['share_above_tenth']:.2%} of {len(self.touching.values):,} samples above "
-            f"{NOTICEABLE:g}"
+        said = (
+            "residual {mean:.4f} voxels in the mean, {largest:.4f} at most, {share_above_tenth:.2%}"
         )
-        return "; ".join([residual, *(self.faults() or ["no faults"])])
+        said = f"{said} of {len(self.values):,} samples above {NOTICEABLE:g}".format(
+            **self.figures()
+        )
+        return "; ".join([said, *(self.faults() or ["no faults"])])
 
     def residuals_at(self, vertices: NDArray[Any]) -> FloatArray:
         """Return the residual at positions on the mesh, (n,); NaN where no foot point is near.
@@ -237,19 +216,17 @@ class Certificate:
         around, each weighted by the inverse of its distance; its sign is that of the mean with
         signs.
         """
-        touching, grid = self.touching, self.grid
+        grid, index = self.grid, VoxelIndex(self.voxel_ijk, self.grid.shape)
         residuals = np.full(len(vertices), np.nan, np.float32)
-        index = VoxelIndex(touching.voxel_ijk, grid.shape)
-        count = len(vertices) if self.has_evidence else 0
-        for chunk in chunks_of(count, 8 * len(NEIGHBOURHOOD)):
+        for chunk in chunks_of(len(vertices) * self.has_evidence, 8 * len(NEIGHBOURHOOD)):
             some = np.asarray(vertices[chunk], np.float64)
             nearest = np.rint(grid.to_index(some)).astype(np.int64)
             rows = index.find(nearest[:, None] + NEIGHBOURHOOD)
-            away = np.linalg.norm(some[:, None] - touching.feet[rows], axis=2) / grid.voxel_size
+            away = np.linalg.norm(some[:, None] - self.feet[rows], axis=2) / grid.voxel_size
             away[rows < 0] = np.inf
             limit = np.partition(away, NEAREST_FEET - 1, axis=1)[:, NEAREST_FEET - 1, None]
             weight = np.where(away <= np.minimum(limit, FARTHEST), 1 / (away + SMOOTHING), 0)
-            there = touching.residuals[rows]
+            there = self.residuals[rows]
             with np.errstate(invalid="ignore"):
                 size = (weight * np.abs(there)).sum(1) / weight.sum(1)
             residuals[chunk] = np.copysign(size, (weight * there).sum(1))
@@ -258,12 +235,12 @@ class Certificate:
 
 def check_limits(limits: Mapping[str, float | None]) -> None:
     """Raise OptionError if one of ``LIMITS``, None for those not asked for, is out of range."""
-    for name in LIMITS:
-        limit, option = limits[name], f"--{name.replace('_', '-')}"
-        if limit is not None and not 0 <= limit < float("inf"):
-            raise OptionError(f"{option} is {limit:g}: give a number from 0 on")
-    if (share := limits["max_share"]) is not None and share > 1:
-        raise OptionError(f"--max-share is {share:g}: give a share from 0 to 1")
+    for name, limit in limits.items():
+        most, kind = (
+            (1, "share from 0 to 1") if name == "max_share" else (1e300, "number from 0 on")
+        )
+        if limit is not None and not 0 <= limit <= most:
+            raise OptionError(f"--{name.replace('_', '-')} is {limit:g}: give a {kind}")
 
 
 def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> list[str]:
@@ -271,7 +248,7 @@ def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> li
     asked = {name: limit for name in LIMITS if (limit := limits[name]) is not None}
     if asked and not certificate.has_evidence:
         return [NO_EVIDENCE]
-    figures, found = certificate.touching.summary() if asked else {}, []
+    figures, found = certificate.figures() if asked else {}, []
     for name, limit in asked.items():
         key, words, unit = LIMITS[name]
         figure = figures[key] * (certificate.grid.voxel_size if unit == WORLD else 1)
@@ -281,27 +258,13 @@ def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> li
     return found
 
 
-def check_files(
-    mesh: str | Path,
-    grid: str | Path,
-    options: Options = AS_GIVEN,
-    *,
-    made: Any = None,
-    intersections: bool = True,
-) -> Certificate:
-    """Check a mesh file against the grid file that it was made from; see ``check_mesh``.
-
-    ``options`` are those that the mesh was made with: how the grid is read, the offset, the memory
-    bound. What was ``made`` has the ``mesh`` and the ``grid``, so that they are not read again.
-    """
-    both = read_for_check(mesh, grid, options, made)
-    return check_mesh(*both, options, intersections=intersections)
-
-
 def read_for_check(
     mesh: str | Path, grid: str | Path, options: Options, made: Any = None
 ) -> tuple[Mesh, SdfGrid]:
-    """Return a mesh and its grid: those that were ``made``, else read from their files."""
+    """Return a mesh and its grid: those that were ``made``, else read from their files.
+
+    ``options`` are those that the mesh was made with: how the grid is read, the unit.
+    """
     if made is not None:
         return merged(made.mesh), made.grid
     samples, read = read_grid(grid, **options.reading()), read_mesh(mesh, options.max_memory)
@@ -320,8 +283,7 @@ def check_mesh(
     GridError if the grid has no surface at the offset; OutOfMemoryError if the search trees would
     not fit in memory.
     """
-    offset = options.offset
-    lattice = cubic_grid(grid, offset)
+    offset, lattice = options.offset, cubic_grid(grid, options.offset)
     band = survey(lattice, offset, threads=useful_threads(0))
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)
@@ -334,13 +296,13 @@ def check_mesh(
             f"{in_words(bound)} may be taken in all; allow more (--max-memory)"
         )
     surface = examine_surface(mesh, self_intersections(mesh) if intersections else None)
-    touching = touch(mesh, band, lattice, surface)
+    found = touch(mesh, band, lattice, surface)
     give_back()
     is_mask, strays = lattice.field.kind == MASK, None
-    if is_mask or len(touching.values):
+    if is_mask or found.has_evidence:
         strays = find_strays(mesh.vertices, lattice, offset, OFF_OF_MASKS * is_mask)
     volume = volume_of_samples(grid, offset) if is_mask else None
-    return Certificate(mesh, lattice, surface, touching, strays, volume)
+    return replace(found, strays=strays, sample_volume=volume)
 
 
 def examine_surface(mesh: Mesh, crossing: int | None = None) -> Surface:
@@ -368,7 +330,7 @@ def self_intersections(mesh: Mesh) -> int | None:
     return len(igl.predicates.find_self_intersections(mesh.vertices.astype(np.float64), faces)[1])
 
 
-def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Touching:
+def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Certificate:
     """Return where the balls of the exact samples of a band meet a mesh.
 
     On which side of the mesh a sample lies is by its winding number; but if the mesh is one closed
@@ -377,11 +339,11 @@ def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Touching:
     values = band.patches[:, CENTRE]
     # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
     trusted = band.exact & (values > values.min()) & (values < values.max())
-    sampled = np.ones(len(values), bool) if band.sampled is None else band.sampled
-    rows = np.flatnonzero(trusted & sampled)  # what is interpolated promises nothing
+    rows = np.flatnonzero(trusted & band.sampled)  # what is interpolated promises nothing
+    sampled = int(np.count_nonzero(band.sampled))
     # if none is exact, too many are no distances for any to be taken for one
-    noisy = band.count_noisy() if len(rows) else int(np.count_nonzero(sampled))
-    cut_off = int(np.count_nonzero(sampled)) - len(rows) - noisy
+    noisy = band.count_noisy() if len(rows) else sampled
+    cut_off = sampled - len(rows) - noisy
     ijk, values = band.voxel_ijk[rows], values[rows] * np.float32(0.5)
     points, solid = grid.to_world(ijk), Solid(mesh)
     found, faces, feet = solid.nearest(points)
@@ -395,14 +357,15 @@ def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Touching:
     agreed = is_sheet & (np.where(values > 0, 1, -1) * cosines > CLEAR)
     apart = np.flatnonzero((distances + size > NOTICEABLE) & ~agreed)  # where the side matters
     wrong[apart] = solid.is_inside(points[apart]) != (values[apart] <= 0)
-    return Touching(cut_off, noisy, ijk, points, values, residuals, feet, wrong)
+    samples = {"exact": len(rows), "cut_off": cut_off, "noisy": noisy}
+    found_there = ijk, points, values, residuals, feet, wrong
+    return Certificate(mesh, grid, surface, samples, *found_there)
 
 
-def find_strays(vertices: NDArray[Any], grid: SdfGrid, offset: float, slack: float) -> Strays:
-    """Look up the nearest sample of each vertex, (n, 3) in world units.
-
-    A sample's value may be off by ``slack``, as those of masks are.
-    """
+def find_strays(
+    vertices: NDArray[Any], grid: SdfGrid, offset: float, slack: float
+) -> dict[str, Any]:
+    """Return ``Certificate.strays``; values may be off by ``slack``, as those of masks are."""
     position = grid.to_index(vertices)
     nearest = np.rint(position).astype(np.int64)
     inside = ((nearest >= 0) & (nearest < grid.shape)).all(1)
@@ -410,12 +373,11 @@ def find_strays(vertices: NDArray[Any], grid: SdfGrid, offset: float, slack: flo
     values = np.zeros(len(nearest))
     for first, last in plane_blocks(grid.shape):
         rows = np.flatnonzero((nearest[:, 0] >= first) & (nearest[:, 0] < last))
-        if len(rows):
-            i, j, k = nearest[rows].T
-            values[rows] = rescale(grid, offset, first, last)[i - first, j, k]
+        i, j, k = nearest[rows].T
+        values[rows] = rescale(grid, offset, first, last)[i - first, j, k]
     depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1) - slack
-    count, beyond = np.count_nonzero(depth > STRAY), np.count_nonzero(~inside)
-    return Strays(int(count), int(beyond), float(depth.max(initial=0)))
+    count, beyond = int((depth > STRAY).sum()), int((~inside).sum())
+    return {"count": count, "beyond": beyond, "deepest": float(depth.max(initial=0))}
 
 
 def check_coloured(path: Path, *, force: bool = False) -> None:

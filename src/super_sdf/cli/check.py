@@ -75,7 +75,8 @@ def command(mesh: Path, grid: Path, **given: Any) -> None:
         check.check_coloured(out, force=force)
         check_apart(out, [mesh, *files_of(grid)])
     options = Options(**{name: given[name] for name in (*READ, "offset", "max_memory", "unit")})
-    found = check.check_files(mesh, grid, options, intersections=not given["skip_intersections"])
+    both, crossing = check.read_for_check(mesh, grid, options), not given["skip_intersections"]
+    found = check.check_mesh(*both, options, intersections=crossing)
     if out:
         check.write_coloured(found, out, force=force)
     faults = found.faults() if given["no_faults"] else []

@@ -102,11 +102,11 @@ def command(source: str, target: str, **given: Any) -> None:
     }
     certificate = None
     if given["check"]:
-        from ..check.check import check_files
+        from ..check.check import check_mesh, read_for_check
 
         start = time.perf_counter()
         try:
-            certificate = check_files(target, source, options, made=done)
+            certificate = check_mesh(*read_for_check(target, source, options, done), options)
         except SuperSdfError as error:
             raise type(error)(f"{error}; {target} is written, but not checked") from error
         report["check"] = certificate.report()

@@ -24,12 +24,12 @@ from numpy.typing import NDArray
 from ..arrays import FloatArray
 from ..errors import FileError, OptionError, OptionTypeError, SuperSdfError, seen
 from ..grid.field import Field
-from ..grid.samples import SamplePlanes
+from ..grid.samples import SamplePlanes, in_blocks
 from ..grid.sdf_grid import SdfGrid
 from ..options import OPTIONS, check_path
 from ..refine.band import neighbour_table
-from ..refine.field import FineField, SampleSpheres, fine_grid, lattice_planes, lattice_shape
-from ..refine.nodes import copies_agree, share_parts
+from ..refine.field import FineField, FineLattice, SampleSpheres, fine_grid, lattice_shape
+from ..refine.nodes import share_parts
 from ..surface.cap import check_all_seen, find_border_inside
 from ..threads import check_fits
 from .output import check_free, naming, replacing
@@ -38,6 +38,7 @@ from .vdb_writer import write_level_set
 
 VERSION = 1
 CHUNK = 1 << 20  # values at a time
+PLANES = 16  # of the fine lattice at a time
 # Which kinds of numbers each array has, and its shape, where None is any length.
 ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
     **dict.fromkeys(("version", "factor"), ("iu", ())),
@@ -89,19 +90,20 @@ def write_sparse(field: FineField, path: Path) -> None:
 
 def write_npy(field: FineField, path: Path) -> None:
     """Write the whole fine lattice as NumPy's ``.npy``, in float32."""
-    shape = lattice_shape(field.shape, field.factor)
+    lattice = FineLattice(field)
+    header = {"descr": "<f4", "fortran_order": False, "shape": lattice.shape}
     with path.open("wb") as file:
-        npy.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
-        for _, planes in lattice_planes(field):
-            file.write(planes.astype("<f4", copy=False).tobytes())
+        npy.write_array_header_1_0(file, header)
+        for plane in lattice:
+            file.write(plane.astype("<f4", copy=False).tobytes())
 
 
 def write_vti(field: FineField, path: Path) -> None:
     """Write the whole fine lattice as VTK image data, from memory: x is the fastest there."""
-    grid = fine_grid(field)
+    grid, lattice = fine_grid(field), FineLattice(field)
     values = np.empty(grid.shape[::-1], "<f4")
-    for first, planes in lattice_planes(field):
-        values[:, :, first : first + len(planes)] = planes.transpose(2, 1, 0)
+    for planes in in_blocks(lattice, PLANES):
+        values[:, :, planes] = lattice[planes].transpose(2, 1, 0)
     extent = " ".join(f"0 {nodes - 1}" for nodes in grid.shape)
     place: dict[str, Any] = {
         "Origin": grid.origin,
@@ -311,9 +313,10 @@ def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
     ):
         if not is_sound:
             raise FileError(f"{path}[{key}] is damaged: {fault}")
-    if not copies_agree(blocks, parts, factor):
-        raise FileError(f"{path}[values] is damaged: blocks differ at nodes that they share")
     three = (shape[0], shape[1], shape[2])
+    plain = FineField(three, factor, voxels, blocks, parts)
+    if (plain.values[plain.numbers] != blocks.T).any():
+        raise FileError(f"{path}[values] is damaged: blocks differ at nodes that they share")
     return FineField(
         *(three, factor, voxels, blocks, parts),
         spheres=SampleSpheres(three, samples, _in_half_voxels(distances, grid)),

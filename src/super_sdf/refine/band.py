@@ -2,21 +2,16 @@
 
 Everything here is in index space with values in half voxels: a voxel has side 2, a distance of
 one spacing h is 2, and the band is ``abs(value) < 3`` (Eqs. 2 and 4).
-
-A sample of the band is taken as an exact distance if it contradicts no neighbour, is near the
-surface, and was not cut off. If too many contradict others, the field is noisy, and none is.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import TypeAlias
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
-from ..errors import GridError
 from ..grid.sdf_grid import SdfGrid
 from ..threads import chunks_of
 
@@ -35,8 +30,9 @@ MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
 # Planes are worked on in blocks of about this many samples, but of a few planes at least, since a
 # block also reads one plane more on either side.
 BLOCK_SAMPLES, BLOCK_PLANES = 1 << 18, 4
-# The largest difference between a voxel's sample and that at each place of its patch, (27,).
-MAX_STEP = 2 + LIPSCHITZ_SLACK  # between neighbours along an axis
+# The largest difference between neighbours along an axis, and between a voxel's sample and that at
+# each place of its patch, (27,).
+MAX_STEP = 2 + LIPSCHITZ_SLACK
 MAX_DIFFERENCE = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
 
 
@@ -77,24 +73,19 @@ def is_active(rescaled: FloatArray) -> BoolArray:
     """
     above, below = rescaled >= HALF_BAND, rescaled <= -HALF_BAND
     active = ~(above | below)
-    corners = above.view(np.uint8) | below.view(np.uint8) << 1
-    for axis in range(3):  # of a cell
-        lines = np.moveaxis(corners, axis, 0)
-        corners = np.moveaxis(lines[1:] | lines[:-1], 0, axis)
-    if (corners == 3).any():
-        active |= (above & _dilate(below)) | (below & _dilate(above))
-    return active
-
-
-def _dilate(mask: BoolArray) -> BoolArray:
-    """Return a mask grown by one voxel in all 26 directions."""
-    grown = mask.copy()
+    sides = above.view(np.uint8) | below.view(np.uint8) << 1  # of samples, then of edges ... cells
     for axis in range(3):
-        source = np.moveaxis(grown.copy(), axis, 0)
-        target = np.moveaxis(grown, axis, 0)
-        target[1:] |= source[:-1]
-        target[:-1] |= source[1:]
-    return grown
+        lines = np.moveaxis(sides, axis, 0)
+        sides = np.moveaxis(lines[1:] | lines[:-1], 0, axis)
+    if (sides == 3).any():
+        for own, other in ((above, below), (below, above)):
+            near = other.copy()  # grown by one voxel in all 26 directions
+            for axis in range(3):
+                source, grown = (np.moveaxis(mask, axis, 0) for mask in (near.copy(), near))
+                grown[1:] |= source[:-1]
+                grown[:-1] |= source[1:]
+            active |= own & near
+    return active
 
 
 def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
@@ -126,9 +117,8 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
     """
     table = np.empty((len(voxel_ijk), 27), np.int32)
     for first, last in plane_blocks(shape):
-        start, low, high, stop = np.searchsorted(
-            voxel_ijk[:, 0], [first - 1, first, last, last + 1]
-        )
+        ends = [first - 1, first, last, last + 1]
+        start, low, high, stop = np.searchsorted(voxel_ijk[:, 0], ends)
         around = voxel_ijk[start:stop] - np.array([first, 0, 0], np.int32)
         at, steps = _flat_steps(around, shape)
         row_at = np.full((last - first + 2) * (shape[1] + 2) * (shape[2] + 2), -1, np.int32)
@@ -138,14 +128,11 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
     return table
 
 
-def plane_blocks(
-    shape: tuple[int, ...], first: int = 0, last: int | None = None, least: int = BLOCK_PLANES
-) -> Iterator[tuple[int, int]]:
+def plane_blocks(shape: tuple[int, ...], least: int = BLOCK_PLANES) -> Iterator[tuple[int, int]]:
     """Yield (start, stop) of blocks of ``BLOCK_SAMPLES`` samples or of ``least`` planes."""
     step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), least)
-    end = shape[0] if last is None else last
-    for start in range(first, end, step):
-        yield start, min(start + step, end)
+    for start in range(0, shape[0], step):
+        yield start, min(start + step, shape[0])
 
 
 def _flat_steps(voxel_ijk: IntArray, shape: tuple[int, ...]) -> tuple[NDArray[np.int64], list[int]]:
@@ -210,8 +197,9 @@ def exact_samples(
 ) -> BoolArray:
     """Return which samples of a band that is not noisy can be taken as exact distances, (V,) bool.
 
-    A truncated sample is one of the ``limits``, the lowest and the highest sample of the whole
-    band, and has no neighbour towards which the field is as steep as a distance.
+    They contradict no neighbour, are near the surface, and were not cut off: a truncated sample is
+    one of the ``limits``, the lowest and the highest sample of the whole band, and has no neighbour
+    towards which the field is as steep as a distance.
     """
     sample = patches[:, CENTRE]
     exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE)
@@ -222,71 +210,3 @@ def exact_samples(
         slope = np.abs(patches[some] - sample[some, None]) / np.maximum(MAX_DIFFERENCE, 1)
         exact[some] = slope.max(1) >= MIN_SLOPE
     return exact
-
-
-# Distances must reach far enough beyond an offset, in half voxels, where they are truncated, and
-# where fill values begin: a surface too near these would come out in loose pieces. Neighbouring
-# samples of noisy distances differ by up to twice the spacing (4 half voxels); a distance and a
-# fill value differ by more, a jump. A small share of jumps is tolerated as outliers.
-CUT_OFF_MARGIN, FILL_MARGIN = HALF_BAND, 5.0
-MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
-# Tolerances in half voxels, so that the offset that the message suggests works: for rounding, and
-# because no sample lies exactly where fill values begin.
-ROUNDING, UNSAMPLED = 1e-3, 0.1
-
-Jumps: TypeAlias = tuple[int, int, float]
-"""Of the samples near an offset: how many jump to a neighbour, how many there are, and the farthest
-with a jump, in half voxels from the offset."""
-
-
-def find_jumps(rescaled: FloatArray, own: slice) -> Jumps:
-    """Return the jumps upwards in planes (n, ny, nz), in half voxels.
-
-    Samples are counted in planes ``own``; those beside them only show whether there is a jump.
-    """
-    jumps = np.zeros(rescaled.shape, bool)
-    for axis in range(3):
-        values, found = np.moveaxis(rescaled, axis, 0), np.moveaxis(jumps, axis, 0)
-        step = values[1:] - values[:-1]
-        found[:-1] |= step > MIN_JUMP
-        found[1:] |= step < -MIN_JUMP
-    near = np.abs(rescaled[own]) < PATCH_LIMIT
-    found = jumps[own] & near
-    return int(found.sum()), int(near.sum()), float(rescaled[own][found].max(initial=-np.inf))
-
-
-def check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> None:
-    """Raise GridError if the distances are truncated within 1.5 voxels of an offset.
-
-    ``patches`` (V, 27) are of the band there. A distance never equals all its neighbours.
-    """
-    centre = patches[:, CENTRE]
-    cut_off = (patches == centre[:, None]).all(1) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
-    if cut_off.any():
-        end = offset + float(centre[cut_off][0]) * voxel_size / 2
-        raise _too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
-
-
-def check_not_filled(
-    up: Sequence[Jumps], down: Sequence[Jumps], offset: float, voxel_size: float
-) -> None:
-    """Raise GridError if fill values begin within 2.5 voxels of an offset, by all jumps."""
-    for side, parts in ((1, up), (-1, down)):
-        counts, near, ends = zip(*parts)
-        jumps_enough = sum(counts) > MAX_JUMP_SHARE * sum(near)
-        if jumps_enough and max(ends) < FILL_MARGIN - UNSAMPLED:
-            end = offset + side * max(ends) * voxel_size / 2
-            raise _too_near(offset, voxel_size, end, FILL_MARGIN, outwards=side > 0)
-
-
-def _too_near(
-    offset: float, voxel_size: float, end: float, needed: float, *, outwards: bool
-) -> GridError:
-    """Return the error for distances that end (world units) within ``needed`` half voxels."""
-    room = needed / 2 * voxel_size
-    limit, which = (end - room, "largest") if outwards else (end + room, "smallest")
-    works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"
-    return GridError(
-        f"offset {offset:g} needs distances {needed / 2:g} spacings ({room:.6g}) to either side "
-        f"of it, but they end at {end:.6g}: {works}"
-    )

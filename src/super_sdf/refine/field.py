@@ -1,13 +1,10 @@
 """The fine field near the surface: blocks of nodes, never a dense array.
 
-``FineLattice`` is the whole fine lattice, whose planes are made when needed. Away from the blocks
-its values are the coarse samples interpolated trilinearly (extrapolated in the half voxel beyond
-the outermost ones), with the sign of the sample whose voxel the node lies in.
+``FineLattice`` is the whole fine lattice, whose planes are made when they are needed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -34,7 +31,6 @@ from .nodes import (
 )
 
 COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "pinned_nodes")
-AT_ONCE = 1 << 20  # values of the lattice at a time, but at least a plane
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +79,7 @@ class FineField:
     offset : float
         The distance from the solid, in world units, of the surface at which the values are 0.
     spheres : SampleSpheres, optional
-        The exact samples near the surface, for a mesher that leans on them.
+        The exact samples near the surface, by which the mesher "sharp" places vertices.
     leaves : bool
         Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
         that crosses the border all the same is closed there.
@@ -114,11 +110,9 @@ class FineField:
     counts: dict[str, int] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        shape = " x ".join(map(str, self.shape))
-        return (
-            f"FineField(factor {self.factor}, {self.parts.count_nodes(self.factor):,} nodes of "
-            f"{len(self.voxel_ijk):,} voxels of {shape})"
-        )
+        shape, nodes = " x ".join(map(str, self.shape)), self.parts.count_nodes(self.factor)
+        voxels = f"{len(self.voxel_ijk):,} voxels of {shape}"
+        return f"FineField(factor {self.factor}, {nodes:,} nodes of {voxels})"
 
     @cached_property
     def numbers(self) -> IntArray:
@@ -195,15 +189,6 @@ class FineField:
         """Return the indices of the nodes of voxels' blocks in the fine lattice, (m, Q, 3)."""
         return self.factor * self.voxel_ijk[rows][:, None] + block_ijk(self.factor)
 
-    def rows(self, first: int, last: int) -> slice:
-        """Return the rows of the voxels in planes ``first`` to before ``last``."""
-        return slice(*np.searchsorted(self._plane, np.array([first, last], np.int32)).tolist())
-
-    @cached_property
-    def _plane(self) -> IntArray:
-        """The plane of each voxel, (D,), in one piece."""
-        return np.ascontiguousarray(self.voxel_ijk[:, 0])
-
 
 def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> bool:
     """Return whether the surface crosses the border of the grid.
@@ -228,37 +213,31 @@ def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> b
 class FineLattice(SamplePlanes):
     """The values at all nodes of the fine lattice, in world units, negative inside.
 
-    Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``. The field has the coarse grid
-    that it was made from.
+    Node (i, j, k) is at the coarse index ``(i, j, k) / K - 1/2``. Away from the blocks the coarse
+    samples are interpolated trilinearly, and extrapolated in the half voxel beyond the outermost
+    ones; a node there has the sign of the sample in whose voxel it lies.
     """
 
     dtype = np.dtype(np.float32)
+    name = "the refined field"
 
     def __init__(self, field: FineField) -> None:
-        self.field = field
+        self.field, self.beside = field, field.factor
         self.shape = lattice_shape(field.shape, field.factor)
-        self.name = "the refined field"
 
     def read(self, first: int, last: int) -> FloatArray:
         """Return planes ``first`` to before ``last`` of nodes, (last - first, ny, nz) float32."""
-        planes = np.empty((max(last - first, 0), *self.shape[1:]), np.float32)
-        if len(planes):
-            self._interpolate(planes, first)
-            self._set_blocks(planes, first)
-        for plane in planes:  # one by one, to save memory
-            plane[...] = self.field.in_world_units(plane)
-        return planes
-
-    def _interpolate(self, planes: FloatArray, first: int) -> None:
-        """Fill planes of nodes from ``first`` on with interpolated samples, in half voxels."""
-        factor, grid = self.field.factor, self.field.placed
-        across = [_places_of_nodes(0, n, factor, m) for n, m in zip(self.shape, grid.shape)][1:]
-        low, share, nearest = _places_of_nodes(first, first + len(planes), factor, grid.shape[0])
+        field, factor, grid = self.field, self.field.factor, self.field.placed
+        planes = np.empty((last - first, *self.shape[1:]), np.float32)
+        if first == last:
+            return planes
+        low, share, voxel = _places_of_nodes(np.arange(first, last), factor, grid.shape[0])
+        across = [_places_of_nodes(np.arange(self.shape[n]), factor, grid.shape[n]) for n in (1, 2)]
         start = int(low[0])
-        samples = rescale(grid, self.field.offset, start, int(low[-1]) + 2)
-        for plane, before, beyond, voxel in zip(planes, low - start, share, nearest - start):
+        samples = rescale(grid, field.offset, start, int(low[-1]) + 2)
+        for plane, before, beyond, nearest in zip(planes, low - start, share, voxel - start):
             values = samples[before] * (1 - beyond) + samples[before + 1] * beyond
-            outside = samples[voxel] > 0
+            outside = samples[nearest] > 0
             for axis, (lower, upper, inner) in enumerate(across):
                 part = upper[:, None] if axis == 0 else upper
                 refined = values.take(lower, axis) * (1 - part)
@@ -268,43 +247,32 @@ class FineLattice(SamplePlanes):
             np.maximum(plane, BARELY_OUTSIDE, out=plane, where=outside)
             np.minimum(plane, BARELY_INSIDE, out=plane, where=~outside)
 
-    def _set_blocks(self, planes: FloatArray, first: int) -> None:
-        """Write the refined values over the planes of nodes from ``first`` on."""
-        field, factor = self.field, self.field.factor
-        side = factor + 1
-        rows = field.rows((first - 1) // factor, (first + len(planes) - 1) // factor + 1)
-        at = factor * field.voxel_ijk[rows].astype(np.int64)
-        blocks = field.blocks[:, rows].reshape(side, side * side, -1)
-        _, ny, nz = self.shape
+        ends = (first - 1) // factor, (last - 1) // factor + 1  # of the voxels with nodes there
+        rows = slice(*np.searchsorted(field.voxel_ijk[:, 0], ends).tolist())
+        i, j, k = factor * field.voxel_ijk[rows].T.astype(np.int64)
+        side, (_, ny, nz) = factor + 1, self.shape
         face = (np.arange(side)[:, None] * nz + np.arange(side)).ravel()
         flat = planes.reshape(-1)
-        for layer, values in enumerate(blocks):
-            plane = at[:, 0] + layer - first
-            here = np.flatnonzero((plane >= 0) & (plane < len(planes)))
-            corner = (plane[here] * ny + at[here, 1]) * nz + at[here, 2]
+        for layer, values in enumerate(field.blocks[:, rows].reshape(side, side * side, -1)):
+            at = i + layer - first
+            here = np.flatnonzero((at >= 0) & (at < len(planes)))
+            corner = (at[here] * ny + j[here]) * nz + k[here]
             flat[corner + face[:, None]] = values[:, here]
-
-
-def lattice_planes(field: FineField) -> Iterator[tuple[int, FloatArray]]:
-    """Yield blocks of planes of the fine lattice, and the number of the first of each."""
-    lattice = FineLattice(field)
-    step = max(AT_ONCE // (lattice.shape[1] * lattice.shape[2]), 1)
-    for start in range(0, lattice.shape[0], step):
-        yield start, lattice.read(start, min(start + step, lattice.shape[0]))
+        scale = grid.voxel_size / 2
+        return np.multiply(planes, scale, out=planes, dtype=np.float64, casting="same_kind")
 
 
 def _places_of_nodes(
-    first: int, last: int, factor: int, samples: int
+    node: NDArray[np.int64], factor: int, samples: int
 ) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
     """Return for nodes of an axis the sample before each, how far beyond it, and its voxel.
 
     That is 0 to 1 spacing, or -1/2 to 3/2 in the half voxels beyond the outermost samples. A node
     on a face lies in the second voxel.
     """
-    place = np.arange(first, last) / factor - 0.5
+    place = node / factor - 0.5
     low = np.clip(np.floor(place), 0, samples - 2).astype(np.int64)
-    voxel = np.minimum(np.arange(first, last) // factor, samples - 1)
-    return low, (place - low).astype(np.float32), voxel
+    return low, (place - low).astype(np.float32), np.minimum(node // factor, samples - 1)
 
 
 def lattice_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, int]:
@@ -320,21 +288,16 @@ def fine_grid(field: FineField) -> SdfGrid:
     from the coarse grid away from the surface, when they are needed. They are relative to the
     surface at the field's offset.
     """
-    grid, lattice = field.placed, FineLattice(field)
-    spacing = tuple(along / field.factor for along in grid.spacing)
-    blocks = field.blocks
+    grid, blocks = field.placed, field.blocks
     ends = np.array([blocks.min(initial=np.inf), blocks.max(initial=-np.inf)], np.float32)
     lowest, highest = field.in_world_units(ends).tolist()
-    extremes = min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)
-    origin = grid.to_world([-0.5, -0.5, -0.5])
     kind = Field() if grid.field.kind == "exact" else Field("noisy", True, NONE_EXACT)
-    kind = replace(kind, on_lattice=grid.field.on_lattice)
     return SdfGrid.trusted(
-        lattice,
-        spacing,
-        origin,
+        FineLattice(field),
+        tuple(along / field.factor for along in grid.spacing),
+        grid.to_world([-0.5, -0.5, -0.5]),
         grid.notes,
         direction=grid.direction,
-        extremes=extremes,
-        field=kind,
+        extremes=(min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)),
+        field=replace(kind, on_lattice=grid.field.on_lattice),
     )

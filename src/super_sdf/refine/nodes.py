@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray, Signs
+from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
 from ..threads import check_count, map_threads, worthwhile_threads
 
 # The value of a node of which only the sign is known, and the least of a mask's sample, in half
@@ -66,7 +66,6 @@ def nodes_of_part(factor: int) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(part == number) for number in range(27)]
 
 
-@lru_cache
 def part_sizes(factor: int) -> NDArray[np.int64]:
     """Return the number of nodes of each part, (27,)."""
     return np.array([len(nodes) for nodes in nodes_of_part(factor)])
@@ -86,9 +85,8 @@ class VoxelIndex:
 
     def _key_of(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the number of each voxel, (...,), in C order of the whole grid."""
-        _, rows, columns = self.shape
         i, j, k = (voxel_ijk[..., axis].astype(np.int64) for axis in range(3))
-        return (i * rows + j) * columns + k
+        return (i * self.shape[1] + j) * self.shape[2] + k
 
     def find(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the row of each voxel (..., 3), -1 if it is not in the list, (...,)."""
@@ -100,13 +98,6 @@ class VoxelIndex:
         return np.where(in_grid & (self.keys[at] == wanted), at, -1)
 
 
-def rows_among(voxels: IntArray, count: int) -> IntArray:
-    """Return the row in ``voxels`` of each of ``count`` voxels, or -1; one more -1 at the end."""
-    row_of = np.full(count + 1, -1, np.int32)
-    row_of[voxels] = np.arange(len(voxels), dtype=np.int32)
-    return row_of
-
-
 @dataclass(frozen=True, eq=False)
 class SharedParts:
     """Which voxels share the parts of their blocks."""
@@ -114,14 +105,10 @@ class SharedParts:
     table: IntArray  # (27, D), neighbour table of the D voxels, -1 where there is no neighbour
     owner: NDArray[np.int8]  # (27, D), of each part, as a place: ``CENTRE`` is the voxel itself
 
-    def owned(self, rows: slice | BoolArray = slice(None)) -> BoolArray:
-        """Return which parts voxels own, (27, n) bool."""
-        own: BoolArray = self.owner[:, rows] == CENTRE
-        return own
-
     def count_nodes(self, factor: int, rows: slice | BoolArray = slice(None)) -> int:
         """Return the number of nodes that voxels own."""
-        return int(np.count_nonzero(self.owned(rows), axis=1) @ part_sizes(factor))
+        owned = self.owner[:, rows] == CENTRE
+        return int(np.count_nonzero(owned, axis=1) @ part_sizes(factor))
 
 
 def share_parts(table: IntArray) -> SharedParts:
@@ -141,7 +128,7 @@ def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray
     They come in the order of the voxels that own them; ``sizes``, (27,), are the nodes per part.
     OptionError if there are more nodes than 32-bit numbers.
     """
-    owned = parts.owned()
+    owned = parts.owner == CENTRE
     count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
     starts = np.cumsum(owned * sizes[:, None].astype(np.int32), axis=0, dtype=np.int32)
     before = np.cumsum(starts[-1], dtype=np.int32) - starts[-1]  # of earlier voxels
@@ -167,48 +154,28 @@ def average_shared(
     and in double precision (in single for two numbers, whose sum does not depend on the order), so
     that all copies get the same bits and the result does not depend on how the work was divided.
     """
-    groups = [axes for axes in product((False, True), repeat=3) if any(axes)]
-    threads = worthwhile_threads(blocks.size, threads)
     some = slice(0, blocks.shape[1] - 1) if rows is None else rows
-    map_threads(lambda axes: _average_group(blocks, parts, factor, axes, some), groups, threads)
 
+    def average(axes: tuple[bool, ...]) -> None:
+        """Average the nodes at the block's ends along ``axes`` and inside along the others."""
+        places, nodes_at = _nodes_of_group(factor, axes)
+        kind = np.float32 if len(places) == 2 else np.float64
+        means = []
+        for own in places:
+            total: NDArray[Any] = np.zeros((len(nodes_at[0]), len(parts.table[0, some])), kind)
+            times: NDArray[Any] = np.zeros(total.shape[1], kind)
+            for other, nodes in zip(places, nodes_at):
+                voxel = parts.table[CENTRE + int((own - other) @ STRIDES), some].astype(np.intp)
+                times += voxel >= 0
+                for row, node in enumerate(nodes):
+                    total[row] += blocks[node, some] if other is own else blocks[node].take(voxel)
+            means.append((total / times).astype(np.float32))
+        for nodes, mean in zip(nodes_at, means):
+            for node, values in zip(nodes, mean):
+                blocks[node, some] = values
 
-def copies_agree(blocks: FloatArray, parts: SharedParts, factor: int) -> bool:
-    """Return whether all copies of each shared node, (Q, D) values by block, are equal."""
-    nodes = nodes_of_part(factor)
-    for part, owners in enumerate(parts.owner):
-        for place in np.unique(owners[owners != CENTRE]):
-            rows = np.flatnonzero(owners == place)
-            there = parts.table[place].take(rows)
-            for own, other in zip(nodes[part], nodes[seen_from(part, place)]):
-                if (blocks[own].take(rows) != blocks[other].take(there)).any():
-                    return False
-    return True
-
-
-def _average_group(
-    blocks: FloatArray,
-    parts: SharedParts,
-    factor: int,
-    axes: tuple[bool, ...],
-    rows: slice | NDArray[np.intp],
-) -> None:
-    """Average the nodes at the block's ends along ``axes`` and inside along the other axes."""
-    places, nodes_at = _nodes_of_group(factor, axes)
-    kind = np.float32 if len(places) == 2 else np.float64
-    means = []
-    for own in places:
-        total: NDArray[Any] = np.zeros((len(nodes_at[0]), len(parts.table[0, rows])), kind)
-        times: NDArray[Any] = np.zeros(total.shape[1], kind)
-        for other, nodes in zip(places, nodes_at):
-            voxel = parts.table[CENTRE + int((own - other) @ STRIDES), rows].astype(np.intp)
-            times += voxel >= 0
-            for row, node in enumerate(nodes):
-                total[row] += blocks[node, rows] if other is own else blocks[node].take(voxel)
-        means.append((total / times).astype(np.float32))
-    for nodes, mean in zip(nodes_at, means):
-        for node, values in zip(nodes, mean):
-            blocks[node, rows] = values
+    groups = [axes for axes in product((False, True), repeat=3) if any(axes)]
+    map_threads(average, groups, worthwhile_threads(blocks.size, threads))
 
 
 @lru_cache
@@ -245,41 +212,37 @@ def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: Int
     blocks[:, wrong] += pyramid[:, None] * (sign * missing)[wrong]
 
 
-def signs_of_skipped(
+def pin_to_skipped(
+    blocks: FloatArray,
     parts: SharedParts,
+    factor: int,
     voxel_ijk: IntArray,
     patches: FloatArray,
     voxels: IntArray,
     shape: tuple[int, int, int],
-) -> Signs:
-    """Return the signs of the neighbours (27, D) of decoded voxels that were not decoded.
-
-    It is 1 outside, -1 inside, 0 for the others. The decoded voxels (D, 3) are the rows ``voxels``
-    of the band, with the samples ``patches`` (V, 27).
-    """
-    signs = np.zeros(parts.table.shape, np.int8)
-    inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
-    for place, step in enumerate(NEIGHBOURHOOD):
-        skipped = parts.table[place] < 0
-        for axis in np.flatnonzero(step):
-            skipped &= inner[axis][int(step[axis] > 0)]
-        rows = np.flatnonzero(skipped)
-        signs[place][rows] = np.where(patches[voxels.take(rows), place] > 0, 1, -1)
-    return signs
-
-
-def pin_to_skipped(blocks: FloatArray, parts: SharedParts, factor: int, skipped: Signs) -> int:
+) -> int:
     """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
 
-    A skipped voxel holds no surface, so all its nodes have its sign. Once they do, no sign change
-    reaches the boundary of the decoded voxels, and the isosurface has no hole there. Returned is
-    how many nodes were changed.
+    A skipped voxel was not decoded, so it holds no surface, and all its nodes have the sign of its
+    sample. Once they do, no sign change reaches the boundary of the decoded voxels, and the
+    isosurface has no hole there. The decoded voxels (D, 3) are the rows ``voxels`` of the band,
+    with the samples ``patches`` (V, 27). Returned is how many nodes were changed.
     """
+    # the sign of each neighbour, 0 of decoded ones
+    skipped: NDArray[np.int8] = np.zeros(parts.table.shape, np.int8)
+    inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
+    for place, step in enumerate(NEIGHBOURHOOD.tolist()):
+        is_skipped = parts.table[place] < 0
+        for along, way in zip(inner, step):
+            if way:
+                is_skipped &= along[way > 0]
+        at = np.flatnonzero(is_skipped)
+        skipped[place, at] = np.where(patches[voxels.take(at), place] > 0, 1, -1)
     changed = 0
     for part, nodes in enumerate(nodes_of_part(factor)):
         sign = np.zeros(skipped.shape[1], np.int8)
-        for place in SHARING[part]:
-            np.copyto(sign, skipped[place], where=skipped[place] != 0)
+        for signs in skipped[SHARING[part]]:
+            np.copyto(sign, signs, where=signs != 0)
         known, outside = sign != 0, sign > 0
         for node in nodes:
             wrong = known & ((blocks[node] > 0) != outside)

@@ -10,7 +10,7 @@ out, so that the bits of a result do not depend on how the grid was cut.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
 from ..grid.derived import local_slopes
-from ..grid.samples import SampleArray, in_spacings
+from ..grid.field import Field
+from ..grid.samples import cropped, in_spacings
 from ..network.decoder import Adapter, decode
-from .band import plane_blocks
+from ..threads import chunks_of
 from .nodes import block_offsets
 from .survey import Band
 
@@ -28,7 +29,7 @@ AT_ONCE = 500_000  # voxels that the network sees at a time, about: they take 1.
 POLE = 3**0.5 - 2
 TAIL = 12  # samples after which the prefilter has fallen to 1e-7
 BEYOND = TAIL + 2  # samples to either side on which the spline in a voxel depends
-STRIP_SAMPLES = 1 << 20  # worked on at a time: they take 60 bytes each
+CUBE = 64  # voxels along the edge of a cube that is worked on at a time
 SIDE = 5  # coefficients along an axis on which the spline within half a voxel of a sample depends
 # Sums of fourth differences, in voxels, up to which a field is smooth, and from which it is not.
 SMOOTH, KINKED = 0.6, 1.3
@@ -55,7 +56,7 @@ def predict(
     if parts == 1 or network.receptive_field is None:
         return decode(network, (band.patches, table, voxels), offsets, threads)
     blocks = np.zeros((len(offsets), len(voxels) + 1), np.float32)
-    ends = [-1, *plane[np.arange(1, parts) * count // parts].tolist(), band.shape[0]]
+    ends = [-1, *plane[np.arange(1, parts) * count // parts].tolist(), band.grid.shape[0]]
     for first, last in pairwise(sorted(set(ends))):  # the planes after the first, to the last
         reach = network.receptive_field
         start, stop = np.searchsorted(plane, [first + 1 - reach, last + 1 + reach])
@@ -67,7 +68,7 @@ def predict(
         inputs = band.patches[start:stop], near, voxels[own] - np.int32(start)
         blocks[:, own] = decode(network, inputs, offsets, threads)[:, :-1]
         if progress:
-            progress(last / band.shape[0])
+            progress(last / band.grid.shape[0])
     return blocks
 
 
@@ -83,63 +84,47 @@ def interpolate(
 
     Of a field that is far from a distance, or was cut off, the network adds nothing.
     """
-    smooth, uneven = band.field.smooth, band.field.is_uneven
-    assert smooth is not None
-    own_ijk = band.voxel_ijk[voxels]
-    blocks, share = spline_blocks(smooth, own_ijk, factor, band.half_voxel, uneven=uneven)
-    blocks[:, :-1] -= np.float32(band.level)
+    grid, unit = band.grid, band.grid.voxel_size / 2
+    blocks, share = spline_blocks(grid.field, band.voxel_ijk[voxels], factor, unit)
+    blocks[:, :-1] -= np.float32(band.offset / unit)
     some = np.flatnonzero(share)
-    if band.field.has_kinks and len(some):
+    if grid.field.has_kinks and len(some):
         added = predict(band, table, voxels[some], network, factor, threads)[:, :-1]
         blocks[:, some] += share[some] * (added - blocks[:, some])
     return blocks
 
 
 def spline_blocks(
-    values: SampleArray, voxel_ijk: IntArray, factor: int, unit: float, *, uneven: bool = False
+    kind: Field, voxel_ijk: IntArray, factor: int, unit: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the cubic spline at the nodes of voxels' blocks, and the network's share there.
 
-    The samples ``values`` are divided by ``unit``; the voxels (D, 3) are in C order. If the slope
-    is ``uneven``, a spline would swing where the samples jump, and nodes are interpolated linearly.
-    The blocks, (Q, D + 1), are those of ``nodes``; the share, (D,), goes from 0 where the field is
-    smooth, or no distance, to 1.
+    The samples ``kind.smooth`` are divided by ``unit``. If their slope is uneven, a spline would
+    swing where they jump, and nodes there are interpolated linearly. The blocks, (Q, D + 1), are
+    those of ``nodes``, of voxels (D, 3); the share, (D,), goes from 0 where the field is smooth, or
+    no distance, to 1.
     """
+    assert kind.smooth is not None
+    samples, shape = kind.smooth, np.array(kind.smooth.shape)
     blocks = np.zeros(((factor + 1) ** 3, len(voxel_ijk) + 1), np.float32)
     share = np.empty(len(voxel_ijk), np.float32)
-    nx = values.shape[0]
-    for first, last in plane_blocks(tuple(values.shape), least=2 * BEYOND):
-        rows = slice(*np.searchsorted(voxel_ijk[:, 0], [first, last]).tolist())
-        if rows.start == rows.stop:
-            continue
-        low, high = max(first - BEYOND, 0), min(last + BEYOND, nx)
-        planes = np.empty((high - low, *values.shape[1:]), np.float32)
-        for i, plane in enumerate(planes, low):  # one by one, to save memory
-            plane[...] = in_spacings(np.asarray(values[i]), unit)
-        ijk = voxel_ijk[rows] - np.array([low, 0, 0], np.int32)
-        for start, stop in _strips(planes.shape):
-            which = np.flatnonzero((ijk[:, 1] >= start) & (ijk[:, 1] < stop))
-            if len(which):
-                around = max(start - BEYOND, 0)
-                strip = planes[:, around : stop + BEYOND]
-                at = ijk[which] - np.array([0, around, 0], np.int32)
-                share[rows][which] = network_share(strip * np.float32(0.5))[tuple(at.T)]
-                found = _evaluate(prefilter(strip), at + 2, node_weights(factor))
-                if uneven:
-                    jumps = (roughness(strip * np.float32(0.5)) - JUMPING) / (JUMPED - JUMPING)
-                    straight = np.pad(strip, 2, mode="reflect", reflect_type="odd")
-                    between = np.clip(1 - _from_samples(factor), 0, None).astype(np.float32)
-                    linear = _evaluate(straight, at + 2, between)
-                    found += np.clip(jumps, 0, 1)[tuple(at.T)] * (linear - found)
-                blocks[:, rows.start + which] = found
+    cube = np.ravel_multi_index(tuple((voxel_ijk // CUBE).T), tuple(shape // CUBE + 1))
+    order = np.argsort(cube, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(cube[order])) + 1) if len(order) else []:
+        ijk = voxel_ijk[rows]
+        low, high = np.maximum(ijk.min(0) - BEYOND, 0), np.minimum(ijk.max(0) + BEYOND + 1, shape)
+        ijk = ijk - low
+        values = np.stack([in_spacings(plane, unit) for plane in cropped(samples, low, high)])
+        rough = roughness(values * np.float32(0.5))
+        share[rows] = network_share(values * np.float32(0.5), rough)[tuple(ijk.T)]
+        found = _evaluate(prefilter(values), ijk + 2, node_weights(factor))
+        if kind.is_uneven:
+            jumps = np.clip((rough[tuple(ijk.T)] - JUMPING) / (JUMPED - JUMPING), 0, 1)
+            straight = np.pad(values, 2, mode="reflect", reflect_type="odd")
+            between = np.clip(1 - _from_samples(factor), 0, None).astype(np.float32)
+            found += jumps * (_evaluate(straight, ijk + 2, between) - found)
+        blocks[:, rows] = found
     return blocks, share
-
-
-def _strips(shape: tuple[int, ...]) -> Iterator[tuple[int, int]]:
-    """Yield (start, stop) of rows of planes that are worked on at a time, to save memory."""
-    size = max(STRIP_SAMPLES // (shape[0] * shape[2]) - 2 * BEYOND, 2 * BEYOND)
-    for start in range(0, shape[1], size):
-        yield start, min(start + size, shape[1])
 
 
 def prefilter(values: FloatArray) -> FloatArray:
@@ -199,10 +184,8 @@ def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float
     step = np.array([coefficients.shape[1] * coefficients.shape[2], coefficients.shape[2], 1])
     around = (np.indices((SIDE,) * 3).reshape(3, -1).T - 2) @ step
     centre = ijk.astype(np.int64) @ step
-    chunk = 4096
-    for start in range(0, len(ijk), chunk):
-        at = centre[start : start + chunk]
-        values = coefficients.ravel().take(around[:, None] + at)
+    for rows in chunks_of(len(ijk), SIDE**3):
+        values = coefficients.ravel().take(around[:, None] + centre[rows])
         block = values.reshape(SIDE, SIDE, SIDE, -1)
         for axis in range(3):
             lines = np.moveaxis(block, axis, 0)
@@ -212,16 +195,16 @@ def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float
                     if share:
                         node += line * share
             block = np.moveaxis(nodes, 0, axis)
-        out[:, start : start + chunk] = block.reshape(len(out), -1)
+        out[:, rows] = block.reshape(len(out), -1)
     return out
 
 
-def network_share(values: FloatArray) -> FloatArray:
+def network_share(values: FloatArray, rough: FloatArray) -> FloatArray:
     """Return the share of the network's values round each sample; ``values`` are in voxels.
 
     It is 0 where the field is smooth, and where its slope is not 1: a network knows distances only.
     """
-    kinked = np.clip((roughness(values) - SMOOTH) / (KINKED - SMOOTH), 0, 1)
+    kinked = np.clip((rough - SMOOTH) / (KINKED - SMOOTH), 0, 1)
     off = np.abs(local_slopes(values) - 1)
     share: FloatArray = (kinked * np.clip(2 - off / WRONG_SLOPE, 0, 1)).astype(np.float32)
     return share

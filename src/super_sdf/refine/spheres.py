@@ -33,6 +33,7 @@ from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntA
 from ..threads import chunks_of, map_chunks
 from .band import MAX_DISTANCE, MIN_SLOPE
 from .nodes import SharedParts, VoxelIndex, nodes_of_part, number_parts
+from .survey import Band
 
 BEYOND = 2.0  # samples this much farther than MAX_DISTANCE have spheres, too
 APART = np.maximum(2 * np.linalg.norm(NEIGHBOURHOOD, axis=1), 1).astype(np.float32)  # of samples
@@ -81,11 +82,10 @@ class Spheres:
 
 
 def _joined(parts: Sequence[Spheres]) -> Spheres:
-    return Spheres(
-        np.concatenate([part.centre for part in parts]),
-        np.concatenate([part.distance for part in parts]),
-        np.concatenate([part.direction for part in parts], 1),
-    )
+    """Return the spheres of all parts."""
+    every = zip(*((part.centre.T, part.distance, part.direction) for part in parts))
+    centre, distance, direction = (np.concatenate(each, -1) for each in every)
+    return Spheres(np.ascontiguousarray(centre.T), distance, direction)
 
 
 def fit_to_spheres(
@@ -117,54 +117,38 @@ def fit_to_spheres(
     blocks[inside[len(inside) // 2], rows[rows >= 0]] = own.distance[rows >= 0]
 
 
-def spheres_of_band(
-    voxel_ijk: IntArray,
-    patches: FloatArray,
-    exact: NDArray[np.signedinteger],
-    shape: tuple[int, int, int],
-    limits: tuple[float, float],
-    threads: int = 1,
-) -> Spheres:
+def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
     """Return the spheres of the exact samples of a band, then of those a voxel beyond.
 
-    The band has voxels (V, 3), in C order, and their patches (V, 27); in the rows ``exact`` the own
-    sample is exact. Samples beyond have no sphere unless they lie between ``limits``.
+    Samples beyond have no sphere unless they lie between the band's limits. Of each, the direction
+    is that of the exact sample beside it from which it rises most steeply, about by 1 along the
+    gradient; one that was cut off does not rise as distances do.
     """
+    exact, shape, (low, high) = np.flatnonzero(band.exact), band.grid.shape, band.limits
 
     def gather(rows: slice) -> tuple[Spheres, Spheres, FloatArray]:
-        patch = patches[exact[rows]]
+        patch = band.patches[exact[rows]]  # (n, 27)
         gradient = _unit((patch[:, CENTRE + STRIDES] - patch[:, CENTRE - STRIDES]).T)
-        own = Spheres(voxel_ijk[exact[rows]], patch[:, CENTRE].copy(), gradient)
-        return own, *_spheres_beyond(own, patch, shape, limits)
+        own = Spheres(band.voxel_ijk[exact[rows]], patch[:, CENTRE].copy(), gradient)
+        size, sign = np.abs(patch), np.copysign(np.float32(1), own.distance)
+        slope = (sign[:, None] * patch - np.abs(own.distance)[:, None]) / APART
+        found = np.asarray((size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND))
+        found &= (slope >= MIN_SLOPE) & (patch > low) & (patch < high)
+        row, step = np.nonzero(found)
+        centre = own.centre[row] + NEIGHBOURHOOD[step]
+        in_grid = ((centre >= 0) & (centre < shape)).all(1)
+        row, step = row[in_grid], step[in_grid]
+        beyond = Spheres(centre[in_grid], patch[row, step], own.direction[:, row])
+        return own, beyond, slope[row, step]
 
     parts = map_chunks(gather, len(exact), 4 * TEMPORARIES, threads)
     if not parts:
-        return Spheres(voxel_ijk[:0], patches[:0, 0], patches[:0, :3].T)
+        return Spheres(band.voxel_ijk[:0], band.patches[:0, 0], band.patches[:0, :3].T)
     own, others, slope = zip(*parts)
     beyond = _joined(others)
     keys = VoxelIndex(beyond.centre, shape).keys
     order = np.lexsort((-np.concatenate(slope), keys))  # of equal samples the steepest
     return _joined([*own, beyond.some(order[np.diff(keys[order], prepend=-1) > 0])])
-
-
-def _spheres_beyond(
-    own: Spheres, patch: FloatArray, shape: tuple[int, int, int], limits: tuple[float, float]
-) -> tuple[Spheres, FloatArray]:
-    """Return those of the samples around, ``patch`` (n, 27), that are farther than exact ones.
-
-    Also returned is how steeply each rises from the exact sample, about 1 along the gradient. One
-    that was cut off does not rise as distances do, or is at a limit.
-    """
-    sign = np.copysign(np.float32(1), own.distance)
-    slope = (sign[:, None] * patch - np.abs(own.distance)[:, None]) / APART
-    size = np.abs(patch)
-    found = np.asarray((size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND))
-    found &= (slope >= MIN_SLOPE) & (patch > limits[0]) & (patch < limits[1])
-    row, step = np.nonzero(found)
-    centre = own.centre[row] + NEIGHBOURHOOD[step]
-    in_grid = np.flatnonzero(((centre >= 0) & (centre < shape)).all(1))
-    row, step = row[in_grid], step[in_grid]
-    return Spheres(centre[in_grid], patch[row, step], own.direction[:, row]), slope[row, step]
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,41 +1,50 @@
-"""The band of a grid, found in one pass over its planes: all that the steps need of the input."""
+"""The band of a grid, found in one pass over its planes: all that the steps need of the input.
+
+A sample of the band is taken as an exact distance if it contradicts no neighbour, is near the
+surface, and was not cut off. If too many contradict others, the field is noisy, and none is.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import CENTRE, BoolArray, FloatArray, IntArray
-from ..errors import NoSurfaceError
-from ..grid.field import Field
+from ..errors import GridError, NoSurfaceError
 from ..grid.samples import let_go, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
 from ..threads import over_threads
 from .band import (
-    Jumps,
+    HALF_BAND,
+    PATCH_LIMIT,
     can_hold_surface,
-    check_not_cut_off,
-    check_not_filled,
     exact_samples,
-    find_jumps,
     gather_patches,
     has_both_sides,
     is_active,
     is_filled_in,
     is_lipschitz,
-    neighbour_table,
     plane_blocks,
     rescale,
 )
-from .bounds import TrustedSamples, samples_beyond
+from .bounds import FARTHEST, TrustedSamples
 
 MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
 FAR = 1e30  # half voxels: no sample of the band is there
 CELLS = 64  # along the longest axis, of the counts by which a large grid is cut
+# Distances must reach far enough beyond an offset, in half voxels, where they are truncated, and
+# where fill values begin: a surface too near these would come out in loose pieces. Neighbouring
+# samples of noisy distances differ by up to twice the spacing (4 half voxels); a distance and a
+# fill value differ by more, a jump. A small share of jumps is tolerated as outliers.
+CUT_OFF_MARGIN, FILL_MARGIN = HALF_BAND, 5.0
+MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
+# Tolerances in half voxels, so that the offset that the message suggests works: for rounding, and
+# because no sample lies exactly where fill values begin.
+ROUNDING, UNSAMPLED = 1e-3, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +55,10 @@ class BandSummary:
     noisy: int  # those of them round which samples differ by more than distances can
     low: float  # the lowest and the highest sample, in half voxels
     high: float
-    leaves: bool  # whether a sample on the border of the grid is inside
-    cells: NDArray[np.int64]  # (a, b, c), voxels of the band in cubes of ``side`` samples
-    side: int
+    leaves: bool  # whether a sample on the border of the grid is inside: the solid leaves it
+    # (a, b, c), voxels of the band in cubes of ``side`` samples; of a band that is kept, none
+    cells: NDArray[np.int64]
+    side: int = 1
 
     @property
     def is_noisy(self) -> bool:
@@ -64,43 +74,31 @@ class BandTooLargeError(Exception):
 class Band:
     """The active voxels of a grid (Eq. 2), their samples, and what these can be used for."""
 
-    shape: tuple[int, int, int]  # samples of the grid along each axis
+    grid: SdfGrid
+    offset: float  # world units: at this distance is the surface
     voxel_ijk: IntArray  # (V, 3), the voxels, in C order
     patches: FloatArray  # (V, 27), the samples round each voxel, in half voxels
     lipschitz: BoolArray  # (V,), which patches can be distances
+    sampled: BoolArray  # (V,), which own values are samples, not interpolated by resampling
     decoded: BoolArray  # (V,), which voxels can hold the surface, and so are decoded
     exact: BoolArray  # (V,), which own samples can be taken as exact distances
     # samples beyond the band may be exact distances if they lie between these, in half voxels
     limits: tuple[float, float]
     trusted: TrustedSamples  # the samples whose spheres can be trusted, in the band and beyond
-    # (V,), which own values are samples of a grid that was resampled; None if all are
-    sampled: BoolArray | None = None
-    # whether a sample on the border of the grid is inside: then the solid leaves the grid
-    leaves: bool = False
-    field: Field = field(default_factory=Field)  # what the values are
-    half_voxel: float = 1.0  # half a spacing in world units, by which the values are divided
-    level: float = 0.0  # what is zero then
+    leaves: bool
 
     def count_noisy(self) -> int:
         """Count the voxels whose own samples differ from others by more than distances can."""
-        noisy = ~self.lipschitz if self.sampled is None else ~self.lipschitz & self.sampled
-        return int(np.count_nonzero(noisy))
-
-    def network_inputs(self) -> tuple[FloatArray, IntArray, IntArray]:
-        """Return the network's inputs: patches, neighbour table, and rows of decoded voxels."""
-        table = neighbour_table(self.voxel_ijk, self.shape)
-        return self.patches, table, np.flatnonzero(self.decoded).astype(np.int32)
+        return int(np.count_nonzero(~self.lipschitz & self.sampled))
 
 
 class _Block(NamedTuple):
     """What is found in some planes of a grid."""
 
-    voxel_ijk: IntArray  # of the band
-    patches: FloatArray
-    number: NDArray[np.int64]  # of samples beyond the band that can be exact, in C order ...
-    value: FloatArray  # ... and their values
-    leaves: bool  # whether a sample on the grid's border is inside
-    jumps: tuple[Jumps, Jumps] | None  # up and down, with an offset
+    rows: tuple[IntArray, FloatArray, BoolArray, BoolArray, BoolArray]  # as in ``Band``
+    beyond: tuple[NDArray[np.int64], FloatArray]  # numbers and values of samples there
+    summary: BandSummary  # of these planes
+    jumps: NDArray[np.float64] | None  # with an offset, see ``_count_jumps``
 
 
 def survey(
@@ -116,67 +114,59 @@ def survey(
     With ``whole`` the grid is a part of another one, of which that is the summary.
     BandTooLargeError is raised as soon as there are more than ``most`` voxels.
     """
+    # the samples of the field, and those beyond the band, that can be exact lie between these
+    low, high = ((limit - offset) * 2 / grid.voxel_size for limit in grid.field.exact)
+    limits = 0.0, 0.0  # what is interpolated beyond the band promises little
+    if grid.on_sample is None:
+        scale = 2 / grid.voxel_size
+        ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
+        lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
+        limits = max(low, lowest), min(high, highest)
     blocks, count = list[_Block](), 0
-    for block in _blocks(grid, offset, threads, is_checked=whole is None):
+    for block in _blocks(grid, offset, threads, limits, is_checked=whole is None):
         blocks.append(block)
-        count += len(block.voxel_ijk)
+        count += len(block.rows[0])
         if count > most:
             raise BandTooLargeError
-    if offset and whole is None:
-        _check_offset([block.jumps for block in blocks if block.jumps], grid, offset)
-    leaves = any(block.leaves for block in blocks) if whole is None else whole.leaves
-    voxel_ijk, patches = (np.concatenate([block[n] for block in blocks]) for n in (0, 1))
-    number, value = (np.concatenate([block[n] for block in blocks]) for n in (2, 3))
-    del blocks, block
-    lipschitz, sampled = _tell_noise(grid, voxel_ijk, patches)
     if whole is None:
-        whole = _summary(patches, lipschitz if sampled is None else lipschitz[sampled], leaves)
+        _check_offset([block.jumps for block in blocks], grid, offset)
+        whole = _together([block.summary for block in blocks])
+    number, value = (np.concatenate(each) for each in zip(*(block.beyond for block in blocks)))
+    every = zip(*(block.rows for block in blocks))
+    del blocks, block
+    voxel_ijk, patches, lipschitz, sampled, decoded = map(np.concatenate, every)
     sample, exact = patches[:, CENTRE], np.zeros(len(patches), bool)
     if not whole.is_noisy:
-        low, high = _exact_between(grid, offset)
         exact = exact_samples(patches, lipschitz, (whole.low, whole.high))
         exact &= (sample > low) & (sample < high)
-    limits = limits_beyond(grid, offset)
-    return Band(
-        grid.shape,
-        voxel_ijk,
-        patches,
-        lipschitz,
-        _is_decoded(grid.field, patches, lipschitz),
-        exact,
-        limits,
-        TrustedSamples.of(grid.shape, voxel_ijk[exact], sample[exact], number, value, limits),
-        sampled,
-        leaves,
-        grid.field,
-        grid.voxel_size / 2,
-        offset * 2 / grid.voxel_size,
-    )
+    if exact.any() and sees_beyond(limits):  # all trusted samples, in the order of their numbers
+        number = np.append(np.ravel_multi_index(tuple(voxel_ijk[exact].T), grid.shape), number)
+        order = np.argsort(number, kind="stable")
+        number, value = number[order], np.append(sample[exact], value)[order]
+    else:
+        number, value = number[:0], value[:0]
+    trusted = TrustedSamples(grid.shape, number, value)
+    rows = voxel_ijk, patches, lipschitz, sampled, decoded
+    return Band(grid, offset, *rows, exact, limits, trusted, whole.leaves)
 
 
 def summarise(grid: SdfGrid, offset: float = 0.0, threads: int = 1) -> BandSummary:
     """Return what the band of a cubic grid says, without keeping it; the grid is read once."""
     side = -(-max(grid.shape) // CELLS)
     cells = np.zeros([-(-n // side) for n in grid.shape], np.int64)
-    jumps, parts = list[tuple[Jumps, Jumps]](), list[BandSummary]()
+    jumps, parts = [], []
     for block in _blocks(grid, offset, threads):
-        lipschitz, sampled = _tell_noise(grid, block.voxel_ijk, block.patches)
-        told = lipschitz if sampled is None else lipschitz[sampled]
-        parts.append(_summary(block.patches, told, block.leaves))
-        place = np.ravel_multi_index(tuple((block.voxel_ijk // side).T), cells.shape)
+        place = np.ravel_multi_index(tuple((block.rows[0] // side).T), cells.shape)
         cells += np.bincount(place, minlength=cells.size).reshape(cells.shape)
-        jumps += [block.jumps] if block.jumps else []
-    if offset:
-        _check_offset(jumps, grid, offset)
-    return BandSummary(
-        sum(part.told for part in parts),
-        sum(part.noisy for part in parts),
-        min(part.low for part in parts),
-        max(part.high for part in parts),
-        any(part.leaves for part in parts),
-        cells,
-        side,
-    )
+        jumps.append(block.jumps)
+        parts.append(block.summary)
+    _check_offset(jumps, grid, offset)
+    return replace(_together(parts), cells=cells, side=side)
+
+
+def sees_beyond(limits: tuple[float, float]) -> bool:
+    """Return whether samples beyond the band can be exact: the same for all parts of a grid."""
+    return limits[0] < -HALF_BAND or limits[1] > HALF_BAND
 
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
@@ -186,111 +176,141 @@ def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     )
 
 
-def limits_beyond(grid: SdfGrid, offset: float) -> tuple[float, float]:
-    """Return between which samples those beyond the band can be exact, see ``Band.limits``."""
-    if grid.on_sample is not None:  # what is interpolated there promises little
-        return 0.0, 0.0
-    low, high = _exact_between(grid, offset)
-    scale = 2 / grid.voxel_size
-    ends = np.clip([grid.low - offset, grid.high - offset], -FAR / scale, FAR / scale) * scale
-    lowest, highest = map(float, ends.astype(np.float32))  # where it may be cut off
-    return max(low, lowest), min(high, highest)
+def _together(parts: list[BandSummary]) -> BandSummary:
+    """Return the summary of planes of which these are the summaries."""
+    told, noisy = sum(part.told for part in parts), sum(part.noisy for part in parts)
+    low, high = min(part.low for part in parts), max(part.high for part in parts)
+    return BandSummary(told, noisy, low, high, any(part.leaves for part in parts), parts[0].cells)
 
 
 def _blocks(
-    grid: SdfGrid, offset: float, threads: int, *, is_checked: bool = True
+    grid: SdfGrid,
+    offset: float,
+    threads: int,
+    limits: tuple[float, float] = (0.0, 0.0),
+    *,
+    is_checked: bool = True,
 ) -> Iterator[_Block]:
     """Yield what is found in the planes of a grid, in order.
 
     An offset is checked: the distances must not be cut off near it. At 0 no other one is better.
     """
-    limits = limits_beyond(grid, offset)
-    is_checked = is_checked and offset != 0
+    unseen, count = grid.field.unseen, grid.shape[0]
 
     def look(planes: tuple[int, int]) -> _Block:
         first, last = planes
-        low, high = max(first - 1, 0), min(last + 1, grid.shape[0])
+        low, high = max(first - 1, 0), min(last + 1, count)
         rescaled = rescale(grid, offset, low, high)
+        let_go(grid.samples)
         own = slice(first - low, last - low)
         inner, active = rescaled[own], is_active(rescaled)[own]
-        if grid.field.unseen is not None:
-            hidden = np.asarray(grid.field.unseen[first:last])
+        if unseen is not None:
+            hidden = np.asarray(unseen[first:last])
             inner, active = np.where(hidden, np.float32(FAR), inner), active & ~hidden
-        sides = [rescaled[own, [0, -1]], rescaled[own, :, [0, -1]]]
-        sides += [rescaled[0]] * (first == 0) + [rescaled[-1]] * (last == grid.shape[0])
-        beyond = samples_beyond(inner, first * grid.shape[1] * grid.shape[2], limits)
-        jumps = (find_jumps(rescaled, own), find_jumps(-rescaled, own)) if is_checked else None
-        voxel_ijk, patches = _patches_of(rescaled, active, first - low)
-        if is_checked:
-            check_not_cut_off(patches, offset, grid.voxel_size)
-        voxel_ijk[:, 0] += low
-        let_go(grid.samples)
-        leaves = any(bool((side <= 0).any()) for side in sides)
-        return _Block(voxel_ijk, patches, *beyond, leaves, jumps)
+        ijk = np.argwhere(active).astype(np.int32) + np.array([own.start, 0, 0], np.int32)
+        patches = np.empty((0, 27), np.float32)
+        if len(ijk):
+            start, stop = np.maximum(ijk.min(0) - 1, 0), ijk.max(0) + 2  # the rest is far away
+            around = rescaled[tuple(slice(a, b) for a, b in zip(start, stop))]
+            patches = gather_patches(around, ijk - start)
+            if (filled := is_filled_in(patches)).any():
+                ijk, patches = ijk[~filled], patches[~filled]
+        voxel_ijk = ijk + np.array([low, 0, 0], np.int32)
 
-    blocks = list(plane_blocks(grid.shape, least=planes_at_once(grid.samples)))
+        # Samples of a resampled grid are judged by samples alone: interpolated values do not tell
+        # whether these are noisy. Interpolated values that contradict no others count as exact,
+        # since thin parts need them (docs/guides/formats.md).
+        lipschitz, sampled = is_lipschitz(patches), on_samples(grid, voxel_ijk)
+        if grid.on_sample is not None:
+            lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
+        if grid.field.smooth is not None:  # no distances: they say nothing certain of the voxels
+            decoded = np.ones(len(patches), bool)
+        elif grid.field.kind == "mask":
+            decoded = has_both_sides(patches)
+        else:
+            decoded = can_hold_surface(patches, lipschitz)
+
+        faces = [rescaled[own, [0, -1]], rescaled[own, :, [0, -1]]]
+        faces += [rescaled[0]] * (first == 0) + [rescaled[-1]] * (last == count)
+        summary = BandSummary(
+            int(np.count_nonzero(sampled)),
+            int(np.count_nonzero(sampled & ~lipschitz)),
+            float(patches[:, CENTRE].min(initial=np.inf)),
+            float(patches[:, CENTRE].max(initial=-np.inf)),
+            any(bool((face <= 0).any()) for face in faces),
+            np.empty((0, 0, 0), np.int64),
+        )
+        jumps = None
+        if is_checked and offset:
+            _check_not_cut_off(patches, offset, grid.voxel_size)
+            jumps = _count_jumps(rescaled, own)
+        number, value = np.zeros(0, np.int64), np.zeros(0, np.float32)
+        if sees_beyond(limits):
+            lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
+            found = (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
+            number, value = np.flatnonzero(found) + first * inner[0].size, inner[found]
+        rows = voxel_ijk, patches, lipschitz, sampled, decoded
+        return _Block(rows, (number, value), summary, jumps)
+
+    blocks = list(plane_blocks(grid.shape, planes_at_once(grid.samples)))
     yield from over_threads(look, blocks, threads)
 
 
-def _patches_of(
-    rescaled: FloatArray, active: BoolArray, before: int
-) -> tuple[IntArray, FloatArray]:
-    """Return the active voxels that are not filled in, as indices of some planes, and patches.
+def _count_jumps(rescaled: FloatArray, own: slice) -> NDArray[np.float64]:
+    """Return a row for the outer and the inner side of an offset, (2, 3).
 
-    ``active`` leaves out the planes that come ``before`` and after.
+    It has the number of samples near the offset from which values jump up (on the inner side down)
+    to a neighbour; the number of all samples near; and the farthest with a jump, in half voxels.
+    Counted are those in planes ``own``, the planes beside only show whether there is a jump.
     """
-    ijk = np.argwhere(active).astype(np.int32)
-    if not len(ijk):
-        return ijk, np.empty((0, 27), np.float32)
-    ijk[:, 0] += before
-    low, high = np.maximum(ijk.min(0) - 1, 0), ijk.max(0) + 2  # most of the planes is far away
-    around = rescaled[tuple(slice(a, b) for a, b in zip(low, high))]
-    patches = gather_patches(around, ijk - low)
-    filled = is_filled_in(patches)
-    return (ijk[~filled], patches[~filled]) if filled.any() else (ijk, patches)
+    near, found = np.abs(rescaled[own]) < PATCH_LIMIT, []
+    for side in (1, -1):
+        jumps = np.zeros(rescaled.shape, bool)
+        for axis in range(3):
+            values, marks = np.moveaxis(rescaled, axis, 0), np.moveaxis(jumps, axis, 0)
+            step = side * (values[1:] - values[:-1])
+            marks[:-1] |= step > MIN_JUMP
+            marks[1:] |= step < -MIN_JUMP
+        jump = jumps[own] & near
+        end = (side * rescaled[own][jump]).max(initial=-np.inf)
+        found.append((jump.sum(), near.sum(), end))
+    return np.array(found, np.float64)
 
 
-def _check_offset(jumps: list[tuple[Jumps, Jumps]], grid: SdfGrid, offset: float) -> None:
-    """Raise GridError if no sample is near an offset, or fill values begin near it."""
-    up, down = zip(*jumps)
-    if not any(near for _, near, _ in up):
+def _check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> None:
+    """Raise GridError if the distances are truncated within 1.5 voxels of an offset.
+
+    ``patches`` (V, 27) are of the band there. A distance never equals all its neighbours.
+    """
+    centre = patches[:, CENTRE]
+    cut_off = (patches == centre[:, None]).all(1) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
+    if cut_off.any():
+        end = offset + float(centre[cut_off][0]) * voxel_size / 2
+        raise _too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
+
+
+def _check_offset(jumps: list[NDArray[np.float64] | None], grid: SdfGrid, offset: float) -> None:
+    """Raise GridError if no sample is near an offset, or fill values begin within 2.5 voxels."""
+    if not offset:
+        return
+    every = np.array(jumps)  # (blocks, 2, 3)
+    if not every[:, 0, 1].any():
         raise no_surface(grid, offset)
-    check_not_filled(up, down, offset, grid.voxel_size)
+    for side, part in ((1, every[:, 0]), (-1, every[:, 1])):
+        (count, near, _), end = part.sum(0), part[:, 2].max()
+        if count > MAX_JUMP_SHARE * near and end < FILL_MARGIN - UNSAMPLED:
+            end = offset + side * end * grid.voxel_size / 2
+            raise _too_near(offset, grid.voxel_size, end, FILL_MARGIN, outwards=side > 0)
 
 
-def _tell_noise(
-    grid: SdfGrid, voxel_ijk: IntArray, patches: FloatArray
-) -> tuple[BoolArray, BoolArray | None]:
-    """Return which patches can be distances, and, of a resampled grid, which voxels are samples.
-
-    There, samples are judged by samples alone: interpolated values do not tell whether the samples
-    are noisy. Where they do not contradict others they count as exact, since thin parts need them
-    (docs/guides/formats.md).
-    """
-    lipschitz = is_lipschitz(patches)
-    if grid.on_sample is None:
-        return lipschitz, None
-    sampled = on_samples(grid, voxel_ijk)
-    lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
-    return lipschitz, sampled
-
-
-def _summary(patches: FloatArray, told: BoolArray, leaves: bool) -> BandSummary:
-    """Return the summary of a band; ``told`` is which telling patches can be distances."""
-    sample, none = patches[:, CENTRE], np.empty((0, 0, 0), np.int64)
-    low, high = float(sample.min(initial=np.inf)), float(sample.max(initial=-np.inf))
-    noisy = len(told) - int(np.count_nonzero(told))
-    return BandSummary(len(told), noisy, low, high, leaves, none, 0)
-
-
-def _is_decoded(kind: Field, patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
-    """Return which voxels of a field are decoded; of a mask those with samples on both sides."""
-    if kind.smooth is not None:  # no distances: what they say of the voxels is not certain
-        return np.ones(len(patches), bool)
-    return has_both_sides(patches) if kind.kind == "mask" else can_hold_surface(patches, lipschitz)
-
-
-def _exact_between(grid: SdfGrid, offset: float) -> tuple[float, float]:
-    """Return the samples, in half voxels, between which those of a field can be exact."""
-    low, high = ((limit - offset) * 2 / grid.voxel_size for limit in grid.field.exact)
-    return low, high
+def _too_near(
+    offset: float, voxel_size: float, end: float, needed: float, *, outwards: bool
+) -> GridError:
+    """Return the error for distances that end (world units) within ``needed`` half voxels."""
+    room = needed / 2 * voxel_size
+    limit, which = (end - room, "largest") if outwards else (end + room, "smallest")
+    works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"
+    return GridError(
+        f"offset {offset:g} needs distances {needed / 2:g} spacings ({room:.6g}) to either side "
+        f"of it, but they end at {end:.6g}: {works}"
+    )

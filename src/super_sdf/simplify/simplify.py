@@ -2,15 +2,13 @@
 
 >>> from super_sdf import simplify_mesh
 >>> simplify_mesh(mesh, error=0.02 * grid.voxel_size).mesh               # doctest: +SKIP
-
-The modules that do it are imported when they are needed: they need the extra ``simplify``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import OutOfMemoryError, check_modules
 from ..options import OPTIONS, check_goal
@@ -23,13 +21,11 @@ BYTES_PER_TRIANGLE = 1300
 LEFT = 0.85  # share of the work that is left after a round: a guess
 
 
-@dataclass(frozen=True)
-class Deviation:
-    """Distances between a mesh and a simplified one, in world units or in voxels."""
+class Deviation(NamedTuple):
+    """Distances between a mesh and a simplified one, in world units; means are over the area."""
 
-    # from the vertices of the mesh, and middles of its triangles, to the simplified one, or a bound
-    largest: float
-    mean: float  # over the area
+    largest: float  # from vertices of the mesh and middles of its triangles, or a bound
+    mean: float
     largest_back: float  # from the vertices of the simplified mesh, and points on it, to the mesh
     mean_back: float
 
@@ -40,19 +36,16 @@ class Simplified:
 
     mesh: Mesh  # closed, oriented, manifold if the unsimplified one was; open edges are the same
     triangles_before: int  # of the unsimplified mesh
-    deviation: Deviation  # in world units
+    deviation: Deviation
     warnings: tuple[str, ...] = ()  # what was asked for and not reached
 
     def report(self, voxel_size: float) -> dict[str, Any]:
-        """Return the figures as they stand in JSON; distances are in voxels.
-
-        ``voxel_size`` is their length in world units.
-        """
+        """Return the figures as they stand in JSON; distances are in voxels of this size."""
         return {
             "voxel_size": voxel_size,
             "triangles_before": self.triangles_before,
             "triangles": len(self.mesh.faces),
-            "deviation": {name: x / voxel_size for name, x in vars(self.deviation).items()},
+            "deviation": {name: x / voxel_size for name, x in self.deviation._asdict().items()},
             "warnings": list(self.warnings),
         }
 
@@ -106,10 +99,9 @@ def simplify_mesh(
             f"simplifying {count:,} triangles needs {in_words(need)} of memory; {in_words(bound)} "
             "may be used; use a smaller factor, allow more (--max-memory), or do not simplify"
         )
-    from .collapsing import down_to, within
-    from .measuring import Original
+    from .collapsing import Original, Solid, down_to, within  # need the extra
 
-    if not len(mesh.faces):
+    if not count:
         return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
     original, left = Original(mesh), 1.0
 
@@ -123,7 +115,7 @@ def simplify_mesh(
         result, warnings = within(mesh, original, error, count_round)
     else:
         result, warnings = down_to(mesh, original, triangles or 0, count_round)
-    deviation = Deviation(*original.deviation(result))
+    deviation = Deviation(*original.compare(Solid(result))[1])
     if progress:
         progress(1.0)
-    return Simplified(result, len(mesh.faces), deviation, warnings)
+    return Simplified(result, count, deviation, warnings)

@@ -172,13 +172,10 @@ class Solid:
         """Return the index of the nearest triangle, (n,)."""
         return self.nearest(points)[1]
 
-    def winding_number(self, points: Points) -> Distances:
-        """Return the winding number, (n,): 1 inside, 0 outside."""
-        return self._winding.winding_number(points) if len(points) else np.zeros(0)
-
     def is_inside(self, points: Points) -> NDArray[np.bool_]:
         """Return a mask, (n,), of the points inside the solid."""
-        return self.winding_number(points) > 0.5
+        inside: NDArray[np.bool_] = np.zeros(len(points), bool)
+        return self._winding.winding_number(points) > 0.5 if len(points) else inside
 
     def signed_distance(self, points: Points) -> Distances:
         """Return the signed distance, (n,), negative inside."""
@@ -186,21 +183,16 @@ class Solid:
         return np.where(self.is_inside(points), -found, found)
 
     def count_overlapping(self) -> int:
-        """Count the faces with a winding number of 2 or more, or below 0, on one side.
-
-        They belong to pieces that overlap, fold over or are inverted.
-        """
+        """Count the faces with a winding number of 2 or more, or below 0, on one side."""
         a, b, c = self.mesh.vertices[self.mesh.faces.T]
-        normals = np.cross(b - a, c - a)
+        normals, centres = np.cross(b - a, c - a), (a + b + c) / 3
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        whole = lengths[:, 0] > 0
         size = np.linalg.norm(np.ptp(self.mesh.vertices, axis=0))
-        step = SIDE_STEP * size * normals[whole] / lengths[whole]
-        centres = (a + b + c)[whole] / 3
-        winding = self.winding_number(np.concatenate([centres + step, centres - step]))
-        winding *= np.sign(self.mesh.volume()) or 1
-        wrong = (winding > 1.5) | (winding < -0.5)
-        return int(wrong.reshape(2, -1).any(0).sum())
+        step = SIDE_STEP * size * normals / np.where(lengths > 0, lengths, 1)
+        winding = self._winding.winding_number(np.concatenate([centres + step, centres - step]))
+        winding = winding * (np.sign(self.mesh.volume()) or 1)
+        wrong = ((winding > 1.5) | (winding < -0.5)).reshape(2, -1).any(0)
+        return int(np.count_nonzero(wrong & (lengths[:, 0] > 0)))
 
 
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:
