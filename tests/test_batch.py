@@ -20,10 +20,10 @@ from conftest import ball
 from planted import COMMAND, run_beside_planted_files
 from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines
 
-from super_sdf.batch import job as batch_job
+from super_sdf.batch import work as batch_work
 from super_sdf.batch.inputs import find_jobs
-from super_sdf.batch.pool import Death, work_in_processes
 from super_sdf.batch.run import count_workers
+from super_sdf.batch.work import Death, work_in_processes
 from super_sdf.convert import convert
 from super_sdf.errors import SuperSdfError
 from super_sdf.files.formats import GRID_SUFFIXES
@@ -139,7 +139,7 @@ def test_a_file_that_appears_meanwhile_is_kept(batch, monkeypatch):
         Path("out/a.ply").write_text("mine")
         return convert(source, *rest, **options)
 
-    monkeypatch.setattr(batch_job, "convert", interfere)
+    monkeypatch.setattr(batch_work, "convert", interfere)
     for _ in range(2):
         assert batch("in/a.npy")[0] == 1 and Path("out/a.ply").read_text() == "mine"
 
@@ -159,10 +159,10 @@ def test_what_was_not_the_inputs_fault_stops_nothing_and_is_tried_again(
             raise error
         return convert(source, *rest, **options)
 
-    monkeypatch.setattr(batch_job, "convert", fail)
+    monkeypatch.setattr(batch_work, "convert", fail)
     code, facts, err = batch("in")
     assert code == 1 and f"Failed: in/a.npy: {reason}\n" in err and facts["done"] == 2
-    monkeypatch.setattr(batch_job, "convert", convert)
+    monkeypatch.setattr(batch_work, "convert", convert)
     assert batch("in/a.npy")[:1] == (0,)
 
 
@@ -184,7 +184,7 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(batch):
     before, plan = files(), batch("in", "--dry-run")[1]
     assert [entry["out"] for entry in plan["to_do"]] == ["new.ply"] and files() == before
     assert [entry["reason"] for entry in plan["failed_before"]] == [CONSTANT]
-    assert [entry["out"] for entry in plan["refused"]] == ["a.ply"] and plan["unread"] == []
+    assert [entry["out"] for entry in plan["refused"]] == ["a.ply"]
 
 
 def test_fail_fast_begins_nothing_after_a_failure(batch):
@@ -205,9 +205,9 @@ def test_patterns_keep_the_folders_below_their_fixed_part_and_links_in_a_circle_
     Path("in/.hidden").mkdir()
     shutil.copy("in/a.npy", "in/.hidden/a.npy")
     assert len(batch("in/**", "--dry-run")[1]["to_do"]) == 4
-    jobs, _ = find_jobs(["in/de*/er/*.npy", "in/.h*/*.npy"], ".ply", Options())
+    jobs = find_jobs(["in/de*/er/*.npy", "in/.h*/*.npy"], ".ply", Options())
     assert [job.target for job in jobs] == ["deep/er/c.d.ply", ".hidden/a.ply"]
-    assert len(find_jobs(["in"], ".ply", Options())[0]) == 5
+    assert len(find_jobs(["in"], ".ply", Options())) == 5
 
 
 def test_lists_name_files_from_where_they_lie_and_objects_have_options_of_their_own(batch, command):
@@ -276,7 +276,7 @@ def test_odd_files_and_names_fail_alone(batch):
     code, facts, err = batch("in", "in/list.jsonl")
     assert code == 1 and facts["done"] == 3 and facts["failed"] == 6, err
     assert "Failed: in/pipe.npy is a named pipe: give a file\n" in err
-    assert "Failed: in/loop.npz cannot be read: Too many levels of symbolic links\n" in err
+    assert "Failed: in/loop.npz cannot be read: " in err
     assert "Failed: in/bad\\n\\udcff.npy: every value is 1" in err
     assert f"{Path('out', 'm' + long)}.ply cannot be written: File name too long\n" in err
 
@@ -292,7 +292,7 @@ def test_folders_that_cannot_be_read_are_named(batch, monkeypatch):
     monkeypatch.setattr(os, "scandir", refuse)
     code, facts, err = batch("in/", "in/a.npy")
     assert code == 1 and f"Failed: {Path('in/deep')} cannot be read: permission denied" in err
-    assert facts["done"] == 1 and facts["failures"][-1]["out"] is None
+    assert facts["done"] == 1 and facts["failures"][0]["out"] == "deep/*.ply"
 
 
 # The report

@@ -14,7 +14,6 @@ from pages import wedge
 from PIL import Image
 from playwright.sync_api import Error, sync_playwright
 
-from super_sdf.batch import page as batch_page
 from super_sdf.cli.main import cli
 
 NAMES = ("chromium", "chromium-browser", "google-chrome")
@@ -79,11 +78,9 @@ def batch(tmp_path_factory):
     np.save(folder / "in" / f"{MARKUP}.npy", ball(12, 3.0).values)
     np.save(folder / "in" / "b.npy", ball(12, 4.0).values)
     np.save(folder / "in" / "bad.npy", np.ones((4, 4, 4)))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(batch_page, "MOST_WITHIN", 0)
-        where = [str(folder / name) for name in ("in", "out", "page & more.html")]
-        words = ["batch", where[0], "--out", where[1], "--report", where[2], "--jobs", "1", *FAST]
-        assert CliRunner().invoke(cli, words).exit_code == 1
+    where = [str(folder / name) for name in ("in", "out", "page & more.html")]
+    words = ["batch", where[0], "--out", where[1], "--report", where[2], "--jobs", "1", *FAST]
+    assert CliRunner().invoke(cli, words).exit_code == 1
     return (folder / "page & more.html").as_uri()
 
 

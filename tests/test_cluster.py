@@ -20,7 +20,7 @@ from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_l
 from super_sdf import Mesh, SdfGrid, __version__, load_network
 from super_sdf.batch import cluster
 from super_sdf.batch.cluster import completed, connect
-from super_sdf.batch.pool import Death
+from super_sdf.batch.work import Death
 from super_sdf.errors import ClusterError, MeshError
 from super_sdf.options import Options
 from super_sdf.pipeline import mesh_grid
@@ -167,7 +167,7 @@ def test_a_task_that_kills_workers_is_the_only_one_that_fails(monkeypatch):
         assert results.pop(4) == Death("ended with OSError: four")
         assert results == {task: 2 * task for task in (0, 1, 2, 5, 6, 7)}
         monkeypatch.setattr(cluster, "__version__", "0.0.1")  # of this process, not of the worker
-        with pytest.raises(ClusterError, match=r"and here is 0\.0\.1: install"):
+        with pytest.raises(ClusterError, match=r"than here \(0\.0\.1\): install"):
             list(completed(client, iter([1]).__next__, double))
 
 

@@ -149,11 +149,15 @@ def test_the_page_of_a_batch_made_without_one_names_failures_first(run_batch, gr
     bad, *made = files_of("page.html")
     assert [entry["name"] for entry in made] == ["a.ply", "deep/b.ply", "deep/er/c.d.ply"]
     assert all(entry["status"] == "ok" and entry["residual"] > 0 for entry in made)
-    assert all(entry["meshes"] == "page" for entry in made)
     assert (bad["name"], bad["status"], bad["reason"]) == ("bad.ply", "failed", CONSTANT)
     found = blocks(Path("page.html"))
-    assert found["facts"]["alert"] == "" and not Path("page-files").exists()
-    assert set(found) == {"facts", *(f"meshes-{entry['id']}" for entry in made)}
+    assert set(found) == {"facts"} and found["facts"]["alert"] == ""
+    beside = [entry["meshes"] for entry in made]
+    assert sorted(beside) == sorted(f"page-files/{name}" for name in os.listdir("page-files"))
+    times = [path.stat().st_mtime_ns for path in sorted(Path("page-files").iterdir())]
+    run_batch(*BATCH)  # the page is replaced, and nothing drawn again
+    assert [path.stat().st_mtime_ns for path in sorted(Path("page-files").iterdir())] == times
+    assert len(files_of("page.html")) == 4
 
 
 def test_a_page_of_others_is_not_replaced_by_a_batch(run_batch, grid_folder):

@@ -11,6 +11,7 @@ import errno
 import hashlib
 import json
 import os
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,10 +21,11 @@ from filelock import FileLock, Timeout
 
 from ..errors import FileError, WriteError
 from ..files.formats import split_member
+from ..files.output import naming
 from ..files.regular import files_of, is_store
 
 NAME, LOCK_NAME, STAGE_NAME = "report.jsonl", ".super-sdf-batch.lock", ".super-sdf-parts"
-OWN_NAMES = (NAME, LOCK_NAME, STAGE_NAME, ".super-sdf-batch")
+OWN_NAMES = (NAME, LOCK_NAME, STAGE_NAME)
 CHUNK = 1 << 20  # bytes read at a time
 NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}  # some network drives
 
@@ -34,41 +36,6 @@ Row = dict[str, Any]
 """A line of the report; docs/reference/json.md says what its keys mean."""
 
 
-class RecordFile:
-    """A file of JSON lines, which need not exist; it is written by one process at a time."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def read(self) -> Iterator[Any]:
-        """Yield what each finished line holds; None for a line that is not valid JSON."""
-        with suppress(FileNotFoundError), self.path.open("rb") as file:
-            for line in file:
-                if line.endswith(b"\n"):
-                    try:
-                        yield json.loads(line)
-                    except (ValueError, RecursionError):
-                        yield None
-
-    def append(self, record: Any) -> None:
-        """Append a record as a line, after cutting off an unfinished one.
-
-        After an OSError, of a full disk, say, the file holds the lines that it held before.
-        """
-        left = memoryview(f"{json.dumps(record)}\n".encode())
-        with self.path.open("a+b", buffering=0) as file:
-            end = file.seek(0, os.SEEK_END)
-            while end and (file.seek(end - 1), file.read(1))[1] != b"\n":
-                end -= 1
-            file.truncate(end)
-            try:
-                while left:  # a full disk may take a part of it
-                    left = left[file.write(left) :]
-            except OSError:
-                file.truncate(end)
-                raise
-
-
 class Record:
     """The rows of an output folder; FileError if its ``report.jsonl`` is something else.
 
@@ -77,37 +44,54 @@ class Record:
     """
 
     def __init__(self, folder: Path) -> None:
-        self.file = RecordFile(folder / NAME)
+        self.path, self.size = folder / NAME, 0  # bytes of whole lines
         self.rows: dict[str, Row] = {}
-        self.made: dict[str, dict[str, set[str]]] = {}
-        path = self.file.path
-        if os.path.exists(path) and not path.is_file():  # opening a pipe would block
-            raise FileError(f"{path} is no regular file: remove it")
+        self.made: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
+        if os.path.exists(self.path) and not self.path.is_file():  # opening a pipe would block
+            raise FileError(f"{self.path} is no regular file: remove it")
         try:
-            read = list(self.file.read())
+            with suppress(FileNotFoundError), self.path.open("rb") as file:
+                for line in file:
+                    if line.endswith(b"\n"):
+                        self.size += len(line)
+                        with suppress(ValueError, RecursionError):
+                            self._take(json.loads(line))
         except OSError as error:
-            raise FileError(f"{path} cannot be read: {error.strerror}") from error
-        for row in read:
-            if _is_row(row):
-                self._take(row)
-        if read and not self.rows:
-            raise FileError(
-                f"{path} is not a batch's report: move it, or give another folder for the meshes"
-            )
+            raise FileError(f"{self.path} cannot be read: {error.strerror}") from error
+        if self.size and not self.rows:
+            way_out = "move it, or give another folder for the meshes"
+            raise FileError(f"{self.path} is not a batch's report: {way_out}")
 
     def add(self, row: Row) -> None:
-        """Keep a row, in memory and in the file."""
-        try:
-            self.file.append(row)
-        except OSError as error:
-            raise WriteError(f"{self.file.path} cannot be written: {error.strerror}") from error
+        """Append a row to the file, in place of an unfinished line, and keep it in memory.
+
+        After an error, of a full disk, say, the file holds the lines that it held before.
+        """
+        line = memoryview(f"{json.dumps(row)}\n".encode())
+        with naming(self.path), self.path.open("ab", buffering=0) as file:
+            self.size = min(self.size, file.seek(0, os.SEEK_END))
+            file.truncate(self.size)
+            try:
+                written = 0
+                while written < len(line):  # a full disk may take a part of it
+                    written += file.write(line[written:])
+            except OSError:
+                file.truncate(self.size)
+                raise
+        self.size += len(line)
         self._take(row)
 
-    def _take(self, row: Row) -> None:
-        self.rows[row["out"]] = row
-        made = self.made.setdefault(row["out"], {})
-        for name, known in outputs_of(row).items():
-            made.setdefault(name, set()).add(known["sha256"])
+    def _take(self, row: Any) -> None:
+        """Keep what is a row in memory; pass over a line that is none."""
+        with suppress(TypeError, KeyError, AttributeError):
+            known, content = outputs_of(row), row["content"] or {"sha256": ""}
+            texts = [row[key] for key in ("in", "out", "status")]
+            texts += [each["sha256"] for each in (content, *known.values())]
+            is_row = isinstance(row["asked"], dict) and isinstance(row["retry"], bool)
+            if is_row and " ".join(texts):
+                self.rows[row["out"]] = row
+                for name, each in known.items():
+                    self.made[row["out"]][name].add(each["sha256"])
 
 
 def outputs_of(row: Row) -> dict[str, Fingerprint]:
@@ -116,24 +100,12 @@ def outputs_of(row: Row) -> dict[str, Fingerprint]:
     return {row["out"]: output} if "sha256" in output else output
 
 
-def _is_row(row: Any) -> bool:
-    """Return whether a parsed line is a row, with what is looked up in one."""
-    try:
-        texts = all(isinstance(row[key], str) for key in ("in", "out", "status", "options"))
-        known = [*outputs_of(row).values(), row["content"] or {"sha256": ""}]
-        return texts and isinstance(row["retry"], bool) and all("sha256" in each for each in known)
-    except (TypeError, KeyError, AttributeError):
-        return False
-
-
 def fingerprint(path: Path) -> Fingerprint | None:
-    """Return the fingerprint of a file, None if it cannot be read or is no regular file.
+    """Return the fingerprint of a file with those that it names, or of all in a Zarr folder.
 
-    Of a Zarr folder it covers the names and contents of all files in it; of a header or a network
-    also those of the files that it names.
+    None if it cannot be read or is no regular file.
     """
-    file, _ = split_member(path)
-    digest = hashlib.sha256()
+    (file, _), digest = split_member(path), hashlib.sha256()
     try:
         if not (is_store(file) or file.is_file()):  # opening a pipe would block
             return None
@@ -141,11 +113,9 @@ def fingerprint(path: Path) -> Fingerprint | None:
         for part in files_of(path):
             if part != file:
                 digest.update(os.fsencode(os.path.relpath(part, file)) + b"\0")
-            with part.open("rb", buffering=0) as opened:
-                left = os.fstat(opened.fileno()).st_size  # files of the system may have no end
-                while left > 0 and (chunk := opened.read(min(CHUNK, left))):
+            with part.open("rb") as opened:
+                while chunk := opened.read(CHUNK):
                     digest.update(chunk)
-                    left -= len(chunk)
     except OSError:
         return None
     return {"sha256": digest.hexdigest(), "size": size, "mtime_ns": changed}
@@ -158,14 +128,11 @@ def file_state(path: Path) -> tuple[int, int]:
 
 
 def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = True) -> bool:
-    """Return whether a file still has a known fingerprint; None stands for an unreadable file.
-
-    Its content is read only if the modification time or the path is another.
-    """
+    """Return whether a file has a known fingerprint; None stands for one that cannot be read."""
     if known is None:
         file, _ = split_member(path)
         return not ((os.path.isfile(file) or is_store(file)) and os.access(file, os.R_OK))
-    with suppress(OSError):
+    with suppress(OSError):  # the content is read only if the time or the path is another
         if same_path and file_state(path) == (known.get("size"), known.get("mtime_ns")):
             return True
     return bool((fingerprint(path) or {}).get("sha256") == known["sha256"])
@@ -179,8 +146,8 @@ def folder_lock(folder: Path) -> Iterator[None]:
         folder.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except Timeout:
-        said = f"{folder} is in use by another batch: wait for it, or give another"
-        raise FileError(said) from None
+        way_out = "wait for it, or give another"
+        raise FileError(f"{folder} is in use by another batch: {way_out}") from None
     except OSError as error:
         if error.errno not in NO_LOCKS:
             raise WriteError(f"{folder} cannot be written: {error.strerror}") from error

@@ -67,14 +67,14 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     start, page, quiet, items = time.perf_counter(), given["report"], given["quiet"], None
     options = main.chosen_options(given)
     from ..batch.inputs import find_jobs
-    from ..batch.job import Settings
     from ..batch.record import folder_lock
     from ..batch.run import Batch
+    from ..batch.work import Settings
     from ..files.regular import files_of
     from ..labels.files import check_options, read_names
 
     names = read_names(given["names"]) if given["names"] else None
-    jobs, unread = find_jobs(sources, f".{given['kind']}", options, names)
+    jobs = find_jobs(sources, f".{given['kind']}", options, names)
     of_labels = [job.options for job in jobs if job.options.labels is not None]
     if names and not of_labels:
         raise OptionError(f"--names {given['names']} is for --labels: give that, too")
@@ -92,76 +92,59 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
         if items.exists() and not items.is_dir():
             raise WriteError(f"{items}, for the meshes of the page, is no folder: move it")
     some = {name: given[name] for name in ("cluster", "force", "retry", "fail_fast", "check")}
-    where = (folder, options.network()["model"], options.precision, options.device, options.threads)
-    settings = Settings(*where, given["jobs"], items=items, names=names, **some)
+    settings = Settings(folder, options, given["jobs"], items=items, names=names, **some)
     if given["dry_run"]:
-        print_plan(Batch(jobs, settings, unread), given["as_json"])
+        print_plan(Batch(jobs, settings), given["as_json"])
         return
     with folder_lock(folder):
-        batch = Batch(jobs, settings, unread)
-        total = len(batch.waiting)
+        batch = Batch(jobs, settings)
+        total = len(batch.of("to_do"))
         main.print_stderr(*made_again(batch) if not quiet else ())
         try:
             with main.progress_bar("converting", quiet or not total) as progress:
-
-                def show(batch: Batch) -> None:
-                    if progress:
-                        progress(len(batch.done) + len(batch.failed), total)
-
-                batch.run(show)
-            write_page(batch, page)
+                batch.run(progress)
+            if page:
+                batch.write_page(page, sentence(batch))
         except KeyboardInterrupt:
             with suppress(SuperSdfError):
-                write_page(batch, page, "interrupted")
-            done = f"{len(batch.done)} of {total} are done and kept"
+                if page:
+                    batch.write_page(page, sentence(batch), "interrupted")
+            done = f"{len(batch.of('done'))} of {total} are done and kept"
             raise KeyboardInterrupt(f"{done}; run it again to go on") from None
     batch.seconds = time.perf_counter() - start
     report = folder / "report.jsonl"
     if given["as_json"]:
         main.print_stdout(summary(batch), f"all is in {report}")
-    lines = [f"Failed: {result.failure()}" for result in batch.failures()]
-    lines += [f"Failed: {path} {reason}" for path, reason in unread]
+    lines = [f"Failed: {job.failure()}" for job in batch.of("failed_before", "refused", "failed")]
     more, failed = len(lines) - MOST_FAILURES, bool(lines)
     lines[MOST_FAILURES:] = [f"and {more} more, see {report}"] * (more > 0)
     if not quiet:
-        lines += [*(f"Note: {note}" for note in batch.notes), *remarks(batch), sentence(batch)]
+        lines += [*remarks(batch), sentence(batch)]
     main.print_stderr(*lines)
     if failed:
         sys.exit(1)
 
 
-def write_page(batch: Batch, page: Path | None, interrupted: str = "") -> None:
-    """Write the page, if one was asked for; after an interrupt, at once and without drawing."""
-    if page:
-        from ..batch.page import write_batch_page
-
-        write_batch_page(page, batch, sentence(batch), interrupted)
-
-
 def plan(batch: Batch) -> dict[str, list[dict[str, Any]]]:
     """Return the files that are to be done, or were done or failed in earlier runs."""
-    failed = {False: list[dict[str, Any]](), True: list[dict[str, Any]]()}
-    for _, row in batch.failed_before:
-        failed[bool(row["retry"])].append({name: row[name] for name in ("in", "out", "reason")})
-    done = [job for job, _ in batch.done_before]
-    paths = [
-        [{"in": os.path.abspath(job.source), "out": job.target} for job in jobs]
-        for jobs in (batch.waiting, done)
-    ]
-    unread = [{"in": path, "out": None, "reason": reason} for path, reason in batch.unread]
-    names = "to_do", "done_before", "failed_before", "refused", "unread"
-    return dict(zip(names, (*paths, failed[False], failed[True], unread)))
+    said: dict[str, list[dict[str, Any]]] = {}
+    for state in ("to_do", "done_before", "failed_before", "refused"):
+        said[state] = []
+        for job in batch.of(state):
+            reason = {"reason": job.row["reason"]} if job.row.get("reason") else {}
+            said[state].append({"in": os.path.abspath(job.source), "out": job.target, **reason})
+    return said
 
 
 def summary(batch: Batch) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
-    rows, known = [row for _, row in batch.results()], plan(batch)
-    failed = [{k: row[k] for k in ("in", "out", "reason")} for _, row in batch.failed]
-    failures = [*known["failed_before"], *known["refused"], *failed, *known["unread"]]
+    rows, known = [job.row for job in batch.of("done", "done_before")], plan(batch)
+    failed = [{k: job.row[k] for k in ("in", "out", "reason")} for job in batch.of("failed")]
+    failures = [*known["failed_before"], *known["refused"], *failed]
     counts = [(len(row.get("labels", [row])), bool(row["closed"])) for row in rows]
     closed = sum(count for count, is_closed in counts if is_closed)
     return {
-        "done": len(batch.done),
+        "done": len(batch.of("done")),
         "failed": len(failures),
         "done_before": len(known["done_before"]),
         "not_begun": len(known["to_do"]),
@@ -181,7 +164,7 @@ def sentence(batch: Batch) -> str:
     facts, seconds = summary(batch), round(batch.seconds)
     shown = {"done": "done", "failed": "failed"}
     more = {"done_before": "done before", "not_begun": "not begun"}
-    if not (batch.done or batch.failed or batch.waiting):
+    if not batch.of("done", "failed", "to_do"):
         shown = {"done_before": "done before"}
         more = {"failed_before": "failed before (--retry tries again)", "refused": "refused"}
     more = {key: words for key, words in more.items() if facts[key]}
@@ -193,7 +176,7 @@ def sentence(batch: Batch) -> str:
 
 def remarks(batch: Batch) -> list[str]:
     """Return how many of the new meshes have notes, warnings and checks in the report."""
-    rows, report = [row for _, row in batch.done], batch.settings.folder / "report.jsonl"
+    rows, report = [job.row for job in batch.of("done")], batch.settings.folder / "report.jsonl"
     checks = [row["check"] for row in rows if "check" in row]
     means = [check["residual"]["mean"] for check in checks if check.get("residual")]
     counts = {

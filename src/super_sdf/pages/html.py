@@ -16,13 +16,16 @@ from pathlib import Path
 from string import Template
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from .. import __version__
 from ..check import check
 from ..convert import convert
+from ..errors import SuperSdfError
 from ..files.formats import is_grid
 from ..files.output import replacing
 from ..truth.solid import read_mesh
+from . import items
 from .items import Entry, Item, entry_of_report, item_of_files
 
 if TYPE_CHECKING:
@@ -127,6 +130,51 @@ def viewed_page(sources: Sequence[str], load: Callable[[], Decoder], options: Op
         shown.append((entry_of_report(name, report, item), item))
     title = Path(sources[0]).name if len(sources) == 1 else f"{len(sources)} files"
     return _whole_page(title, shown)
+
+
+def write_batch_page(
+    path: Path,
+    facts: Mapping[str, Any],
+    rows: Mapping[str, Mapping[str, Any]],
+    draw: Callable[[str], Item | None],
+    *,
+    force: bool = False,
+) -> None:
+    """Write the page of a batch, files that failed first; their meshes are beside it.
+
+    ``rows`` are lines of the report by their output, empty of what is not finished; ``draw`` makes
+    the item of an output if its file is missing.
+    """
+    folder, entries = items.items_folder(path), list[Entry]()
+    for name, row in rows.items():
+        if row.get("status") != "ok":
+            known: dict[str, Any] = {"line": "not finished"}
+            if row:
+                known = {"reason": row["reason"], "facts": [["grid", row["in"]], ["mesh", name]]}
+            entries.append(items.entry_of(name, row.get("status", "waiting"), **known))
+            continue
+        digest, file = row["output"]["sha256"], items.item_path(folder, name)
+        item = items.find_item(folder, name, digest)
+        with suppress(SuperSdfError):  # then it is not shown
+            if item is None and (made := draw(name)):
+                items.keep_item(made, folder, name, digest)
+                item = items.find_item(folder, name, digest)
+        entries.append(entry_of_report(name, {**row, "output": name}, item) | {"id": file.stem})
+        if item and item.size:
+            entries[-1]["meshes"] = quote(f"{folder.name}/{file.name}")
+    kinds = {"failed": 0, "waiting": 1, "doubtful": 2, "ok": 3}
+    of = {e["name"]: "doubtful" if e["faults"] or e["warnings"] else e["status"] for e in entries}
+    entries.sort(key=lambda entry: (kinds[of[entry["name"]]], entry["name"]))
+    counts = {"files": len(entries)}
+    for words, key in (
+        ("failed", "reason"),
+        ("with faults", "faults"),
+        ("with warnings", "warnings"),
+    ):
+        counts[words] = sum(bool(entry[key]) for entry in entries)
+    summary = [[words, f"{count:,}"] for words, count in counts.items() if count]
+    page = make_page({**facts, "summary": summary, "files": entries}, beside=True)
+    write_page(page, path, force=force or is_page(path))
 
 
 def _whole_page(

@@ -16,7 +16,6 @@ import hashlib
 import json
 import zlib
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,9 +103,10 @@ def packed_mesh(title: str, mesh: Mesh, certificate: Certificate | None = None) 
     caption = f"{title}: {len(mesh.faces):,} triangles"
     if len(mesh.faces) > MOST_TRIANGLES:  # in one pass, unlike ``simplify_mesh``: only to be seen
         check_modules(f"a view of more than {MOST_TRIANGLES:,} triangles", "simplify", ("pyfqmr",))
-        from ..simplify.collapsing import collapse_to
+        from ..simplify.collapsing import collapse_edges
 
-        mesh = collapse_to(mesh, np.zeros(len(mesh.faces), bool), MOST_TRIANGLES)
+        kept = np.zeros(len(mesh.faces), bool)
+        mesh = collapse_edges(mesh, kept, triangles=MOST_TRIANGLES)
         caption += f", shown simplified to {len(mesh.faces):,}"
     vertices = mesh.vertices.astype(np.float64)
     low, high = (vertices.min(0), vertices.max(0)) if len(vertices) else np.zeros((2, 3))
@@ -155,20 +155,6 @@ def find_item(folder: Path, target: str, sha256: str) -> Item | None:
     except (OSError, ValueError, TypeError):  # missing, or damaged
         return None
     return item if item.made_of == sha256 else None
-
-
-def read_meshes(path: Path) -> list[dict[str, Any]]:
-    """Return the packed meshes from the file of an item that was just written or read."""
-    _, call = path.read_bytes().split(b"\n", 1)
-    return list(json.loads(call[call.index(b"[") : call.rindex(b"]") + 1]))
-
-
-def remove_items(folder: Path, targets: Iterable[str]) -> None:
-    """Remove the items of some outputs, and the folder if nothing else is in it."""
-    with suppress(OSError):
-        for target in targets:
-            item_path(folder, target).unlink(missing_ok=True)
-        folder.rmdir()
 
 
 def entry_of(name: str, status: str = "ok", **known: Any) -> Entry:
