@@ -1,6 +1,7 @@
 """Unknown far samples, NaN or infinite: their side, their cut-off, and what is refused."""
 
 import os
+import warnings
 
 import numpy as np
 import pytest
@@ -209,3 +210,12 @@ def test_fused_depth_images_are_meshed_by_their_spline(unseen, scale):
     assert grid.field.kind == "truncated" and grid.field.is_uneven
     assert grid.field.exact == (0, 0) and "their slope is uneven" in grid.notes[-1]
     assert reconstruct(grid, trilinear, 2).is_closed()
+
+
+def test_a_small_solid_in_a_large_truncated_grid_is_read_without_warnings():
+    x, y, z = np.indices((160, 160, 160), dtype=np.float32)
+    away = np.sqrt((x - 53.6) ** 2 + (y - 80) ** 2 + (z - 80.4) ** 2) - 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        grid = make_grid(np.clip(away, -3, 3), spacing=1.0, origin=0.0)
+    assert grid.field.kind in ("exact", "truncated")

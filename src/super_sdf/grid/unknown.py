@@ -235,7 +235,8 @@ def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extreme
     crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
     others = pairs[~np.isin(pairs, extremes)]
     near = np.abs(others - value).min(initial=np.inf) < JUMP * steepest
-    return bool(near and np.isin(crossing, extremes).all(0).mean() > FILLED_IN)
+    has_crossing = near and crossing.size > 0  # few planes of a large grid are looked at
+    return bool(has_crossing and np.isin(crossing, extremes).all(0).mean() > FILLED_IN)
 
 
 def _steepest(pairs: Floats, has: BoolArray, is_extreme: BoolArray) -> float:
@@ -257,7 +258,7 @@ def _steepest(pairs: Floats, has: BoolArray, is_extreme: BoolArray) -> float:
 def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:
     pairs = census.pairs[:, (census.pairs[0] > 0) != (census.pairs[1] > 0)]
     jumps = _are_jumps(pairs, limit, census.extremes) & (pairs == value).any(0)
-    if jumps.mean() > MIXED and jumps.sum() >= LEAST_JUMPS:
+    if jumps.sum() >= LEAST_JUMPS and jumps.mean() > MIXED:
         raise GridError(
             f"{count:,} samples are exactly {value:g}, and beside some the values jump as no "
             "distance does: write NaN where nothing was seen"
