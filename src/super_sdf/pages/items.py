@@ -103,9 +103,10 @@ def packed_mesh(title: str, mesh: Mesh, certificate: Certificate | None = None) 
     caption = f"{title}: {len(mesh.faces):,} triangles"
     if len(mesh.faces) > MOST_TRIANGLES:  # in one pass, unlike ``simplify_mesh``: only to be seen
         check_modules(f"a view of more than {MOST_TRIANGLES:,} triangles", "simplify", ("pyfqmr",))
-        from ..simplify.collapsing import collapse_to
+        from ..simplify.collapsing import collapse_edges
 
-        mesh = collapse_to(mesh, np.zeros(len(mesh.faces), bool), MOST_TRIANGLES)
+        kept = np.zeros(len(mesh.faces), bool)
+        mesh = collapse_edges(mesh, kept, triangles=MOST_TRIANGLES)
         caption += f", shown simplified to {len(mesh.faces):,}"
     vertices = mesh.vertices.astype(np.float64)
     low, high = (vertices.min(0), vertices.max(0)) if len(vertices) else np.zeros((2, 3))
