@@ -8,12 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from batches import rows
-from conftest import ball
 from solids import cube, inverted, joined, saved
 
 from super_sdf import Mesh, SdfGrid
-from super_sdf import errors as extras
 from super_sdf.check import check
 from super_sdf.check.check import LIMITS, check_mesh, exceeded
 from super_sdf.files import mesh_writers
@@ -86,17 +83,6 @@ def test_a_shift_is_its_cosine_and_so_are_the_colours(ball_mesh):
     np.testing.assert_allclose(said[2], (np.array(check.TOUCHING) + check.PIERCED) / 2, atol=1)
 
 
-def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
-    found = check_mesh(round_mesh(RADIUS - 0.2 * H), GRID)
-    clear, outside = np.abs(found.values) > 0.3, found.values > 0
-    np.testing.assert_allclose(found.residuals[clear & outside], 0.2, atol=0.01)
-    np.testing.assert_allclose(found.residuals[clear & ~outside], -0.2, atol=0.01)
-    between = (found.values < -0.001) & (found.values > -0.19)  # inside, the mesh says outside
-    distance = np.abs(found.values)
-    expected = between & (distance + np.abs(found.residuals + distance) > 0.1)
-    assert np.array_equal(found.wrong_side, expected) and found.wrong_side.any()
-
-
 def test_holes_components_and_twists_are_counted():
     ball_mesh = round_mesh(subdivisions=2)
     lidless = check.examine_surface(Mesh(ball_mesh.vertices, ball_mesh.faces[1:]))
@@ -136,6 +122,17 @@ def test_a_vertex_shared_by_two_pieces_is_pinched():
     )
     assert (found.pinched_vertices, found.open_edges, found.components) == (1, 0, 1)
     assert not found.report()["manifold"] and found.report()["closed"]
+
+
+def test_a_smaller_sphere_does_not_reach_outside_and_is_pierced_inside():
+    found = check_mesh(round_mesh(RADIUS - 0.2 * H), GRID)
+    clear, outside = np.abs(found.values) > 0.3, found.values > 0
+    np.testing.assert_allclose(found.residuals[clear & outside], 0.2, atol=0.01)
+    np.testing.assert_allclose(found.residuals[clear & ~outside], -0.2, atol=0.01)
+    between = (found.values < -0.001) & (found.values > -0.19)  # inside, the mesh says outside
+    distance = np.abs(found.values)
+    expected = between & (distance + np.abs(found.residuals + distance) > 0.1)
+    assert np.array_equal(found.wrong_side, expected) and found.wrong_side.any()
 
 
 def test_sides_of_a_mesh_that_meets_itself_are_by_winding_number(ball_mesh):
@@ -248,16 +245,6 @@ def test_the_offset_is_that_of_the_mesh(here, command):
     assert command(*words)[0] == 1
 
 
-def test_a_missing_extra_is_said_before_the_work(here, command, monkeypatch):
-    monkeypatch.setattr(extras, "missing_modules", lambda modules: ["igl"])
-    before = sorted(os.listdir())
-    line = "needs igl: pip install -e '.[report]' in a clone of super-sdf"
-    assert command("check", "none.ply", "none.npz") == (1, "", f"Error: check {line}\n")
-    for words in (("upsample", "ball.npz", "new.ply"), ("batch", "ball.npz", "--out", "new")):
-        assert command(*words, "--check")[::2] == (1, f"Error: --check {line}\n")
-    assert sorted(os.listdir()) == before
-
-
 def test_the_coloured_mesh_is_a_mesh_with_residuals_whole_or_not_there(here, command, monkeypatch):
     assert command("check", "off.ply", "ball.npz", "--out", "c.ply", "-q") == (0, "", "")
     mesh = trimesh.load("c.ply", process=False)
@@ -300,23 +287,3 @@ def test_errors_are_one_line_and_leave_nothing(here, command, words, code, messa
     assert (found, out) == (code, "")
     assert len(err.splitlines()) == 1 and message in err, err
     assert sorted(os.listdir()) == before
-
-
-def test_upsample_checks_what_it_wrote(here, command):
-    words = ("upsample", "ball.npz", "new.ply", "--factor", 2, "--check", "--json")
-    code, out, err = command(*words)
-    report, last = json.loads(out)["check"], err.splitlines()[-1]
-    assert code == 0 and report["residual"]["mean"] < 0.02 and report["surface"]["closed"]
-    assert last.startswith("Check: residual 0.00") and last.endswith("; no faults")
-
-
-def test_batch_records_certificates_and_makes_those_that_are_missing(here, run_batch):
-    Path("in").mkdir()
-    np.savez("in/a.npz", values=ball(16, 5.0).values, spacing=1.0)
-    assert run_batch("in")[0] == 0
-    code, _, err = run_batch("in", "--check")
-    check = rows()[-1]["check"]
-    assert code == 0 and check["residual"]["largest"] < 0.2 and check["surface"]["closed"]
-    assert "1 done, 0 failed" in err and "Check: mean residual 0.0" in err
-    for flags in (("--check",), ()):  # now it is there
-        assert "nothing to do: 1 done before" in run_batch("in", *flags)[2]

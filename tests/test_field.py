@@ -31,22 +31,9 @@ def test_the_cap_closes_it_along_the_border(factor):
     assert mesh.open_edges() == 0
     low = np.array(grid.origin) - 0.25  # the fine lattice starts half a voxel before the samples
     assert np.abs(mesh.vertices.min(0) - low).max() < 0.02 * 0.5 / factor
-    assert mesh.volume() == pytest.approx(inside_volume(grid, low), rel=0.01)
-
-
-def inside_volume(grid: SdfGrid, low: np.ndarray) -> float:
-    """Return the volume of the ball inside the grid, estimated on a lattice of 100^3 points."""
-    middle = np.array(grid.origin) + 2.3 * 0.5
-    side = 4.5
-    points = low + (np.indices((100,) * 3).reshape(3, -1).T + 0.5) * side / 100
-    return float((np.linalg.norm(points - middle, axis=1) < 3).mean() * side**3)
-
-
-def test_the_cap_changes_nothing_where_nothing_leaves():
-    grid = ball()
-    plain, capped = reconstruct(grid, trilinear), reconstruct(grid, trilinear)
-    np.testing.assert_array_equal(plain.faces, capped.faces)
-    np.testing.assert_array_equal(plain.vertices, capped.vertices)
+    points = low + (np.indices((100,) * 3).reshape(3, -1).T + 0.5) * 4.5 / 100
+    inside = np.linalg.norm(points - np.array(grid.origin) - 2.3 * 0.5, axis=1) < 3
+    assert mesh.volume() == pytest.approx(inside.mean() * 4.5**3, rel=0.01)
 
 
 def tip(beyond: float = -0.004) -> SdfGrid:

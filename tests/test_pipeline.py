@@ -90,16 +90,9 @@ SYMMETRIES = [
 ][::5]  # ten of 48, of all orders of axes
 
 
-@pytest.mark.parametrize("name", ["stand-in", "shipped"])
-def test_symmetries_of_the_cube_map_the_vertices_along(network, name, monkeypatch):
-    """The transformed field gives the transformed mesh: exactly for trilinear interpolation.
-
-    Less exactly for the network, which has only learnt the symmetry, and for the fit to the
-    spheres, which on a face between cells takes the gradient of one side.
-    """
-    answer, most, mean = (trilinear, 1e-5, 1e-5) if name == "stand-in" else (network, 0.4, 0.02)
-    if name == "stand-in":
-        monkeypatch.setattr(pipeline, "fit_to_spheres", lambda *_: None)
+def test_symmetries_of_the_cube_map_the_vertices_along(monkeypatch):
+    """But for the fit to the spheres, which on a face between cells takes one side's gradient."""
+    monkeypatch.setattr(pipeline, "fit_to_spheres", lambda *_: None)
     ijk = np.indices((12, 12, 12)) - 5.5
     box = np.abs(ijk - np.array([0.3, -0.2, 0.1])[:, None, None, None])
     values = np.maximum(box[0] - 3.2, np.maximum(box[1] - 2.3, box[2] - 3.6))
@@ -107,15 +100,14 @@ def test_symmetries_of_the_cube_map_the_vertices_along(network, name, monkeypatc
 
     def vertices_of(values):
         grid = SdfGrid(values, (1.0,) * 3, (-5.5,) * 3)
-        return reconstruct(grid, answer, mesher="marching").vertices
+        return reconstruct(grid, trilinear, mesher="marching").vertices
 
     base = vertices_of(values)
     for turn in SYMMETRIES:
         source = np.moveaxis(ijk, 0, -1) @ turn + 5.5  # where each sample of the turned grid was
         turned = values[tuple(np.moveaxis(source.astype(int), -1, 0))]
         distance = cKDTree(vertices_of(turned)).query(base @ turn.T)[0]
-        assert distance.max() < most + 2 * CLEARANCE
-        assert distance.mean() < mean + 2 * CLEARANCE
+        assert distance.max() < 1e-5 + 2 * CLEARANCE
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5])
@@ -126,7 +118,7 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     noisy = SdfGrid.trusted(values, grid.spacing)
     some = upsample(noisy, trilinear)
     part = reconstruct(noisy, trilinear)
-    monkeypatch.setattr(survey, "can_hold_surface", lambda patches, _: np.ones(len(patches), bool))
+    monkeypatch.setattr(survey, "DECODE_LIMIT", np.inf)
     whole = reconstruct(noisy, trilinear)
     assert some.counts["pinned_nodes"] == 0
     assert len(part.faces) == len(whole.faces)

@@ -11,11 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from solids import cube, joined, sphere, square, torus
 
-from lab.surfaces import isosurface
 from super_sdf import Mesh, SdfGrid, reconstruct, simplify_mesh
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
 from super_sdf.network.network import load_network
-from super_sdf.simplify import collapsing, simplify
+from super_sdf.simplify import collapsing
 from super_sdf.simplify.collapsing import Original, irregular_places
 from super_sdf.truth.solid import Solid
 
@@ -59,14 +58,6 @@ def three_holes() -> Mesh:
     for k in range(3):
         plate = np.maximum(plate, 2.4 - np.hypot(x - 3.2 - 8.3 * k, y))
     return reconstruct(SdfGrid.trusted(plate.astype(np.float32), 1.0), trilinear, factor=2)
-
-
-def forty_holes() -> Mesh:
-    """Return a plate with 5 times 8 holes, 0.02 thick, of a field with 100 samples to the unit."""
-    x, y, z = np.indices((56, 36, 7)) - np.array([27.7, 17.6, 3.1])[:, None, None, None]
-    plate = np.maximum(np.maximum(abs(x) - 26.2, abs(y) - 16.3), abs(z) - 1.2)
-    hole = 1.9 - np.hypot((x + 26) % 6.5 - 3.25, (y + 16.25) % 6.5 - 3.25)
-    return isosurface(np.maximum(plate, hole).astype(np.float32), 0.01, 0.0)
 
 
 def speck(place: list[float]) -> Mesh:
@@ -170,13 +161,11 @@ def test_a_number_of_triangles_is_not_exceeded_and_what_the_shape_does_not_allow
     assert max(found.deviation) <= 0.05 * diagonal
 
 
-@pytest.mark.parametrize(
-    "shape, error", [("torus", 1e-2), ("forty holes", 3e-3), ("two balls and a speck", 1e-2)]
-)
+@pytest.mark.parametrize("shape, error", [("torus", 1e-2), ("two balls and a speck", 1e-2)])
 def test_a_number_of_triangles_is_no_farther_off_than_an_error_that_leaves_as_many(shape, error):
     ball = sphere(0.3, 24).transformed(np.eye(3), np.array([1.0, 0, 0]))
     balls = joined(sphere(0.4), ball, speck([0.5, 0, 0.2]))
-    mesh = {"torus": torus, "forty holes": forty_holes}.get(shape, lambda: balls)()
+    mesh = torus() if shape == "torus" else balls
     within = simplify_mesh(mesh, error=error)
     found = simplify_mesh(mesh, triangles=len(within.mesh.faces))
     assert found.warnings == () and len(found.mesh.faces) <= len(within.mesh.faces)
@@ -185,15 +174,9 @@ def test_a_number_of_triangles_is_no_farther_off_than_an_error_that_leaves_as_ma
     assert is_closed_manifold(found.mesh) and collapsing.same_topology(found.mesh, mesh)
 
 
-@pytest.mark.parametrize("goal", [{"error": 0.1}, {"triangles": 100}], ids=str)
-def test_specks_do_not_keep_a_cube_from_being_simplified(goal):
-    """They are nearer to it than the error, so they can be lost without being far from the rest."""
-    specks = [speck([x, y, 0.53]) for x in (-0.3, 0.1, 0.4) for y in (-0.2, 0.25)]
-    mesh = joined(refined(cube(), 4), *specks)
-    found = simplify_mesh(mesh, **goal)
-    assert found.warnings == () and is_closed_manifold(found.mesh)
-    assert collapsing.same_topology(found.mesh, mesh)
-    assert len(found.mesh.faces) <= 12 + 8 * len(specks)
+def test_what_does_not_fit_in_memory_is_refused():
+    with pytest.raises(OutOfMemoryError, match="simplifying 9,216 triangles needs "):
+        simplify_mesh(torus(), error=1e-3, max_memory=10**7)
 
 
 WRONG = {
@@ -214,12 +197,6 @@ def test_wrong_arguments_are_said(message):
     assert str(error.value) == message
     with pytest.raises(OptionTypeError):
         simplify_mesh("cube", error=1)
-
-
-def test_what_does_not_fit_in_memory_is_refused(monkeypatch):
-    monkeypatch.setattr(simplify, "held_memory", lambda: 10**8)
-    with pytest.raises(OutOfMemoryError, match="simplifying 9,216 triangles needs 112 MB of mem"):
-        simplify_mesh(torus(), error=1e-3, max_memory=10**8)
 
 
 def test_the_command_simplifies_and_says_how_far_off(here, command):
@@ -250,15 +227,7 @@ def test_the_command_simplifies_and_says_how_far_off(here, command):
     assert err.splitlines()[-1].endswith(" mm")
 
 
-def two_balls():
-    """Two balls of radius 3 apart, spacing 1."""
-    one = ball(20, 3, (20, 12, 12)).values
-    return np.minimum(np.roll(one, -4, 0), np.roll(one, 4, 0))
-
-
-def test_an_open_mesh_is_simplified_too_and_a_count_that_cannot_be_reached_is_a_warning(
-    here, command
-):
+def test_the_command_simplifies_an_open_mesh_too(here, command):
     np.save("cut.npy", ball(20, 6.0).values[:10])
     words = ("upsample", "cut.npy", "a.ply", "--simplify", 0.02, "--json", "--open", *QUICK)
     code, out, err = command(*words)
@@ -266,7 +235,3 @@ def test_an_open_mesh_is_simplified_too_and_a_count_that_cannot_be_reached_is_a_
     assert code == 0 and not report["closed"]
     assert report["triangles"] < report["simplified"]["triangles_before"] / 2
     assert "Warning: the surface runs out of the grid and is open there" in err
-    np.savez("two.npz", values=two_balls(), spacing=1.0)
-    code, _, err = command("upsample", "two.npz", "b.ply", "--triangles", 6, *QUICK)
-    left = len(trimesh.load("b.ply").faces)
-    assert code == 0 and left > 6 and f"Warning: {UNREACHED.format(6)}{left:,}\n" in err

@@ -43,28 +43,6 @@ if TYPE_CHECKING:
     from .functions.function import Function
 
 
-def refine(
-    grid: SdfGrid,
-    network: Decoder | Adapter,
-    factor: int = 4,
-    offset: float = 0.0,
-    *,
-    threads: int = 1,
-    steps: StepCounter | None = None,
-    whole: BandSummary | None = None,
-) -> FineField:
-    """Return the fine field of a cubic grid, in one piece.
-
-    With ``whole`` the grid is a part of another one, of which that is the summary.
-    """
-    steps = steps or StepCounter()
-    band = survey(grid, offset, threads=threads, whole=whole)  # Eqs. 2 and 4
-    if whole is None and not band.decoded.any():
-        raise no_surface(grid, offset)
-    steps.finish("band")
-    return refine_band(band, adapt(network), factor, threads, steps)
-
-
 def refine_band(
     band: Band,
     network: Adapter,
@@ -159,9 +137,8 @@ def upsample(
         If the network returns values that are not finite.
     GridError
         If the distances end within 1.5 spacings of the offset; if the grid is so far from the
-        origin that floating-point numbers cannot resolve its vertices; if there is no surface. The
-        last is raised only at the end, since a thin part may lie between samples that are all
-        outside.
+        origin that floating-point numbers cannot resolve its vertices; if there is no surface,
+        which shows only at the end: a thin part may lie between samples that are all outside.
     """
     check_grid(grid)
     options.check_network(network)
@@ -172,7 +149,11 @@ def upsample(
     lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     threads = useful_threads(chosen.threads)
-    field = refine(lattice, chosen, factor, offset, threads=threads, steps=steps)
+    band = survey(lattice, offset, threads=threads)  # Eqs. 2 and 4
+    if not band.decoded.any():
+        raise no_surface(grid, offset)
+    steps.finish("band")
+    field = refine_band(band, chosen, factor, threads, steps)
     if not field.has_surface:
         raise no_surface(grid, offset)
     return field

@@ -144,6 +144,16 @@ def check_fits(need: int, what: str, way_out: str) -> None:
         )
 
 
+def check_bound(need: int, what: str, max_memory: int | None, way_out: str = "") -> None:
+    """Raise OutOfMemoryError if ``need`` bytes beside what is held pass the process's bound."""
+    bound, need = memory_bound(max_memory), need + (held_memory() or 0)
+    if bound is not None and need > bound:
+        raise OutOfMemoryError(
+            f"{what} needs {in_words(need)} of memory, {in_words(bound)} may be taken in all; "
+            f"{way_out}allow more (--max-memory)"
+        )
+
+
 def in_words(size: float) -> str:
     """Return a number of bytes as text for users, in the form that ``--max-memory`` takes."""
     return f"{size / 1e9:,.2f} GB" if size >= 1e9 else f"{size / 1e6:,.0f} MB"

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
-from ..errors import OptionError, OutOfMemoryError
+from ..errors import OptionError
 from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
@@ -29,7 +29,7 @@ from ..refine.band import plane_blocks, rescale
 from ..refine.nodes import VoxelIndex
 from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh
-from ..threads import chunks_of, give_back, held_memory, in_words, memory_bound, useful_threads
+from ..threads import check_bound, chunks_of, give_back, useful_threads
 from ..truth.solid import Points, Solid, merged, read_mesh
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
@@ -201,13 +201,9 @@ class Certificate:
         if not self.has_evidence:
             said = ["no sample is exact, so the residual is unknown"]
             return "; ".join(said + [self._off()] * bool(self.sample_volume) + self.faults())
-        said = (
-            "residual {mean:.4f} voxels in the mean, {largest:.4f} at most, {share_above_tenth:.2%}"
-        )
-        said = f"{said} of {len(self.values):,} samples above {NOTICEABLE:g}".format(
-            **self.figures()
-        )
-        return "; ".join([said, *(self.faults() or ["no faults"])])
+        text = "residual {mean:.4f} voxels in the mean, {largest:.4f} at most, "
+        text += f"{{share_above_tenth:.2%}} of {len(self.values):,} samples above {NOTICEABLE:g}"
+        return "; ".join([text.format(**self.figures()), *(self.faults() or ["no faults"])])
 
     def residuals_at(self, vertices: NDArray[Any]) -> FloatArray:
         """Return the residual at positions on the mesh, (n,); NaN where no foot point is near.
@@ -287,14 +283,8 @@ def check_mesh(
     band = survey(lattice, offset, threads=useful_threads(0))
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)
-    bound, triangles = memory_bound(options.max_memory), len(mesh.faces)
-    need = triangles * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
-    need += held_memory() or 0
-    if bound is not None and need > bound:
-        raise OutOfMemoryError(
-            f"checking {triangles:,} triangles needs {in_words(need)} of memory, "
-            f"{in_words(bound)} may be taken in all; allow more (--max-memory)"
-        )
+    need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
+    check_bound(need, f"checking {len(mesh.faces):,} triangles", options.max_memory)
     surface = examine_surface(mesh, self_intersections(mesh) if intersections else None)
     found = touch(mesh, band, lattice, surface)
     give_back()

@@ -144,9 +144,8 @@ def _flat_steps(voxel_ijk: IntArray, shape: tuple[int, ...]) -> tuple[NDArray[np
 def is_lipschitz(patches: FloatArray, places: Iterable[int] = range(27)) -> BoolArray:
     """Return which patches (V, 27) can be distances, (V,) bool: those that are 1-Lipschitz.
 
-    The distances of two points differ by no more than the points are apart. This fails nearly
-    everywhere in a noisy field, and in many places of a field that is not a distance.
-    ``places`` are those of a patch that are compared with its centre.
+    This fails nearly everywhere in a noisy field, and in many places of a field that is not a
+    distance. ``places`` are those of a patch that are compared with its centre.
     """
     keeps = np.ones(len(patches), bool)
     for rows in chunks_of(len(patches), 4 * 27):  # in cache
@@ -180,16 +179,6 @@ def is_filled_in(patches: FloatArray) -> BoolArray:
             some = (size[at] > -JUMP / 2).all(1) & ~has_both_sides(patches[rows][at])
             found[rows.start + at] = some
     return found
-
-
-def can_hold_surface(patches: FloatArray, lipschitz: BoolArray) -> BoolArray:
-    """Return which voxels may contain a piece of the surface, (V,) bool.
-
-    If a patch can be distances (``lipschitz``), a sample farther from the surface than the voxel's
-    corners proves that the voxel holds none. Otherwise it proves nothing.
-    """
-    near: BoolArray = np.abs(patches[:, CENTRE]) <= DECODE_LIMIT
-    return near | ~lipschitz
 
 
 def exact_samples(

@@ -6,11 +6,9 @@ inside: no surface reaches into a sample's sphere. The network sees the samples 
 only, and its values exceed the bounds of farther ones at a tenth of the nodes. A sample that was
 cut off sets a weaker bound, no wrong one.
 
-Some blocks are left as they are. Where samples contradict each other the field is no distance.
-Where bounds would take a good part of a block's inside away, there is a wall thinner than the fine
-lattice, which the true distances at the nodes would lose, and the network's values keep.
-
-Lengths are in half voxels, as in ``band``.
+Some blocks are left as they are: where samples contradict each other, the field is no distance;
+where bounds would take a good part of a block's inside away, there is a wall thinner than the fine
+lattice, which the true distances at the nodes would lose. Lengths are in half voxels.
 """
 
 from __future__ import annotations
@@ -29,19 +27,18 @@ from .nodes import SharedParts, average_shared, block_ijk, block_offsets
 FARTHEST = 8.0  # of the samples that set bounds: four voxels
 REACH_OF_SAMPLES = 4  # voxels from a block's sample to those that bound its values
 REACH_IN_VOXELS = 2  # a block depends on those beside it, which may have a thin wall, and on theirs
-# A sample counts where the block's own sample is this close to its bound. Nearly all bounds that
-# values exceed are so, and one in ten of the others.
+# A sample counts where the block's own sample is this close to its bound: nearly all bounds that
+# values exceed, and one in ten of the others.
 SLACK = 1.0
-# A block stays as it is unless a value at 27 of its nodes is so far beyond a bound. Otherwise the
-# spheres that are nearly as far as these values count: other nodes lie between.
+# A block stays as it is unless a value at 27 of its nodes is so far beyond a bound; then all
+# spheres count that come this near to these values, since other nodes lie between.
 EXCEEDED, MARGIN = np.float32(0.002), np.float32(0.05)
 CONTRADICTION = 0.02  # that far beyond a bound, one of two samples is no distance
-# With larger cells the fit to the spheres makes up for what linear cells cut off, and bounds, which
-# hold for true distances, would undo half of that.
-LEAST_FACTOR = 4
+LEAST_FACTOR = 4  # in larger cells, bounds would undo what the fit to the spheres makes up for
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
-BOX_ROWS = 4096  # blocks at most that are worked on with one box of samples ...
-BOX_SAMPLES = 1 << 21  # ... of at most this size: far fewer blocks along a diagonal
+# Blocks that are worked on with one box of samples, and the largest box: of far fewer blocks, if
+# they lie along a diagonal.
+BOX_ROWS, BOX_SAMPLES = 4096, 1 << 21
 TEMPORARIES = 512  # numbers of each block in a chunk: four spheres at its nodes
 
 
@@ -118,10 +115,10 @@ def _cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
     size = np.ptp(voxel_ijk[rows], axis=0).astype(np.int64) + 2 * REACH_OF_SAMPLES + 1
     if size.prod() <= BOX_SAMPLES or rows.stop - rows.start == 1:
         yield rows
-        return
-    middle = (rows.start + rows.stop) // 2
-    yield from _cut_to_boxes(voxel_ijk, slice(rows.start, middle))
-    yield from _cut_to_boxes(voxel_ijk, slice(middle, rows.stop))
+    else:
+        middle = (rows.start + rows.stop) // 2
+        yield from _cut_to_boxes(voxel_ijk, slice(rows.start, middle))
+        yield from _cut_to_boxes(voxel_ijk, slice(middle, rows.stop))
 
 
 def _bounded(values: FloatArray, factor: int, around: FloatArray) -> FloatArray:

@@ -118,10 +118,7 @@ class FineField:
     def numbers(self) -> IntArray:
         """The nodes of each voxel's block as indices of ``values``, (D, Q); computed when read.
 
-        Raises
-        ------
-        OptionError
-            If there are more nodes than 32-bit numbers.
+        OptionError if there are more nodes than 32-bit numbers.
         """
         starts, _ = number_parts(self.parts, part_sizes(self.factor))
         part, place = part_of_node(self.factor)
@@ -144,10 +141,7 @@ class FineField:
     def positions(self) -> NDArray[np.float64]:
         """Return the world positions of all nodes, each once, (n, 3).
 
-        Raises
-        ------
-        OptionError
-            If the field was made without its ``grid``.
+        OptionError if the field was made without its ``grid``.
         """
         return self.placed.to_world(self.node_ijk / self.factor - 0.5)
 
@@ -156,13 +150,7 @@ class FineField:
         return self.in_world_units(self.values)
 
     def block_positions(self, rows: slice = slice(None)) -> NDArray[np.float64]:
-        """Return the world positions of the nodes of voxels' blocks, (m, Q, 3).
-
-        Parameters
-        ----------
-        rows : slice
-            The voxels, rows of ``voxel_ijk``; all by default.
-        """
+        """Return the world positions of the nodes of voxels' blocks, (m, Q, 3)."""
         return self.placed.to_world(self._block_node_ijk(rows) / self.factor - 0.5)
 
     def block_distances(self, rows: slice = slice(None)) -> NDArray[np.float64]:
@@ -191,11 +179,11 @@ class FineField:
 
 
 def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> bool:
-    """Return whether the surface crosses the border of the grid.
+    """Return whether the surface crosses the border of the fine lattice.
 
-    The border is that of the fine lattice, half a voxel beyond the outermost samples. So it may be
-    crossed though all samples on it are outside. Of a part of a grid, ``border`` (2, 3) are the
-    whole grid's first voxels and those after its last ones, counted from the first of the part.
+    That is half a voxel beyond the outermost samples, which may all be outside. Of a part of a
+    grid, ``border`` (2, 3) are the whole grid's first voxels and those after its last ones, counted
+    from the first of the part.
     """
     side = block_ijk(field.factor)
     for axis in range(3):

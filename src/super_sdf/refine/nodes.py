@@ -3,10 +3,9 @@
 Nodes have spacing h/K. A voxel's block is its Q = (K+1)^3 nodes, faces included (Eq. 3), in C
 order. Coarse sample i has the fine index ``K*i + K/2``.
 
-Values are stored by block in an array (Q, D): a row per node of the block, a column per voxel. An
-operation on a node is one pass over contiguous memory for all voxels. Blocks that share a node
-each hold a copy of its value; ``average_shared`` makes the copies equal, bit for bit, and they stay
-so. One more column, always 0, stands for absent voxels: their index -1 reads it.
+Values are stored by block in an array (Q, D): a row per node of the block, a column per voxel.
+Blocks that share a node each hold a copy of its value; ``average_shared`` makes the copies equal,
+bit for bit. One more column, always 0, stands for absent voxels: their index -1 reads it.
 
 A block has 27 parts: 8 corners, 12 edges, 6 faces and the interior, in the order of
 ``NEIGHBOURHOOD``. Voxels share whole parts. A part belongs to the first of the voxels that share
@@ -26,16 +25,13 @@ from numpy.typing import NDArray
 from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
 from ..threads import check_count, map_threads, worthwhile_threads
 
-# The value of a node of which only the sign is known, and the least of a mask's sample, in half
-# voxels.
+# Half voxels: the value of a node of which only the sign is known, the least of a mask's sample.
 BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
 LEAST_OF_MASK = np.float32(0.04)
 
 # The neighbours that share each part, the voxel itself included.
-SHARING = [
-    np.flatnonzero(((NEIGHBOURHOOD == 0) | (sides == NEIGHBOURHOOD)).all(1))
-    for sides in NEIGHBOURHOOD
-]
+IS_SHARED = ((NEIGHBOURHOOD == 0) | (NEIGHBOURHOOD[:, None] == NEIGHBOURHOOD)).all(2)
+SHARING = [np.flatnonzero(shared) for shared in IS_SHARED]
 
 
 def block_ijk(factor: int) -> IntArray:
@@ -151,8 +147,7 @@ def average_shared(
     """Set each copy of a shared node to the mean of the copies (Eq. 7), in ``blocks`` (Q, D + 1).
 
     Given ``rows``, only those of their blocks are set. Sums are taken in the order of the voxels
-    and in double precision (in single for two numbers, whose sum does not depend on the order), so
-    that all copies get the same bits and the result does not depend on how the work was divided.
+    and in double precision (of two numbers in single), so that all copies get the same bits.
     """
     some = slice(0, blocks.shape[1] - 1) if rows is None else rows
 
@@ -188,22 +183,20 @@ def _nodes_of_group(
     that are not shared. Places come in the order of the voxels that see the node there.
     """
     block = block_ijk(factor)
+    inner = (block > 0) & (block < factor)
     ends = [(1, 0) if shared else (0,) for shared in axes]
     places = [np.array(place, np.int32) for place in product(*ends)]
-    inner = (block > 0) & (block < factor)
-    nodes_at = [
-        np.flatnonzero(np.where(axes, block == factor * place, inner).all(1)) for place in places
-    ]
-    return places, nodes_at
+    at_ends = (np.where(axes, block == factor * place, inner).all(1) for place in places)
+    return places, [np.flatnonzero(nodes) for nodes in at_ends]
 
 
 def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: IntArray) -> None:
     """Give every sample of a mask its side, whatever the network says.
 
     A block's value at its sample is raised by adding a pyramid that is 0 on the faces of the block,
-    so that neighbouring blocks still agree. The lines between samples are the network's: it joins
-    slices of a thin vessel or plate across the line between two samples outside, and to hold that
-    line would drill a hole into the joint. The decoded rows of ``patches`` (V, 27) are ``voxels``.
+    so that neighbouring blocks still agree. Lines between samples are the network's: it joins
+    slices of a thin vessel or plate across the line between two samples outside. The decoded rows
+    of ``patches`` (V, 27) are ``voxels``.
     """
     sign = np.where(patches[voxels, CENTRE] > 0, np.float32(1), np.float32(-1))
     missing = np.maximum(LEAST_OF_MASK - sign * blocks[len(blocks) // 2, :-1], 0)

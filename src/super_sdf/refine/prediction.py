@@ -73,12 +73,7 @@ def predict(
 
 
 def interpolate(
-    band: Band,
-    table: IntArray,
-    voxels: IntArray,
-    network: Adapter,
-    factor: int,
-    threads: int = 1,
+    band: Band, table: IntArray, voxels: IntArray, network: Adapter, factor: int, threads: int = 1
 ) -> FloatArray:
     """Return the blocks of a field that is no distance: its spline, and the network at kinks.
 
@@ -106,6 +101,11 @@ def spline_blocks(
     """
     assert kind.smooth is not None
     samples, shape = kind.smooth, np.array(kind.smooth.shape)
+    # the weights of samples -2 to 2 for the nodes along an axis, (K + 1, 5)
+    far = np.abs(np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3))
+    linear = np.clip(1 - far, 0, None).astype(np.float32)
+    tails = np.clip(2 - far, 0, None) ** 3 / 6
+    cubic = np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, tails).astype(np.float32)
     blocks = np.zeros(((factor + 1) ** 3, len(voxel_ijk) + 1), np.float32)
     share = np.empty(len(voxel_ijk), np.float32)
     cube = np.ravel_multi_index(tuple((voxel_ijk // CUBE).T), tuple(shape // CUBE + 1))
@@ -117,12 +117,11 @@ def spline_blocks(
         values = np.stack([in_spacings(plane, unit) for plane in cropped(samples, low, high)])
         rough = roughness(values * np.float32(0.5))
         share[rows] = network_share(values * np.float32(0.5), rough)[tuple(ijk.T)]
-        found = _evaluate(prefilter(values), ijk + 2, node_weights(factor))
+        found = _evaluate(prefilter(values), ijk + 2, cubic)
         if kind.is_uneven:
             jumps = np.clip((rough[tuple(ijk.T)] - JUMPING) / (JUMPED - JUMPING), 0, 1)
             straight = np.pad(values, 2, mode="reflect", reflect_type="odd")
-            between = np.clip(1 - _from_samples(factor), 0, None).astype(np.float32)
-            found += jumps * (_evaluate(straight, ijk + 2, between) - found)
+            found += jumps * (_evaluate(straight, ijk + 2, linear) - found)
         blocks[:, rows] = found
     return blocks, share
 
@@ -163,19 +162,6 @@ def roughness(values: FloatArray) -> FloatArray:
         np.maximum(largest[:-1], lines[1:], out=largest[:-1])
         total = np.moveaxis(largest, 0, axis)
     return total
-
-
-def _from_samples(factor: int) -> NDArray[np.float64]:
-    """Return how far the nodes along an axis are from samples -2 to 2, (K + 1, 5)."""
-    return np.abs(np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3))
-
-
-def node_weights(factor: int) -> NDArray[np.float32]:
-    """Return the weights of the coefficients at -2 to 2 samples for the nodes along an axis."""
-    far = _from_samples(factor)
-    near = 2 / 3 - far**2 + far**3 / 2
-    weights = np.where(far < 1, near, np.clip(2 - far, 0, None) ** 3 / 6)
-    return weights.astype(np.float32)
 
 
 def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float32]) -> FloatArray:

@@ -4,13 +4,10 @@ An exact sample x with distance d is the centre of a sphere of radius |d| that t
 at its foot point x - d n, where n is the surface normal there. Samples of the band have one, and
 so have those a voxel beyond it: many of these touch the same edges and tips, of which the samples
 nearby say little. The refined field should be 0 at the foot points. It is not quite, since the
-network sees a sample as one number among many. In steps:
-
-1. ``find_foot_points`` follows the field's gradient from each exact sample to its foot point, and
-   reads the field there: the error, with a weight for how far to trust it.
-2. ``find_correction`` averages the errors at the corners of voxels, which also corrects walls that
-   lie between samples; then, twice, what is left of them on a lattice twice as fine.
-3. ``fit_to_spheres`` subtracts the averages from the field, by trilinear interpolation.
+network sees a sample as one number among many. ``find_foot_points`` reads the field there: the
+error. ``find_correction`` averages the errors at the corners of voxels, which also corrects walls
+that lie between samples; then, twice, what is left of them on a lattice twice as fine. The averages
+are subtracted from the field, interpolated trilinearly.
 
 Reference: Sellán, Batty and Stein, "Reach For the Spheres: Tangency-Aware Surface Reconstruction
 of SDFs", 2023, for the constraint; it is solved differently here.
@@ -23,8 +20,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +27,7 @@ from numpy.typing import NDArray
 from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
 from ..threads import chunks_of, map_chunks
 from .band import MAX_DISTANCE, MIN_SLOPE
-from .nodes import SharedParts, VoxelIndex, nodes_of_part, number_parts
+from .nodes import SharedParts, VoxelIndex, number_parts
 from .survey import Band
 
 BEYOND = 2.0  # samples this much farther than MAX_DISTANCE have spheres, too
@@ -52,14 +47,13 @@ TEMPORARIES = 64  # numbers per sample in the search for its foot point
 PRIOR_WEIGHT = 0.2  # of the assumption that the error is 0, in foot points
 VARIANCE_PENALTY = 0.5  # how strongly disagreement of the errors reduces their mean
 CORNER_PARTS = np.flatnonzero(np.abs(NEIGHBOURHOOD).all(1))
-# By cells along a block: how often errors are averaged on the lattice of such cells.
-MEANS = {1: 1, 2: 2}
+CELLS = 1, 2, 2  # along a block, of the lattice on which errors are averaged, each time
 
-# The fitted values of a block depend on this many planes of voxels to either side: one each time
-# that errors are averaged, for the foot points in the blocks beside; then the foot points' samples,
-# and the blocks in which these were searched for; and one for the averaging of shared nodes.
-SAMPLE_TO_FOOT = 2  # voxels: (MAX_DISTANCE + BEYOND) / 2, rounded
-REACH_IN_VOXELS = sum(MEANS.values()) + 2 * SAMPLE_TO_FOOT + 1
+# The fitted values of a block depend on this many voxels to either side: one each time that errors
+# are averaged, for the foot points in the blocks beside; then the foot points' samples, and the
+# blocks in which these were searched for; and one for the averaging of shared nodes.
+SAMPLE_TO_FOOT = 2  # (MAX_DISTANCE + BEYOND) / 2, rounded
+REACH_IN_VOXELS = len(CELLS) + 2 * SAMPLE_TO_FOOT + 1
 
 CELL = np.indices((2, 2, 2)).reshape(3, 8).T
 """The corners of a cell, (8, 3)."""
@@ -113,8 +107,7 @@ def fit_to_spheres(
     map_chunks(subtract, correction.shape[1], len(blocks), threads)
     own = spheres.some(np.abs(spheres.distance) < MAX_DISTANCE)
     rows = index.find(own.centre)
-    inside = nodes_of_part(factor)[CENTRE]
-    blocks[inside[len(inside) // 2], rows[rows >= 0]] = own.distance[rows >= 0]
+    blocks[len(blocks) // 2, rows[rows >= 0]] = own.distance[rows >= 0]
 
 
 def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
@@ -164,16 +157,31 @@ class FootPoints:
 def find_foot_points(
     blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, threads: int = 1
 ) -> FootPoints:
-    """Return the foot points of samples, leaving out those outside all blocks (Q, D + 1)."""
+    """Return the foot points of samples, leaving out those outside all blocks (Q, D + 1).
 
-    def search(rows: slice) -> FootPoints:
+    The weight falls with the angle between direction and normal, with the error (a Cauchy weight: a
+    large error is probably a place on the wrong part of the surface), and with the sample's
+    distance, since an error of the direction matters more. Spheres from beyond the band mostly
+    touch edges, which linear cells cut off: that they are clear of them is no error.
+    """
+
+    def search(rows: slice) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
         some = spheres.some(rows)
-        return _weigh(_touch(blocks, factor, some, index), some.distance)
+        found, size = _touch(blocks, factor, some, index), np.abs(some.distance)
+        clear = (size >= MAX_DISTANCE) & (found.clearance > 0)
+        unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
+        aligned = np.clip(_dot(found.direction, found.normal), 0, 1)
+        for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
+            aligned *= aligned
+        farther: FloatArray = np.maximum(size - np.float32(MAX_DISTANCE), 0)
+        penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
+        weights = aligned / penalty
+        kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
+        values = np.clip(found.value[kept], -MAX_ERROR, MAX_ERROR)
+        return found.rows[kept], found.place[:, kept], values, weights[kept]
 
     parts = map_chunks(search, len(spheres), TEMPORARIES, threads)
-    return FootPoints(
-        *(np.concatenate(each, -1) for each in zip(*(vars(part).values() for part in parts)))
-    )
+    return FootPoints(*(np.concatenate(each, -1) for each in zip(*parts)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,11 +195,6 @@ class Look:
     normal: FloatArray  # (3, n), its gradient, of length 1
     clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
 
-    @property
-    def cosine(self) -> FloatArray:
-        """The cosine between the direction and the normal, (n,)."""
-        return _dot(self.direction, self.normal)
-
 
 def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Look:
     """Return the places where spheres touch the surface.
@@ -201,64 +204,40 @@ def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex)
     direction is the normal there. Each look turns the direction some way to the normal; a turn
     that gains nothing is taken back, and the next one is smaller.
     """
-    found = _look_along(blocks, factor, spheres, index, spheres.direction)
+
+    def look(some: Spheres, direction: FloatArray) -> Look:
+        """Return what the field is where directions (3, n) meet spheres."""
+        half = some.distance * direction * np.float32(-0.5)
+        aside = np.rint(half)
+        rows = index.find(some.centre + aside.T.astype(np.int32)).astype(np.int32)
+        place = np.clip(half - aside + np.float32(0.5), 0, 1)
+        value, gradient = sample_trilinear(blocks, rows, place, factor)
+        outwards = np.copysign(np.float32(1), some.distance) * value
+        clearance = np.where(rows >= 0, outwards, np.float32(np.inf))
+        return Look(direction.copy(), rows, place, value, _unit(gradient), clearance)
+
+    found = look(spheres, spheres.direction)
     turn = np.full(len(spheres), FIRST_TURN, np.float32)
     for _ in range(LOOKS - 1):
-        rest = np.flatnonzero((found.rows >= 0) & (found.cosine < SETTLED))
+        cosine = _dot(found.direction, found.normal)
+        rest = np.flatnonzero((found.rows >= 0) & (cosine < SETTLED))
         if not len(rest):
             break
         direction, share = found.direction[:, rest], turn[rest]
         direction = _unit(direction + share * (found.normal[:, rest] - direction))
-        new = _look_along(blocks, factor, spheres.some(rest), index, direction)
+        new = look(spheres.some(rest), direction)
         better = new.clearance < found.clearance[rest]
-        turn[rest] = np.where(
-            better, np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
-        )
+        nearer, farther = np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
+        turn[rest] = np.where(better, nearer, farther)
         for mine, its in zip(vars(found).values(), vars(new).values()):
             mine[..., rest[better]] = its[..., better]
     return found
 
 
-def _look_along(
-    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, direction: FloatArray
-) -> Look:
-    """Return what the field is where directions (3, n) meet spheres."""
-    half = spheres.distance * direction * np.float32(-0.5)
-    aside = np.rint(half)
-    rows = index.find(spheres.centre + aside.T.astype(np.int32)).astype(np.int32)
-    place = np.clip(half - aside + np.float32(0.5), 0, 1)
-    value, gradient = sample_trilinear(blocks, rows, place, factor)
-    side = np.copysign(np.float32(1), spheres.distance)
-    clearance = np.where(rows >= 0, side * value, np.float32(np.inf))
-    return Look(direction.copy(), rows, place, value, _unit(gradient), clearance)
-
-
-def _weigh(found: Look, distance: FloatArray) -> FootPoints:
-    """Return foot points with their weights, leaving out those of almost no weight.
-
-    The weight falls with the angle between direction and normal, with the error (a Cauchy weight: a
-    large error is probably a place on the wrong part of the surface), and with the sample's
-    ``distance`` (n,), since an error of the direction matters more. Spheres from beyond the band
-    mostly touch edges, which linear cells cut off: that they are clear of them is no error.
-    """
-    clear = (np.abs(distance) >= MAX_DISTANCE) & (found.clearance > 0)
-    unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
-    aligned = np.clip(found.cosine, 0, 1)
-    for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
-        aligned *= aligned
-    farther: FloatArray = np.maximum(np.abs(distance) - np.float32(MAX_DISTANCE), 0)
-    penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
-    weights = aligned / penalty
-    kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
-    values = np.clip(found.value[kept], -MAX_ERROR, MAX_ERROR)
-    place = np.ascontiguousarray(found.place[:, kept])
-    return FootPoints(found.rows[kept], place, values, weights[kept])
-
-
 def _unit(vectors: FloatArray) -> FloatArray:
     """Return the vectors (3, n) scaled to length 1; 0 stays 0."""
-    length = np.maximum(np.sqrt(_dot(vectors, vectors)), np.float32(1e-6))
-    return (vectors / length).astype(np.float32, copy=False)
+    length: FloatArray = np.maximum(np.sqrt(_dot(vectors, vectors)), np.float32(1e-6))
+    return vectors / length
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -302,57 +281,46 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     """Return the correction on the lattice of 2 cells per block, (27, D), in half voxels.
 
     It is the mean error at the corners of voxels, interpolated to the finer lattice, plus the means
-    there of the errors that are left each time. Errors are summed in the order of the samples, some
-    at a time, to save memory.
+    there of the errors that are left each time. Where errors disagree, means are smaller. Errors
+    are summed in the order of the samples, some at a time, to save memory.
     """
     numbers, count = number_parts(parts, np.ones(27, np.int64))
     left, voxels = feet.values.copy(), numbers.shape[1]
     correction = np.zeros((len(numbers), voxels), np.float32)
-    before: tuple[int, FloatArray] | None = None  # the cells and means of the turn before
-    for cells in [cells for cells, turns in MEANS.items() for _ in range(turns)]:
+
+    def nodes_round(rows: slice, cells: int) -> tuple[NDArray[np.intp], FloatArray]:
+        """Return the 8 nodes round foot points, (8, n), and their trilinear weights there."""
+        low, within = _find_cell(feet.place[:, rows], cells)
+        step = STRIDES * (2 // cells)
+        at = (step @ low + (CELL @ step)[:, None]) * voxels + feet.rows[rows]
+        upper = np.stack([1 - within, within])  # (2, 3, n)
+        shares: FloatArray = upper[CELL[:, 0], 0] * upper[CELL[:, 1], 1] * upper[CELL[:, 2], 2]
+        return numbers.ravel().take(at).astype(np.intp), shares
+
+    def mean(some: slice) -> FloatArray:
+        weight, total, squares = sums[:, some]
+        plain = total / np.maximum(weight, 1e-9)
+        variance = np.maximum(squares / np.maximum(weight, 1e-9) - plain**2, 0)
+        agreement = plain**2 / np.maximum(plain**2 + VARIANCE_PENALTY * variance, 1e-12)
+        return np.asarray(agreement * total / (weight + PRIOR_WEIGHT), np.float32)
+
+    cells_before, means = 0, left[:0]
+    for cells in CELLS:
         sums = np.zeros((3, count))  # of weights, values and squares
         for rows in chunks_of(len(left), TEMPORARIES):
-            if before:
-                at, shares = _nodes_round(feet, rows, numbers, before[0])
-                left[rows] -= (before[1].take(at) * shares).sum(0)
-            at, shares = _nodes_round(feet, rows, numbers, cells)
+            if cells_before:
+                at, shares = nodes_round(rows, cells_before)
+                left[rows] -= (means.take(at) * shares).sum(0)
+            at, shares = nodes_round(rows, cells)
             weight = (shares * feet.weights[rows]).astype(np.float64)
             for total in sums:
                 np.add.at(total, at.T.ravel(), weight.T.ravel())
                 weight *= left[rows]
-        means = map_chunks(partial(_shrunk_mean, sums), count, 8)
-        before = cells, np.concatenate(means) if means else left[:0]
-        del sums
+        cells_before, means = cells, np.concatenate([left[:0], *map_chunks(mean, count, 8)])
         own = CORNER_PARTS if cells == 1 else slice(None)
         for rows in chunks_of(voxels, 4 * len(correction)):
-            correction[:, rows] += prolong(before[1].take(numbers[own, rows]), cells, 2)
+            correction[:, rows] += prolong(means.take(numbers[own, rows]), cells, 2)
     return correction
-
-
-def _nodes_round(
-    feet: FootPoints, rows: slice, numbers: IntArray, cells: int
-) -> tuple[NDArray[np.intp], FloatArray]:
-    """Return the 8 nodes round foot points, (8, n), and their trilinear weights there, (8, n).
-
-    The nodes have ``numbers`` (27, D) by the part of each block; with 1 cell along a block they are
-    the corners of blocks, with 2 all parts.
-    """
-    low, within = _find_cell(feet.place[:, rows], cells)
-    step = STRIDES * (2 // cells)
-    at = (step @ low + (CELL @ step)[:, None]) * numbers.shape[1] + feet.rows[rows]
-    upper = np.stack([1 - within, within])  # (2, 3, n)
-    shares: FloatArray = upper[CELL[:, 0], 0] * upper[CELL[:, 1], 1] * upper[CELL[:, 2], 2]
-    return numbers.ravel().take(at).astype(np.intp), shares
-
-
-def _shrunk_mean(sums: NDArray[Any], some: slice) -> FloatArray:
-    """Return means, (n,), by sums of weights, values and squares, shrunk if these disagree."""
-    weight, total, squares = sums[:, some]
-    mean = total / np.maximum(weight, 1e-9)
-    variance = np.maximum(squares / np.maximum(weight, 1e-9) - mean**2, 0)
-    agreement = mean**2 / np.maximum(mean**2 + VARIANCE_PENALTY * variance, 1e-12)
-    mean = agreement * total / (weight + PRIOR_WEIGHT)
-    return np.asarray(mean, np.float32)
 
 
 def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:

@@ -19,9 +19,9 @@ from ..grid.samples import let_go, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
 from ..threads import over_threads
 from .band import (
+    DECODE_LIMIT,
     HALF_BAND,
     PATCH_LIMIT,
-    can_hold_surface,
     exact_samples,
     gather_patches,
     has_both_sides,
@@ -36,15 +36,14 @@ from .bounds import FARTHEST, TrustedSamples
 MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
 FAR = 1e30  # half voxels: no sample of the band is there
 CELLS = 64  # along the longest axis, of the counts by which a large grid is cut
-# Distances must reach far enough beyond an offset, in half voxels, where they are truncated, and
-# where fill values begin: a surface too near these would come out in loose pieces. Neighbouring
-# samples of noisy distances differ by up to twice the spacing (4 half voxels); a distance and a
-# fill value differ by more, a jump. A small share of jumps is tolerated as outliers.
+# Half voxels beyond an offset within which distances must not be truncated, or fill values begin: a
+# surface too near would come out in loose pieces. The tolerances make the offset that the message
+# suggests work: for rounding, and because no sample lies exactly where fill values begin.
 CUT_OFF_MARGIN, FILL_MARGIN = HALF_BAND, 5.0
-MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
-# Tolerances in half voxels, so that the offset that the message suggests works: for rounding, and
-# because no sample lies exactly where fill values begin.
 ROUNDING, UNSAMPLED = 1e-3, 0.1
+# Neighbouring samples of noisy distances differ by up to twice the spacing (4 half voxels); a
+# distance and a fill value differ by more. A small share of jumps is tolerated as outliers.
+MIN_JUMP, MAX_JUMP_SHARE = 4.2, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,7 +210,7 @@ def _blocks(
         patches = np.empty((0, 27), np.float32)
         if len(ijk):
             start, stop = np.maximum(ijk.min(0) - 1, 0), ijk.max(0) + 2  # the rest is far away
-            around = rescaled[tuple(slice(a, b) for a, b in zip(start, stop))]
+            around = rescaled[tuple(map(slice, start, stop))]
             patches = gather_patches(around, ijk - start)
             if (filled := is_filled_in(patches)).any():
                 ijk, patches = ijk[~filled], patches[~filled]
@@ -228,7 +227,9 @@ def _blocks(
         elif grid.field.kind == "mask":
             decoded = has_both_sides(patches)
         else:
-            decoded = can_hold_surface(patches, lipschitz)
+            # only a patch that can be distances proves, by a sample far from the surface, that
+            # the voxel holds none
+            decoded = (np.abs(patches[:, CENTRE]) <= DECODE_LIMIT) | ~lipschitz
 
         faces = [rescaled[own, [0, -1]], rescaled[own, :, [0, -1]]]
         faces += [rescaled[0]] * (first == 0) + [rescaled[-1]] * (last == count)
@@ -242,7 +243,12 @@ def _blocks(
         )
         jumps = None
         if is_checked and offset:
-            _check_not_cut_off(patches, offset, grid.voxel_size)
+            centre = patches[:, CENTRE]  # never equal to all around, unless it was cut off
+            cut_off = (patches == centre[:, None]).all(1)
+            cut_off &= np.abs(centre) < CUT_OFF_MARGIN - ROUNDING
+            if cut_off.any():
+                end = offset + float(centre[cut_off][0]) * grid.voxel_size / 2
+                raise _too_near(grid, offset, end, CUT_OFF_MARGIN, outwards=end > 0)
             jumps = _count_jumps(rescaled, own)
         number, value = np.zeros(0, np.int64), np.zeros(0, np.float32)
         if sees_beyond(limits):
@@ -277,18 +283,6 @@ def _count_jumps(rescaled: FloatArray, own: slice) -> NDArray[np.float64]:
     return np.array(found, np.float64)
 
 
-def _check_not_cut_off(patches: FloatArray, offset: float, voxel_size: float) -> None:
-    """Raise GridError if the distances are truncated within 1.5 voxels of an offset.
-
-    ``patches`` (V, 27) are of the band there. A distance never equals all its neighbours.
-    """
-    centre = patches[:, CENTRE]
-    cut_off = (patches == centre[:, None]).all(1) & (np.abs(centre) < CUT_OFF_MARGIN - ROUNDING)
-    if cut_off.any():
-        end = offset + float(centre[cut_off][0]) * voxel_size / 2
-        raise _too_near(offset, voxel_size, end, CUT_OFF_MARGIN, outwards=end > 0)
-
-
 def _check_offset(jumps: list[NDArray[np.float64] | None], grid: SdfGrid, offset: float) -> None:
     """Raise GridError if no sample is near an offset, or fill values begin within 2.5 voxels."""
     if not offset:
@@ -300,14 +294,14 @@ def _check_offset(jumps: list[NDArray[np.float64] | None], grid: SdfGrid, offset
         (count, near, _), end = part.sum(0), part[:, 2].max()
         if count > MAX_JUMP_SHARE * near and end < FILL_MARGIN - UNSAMPLED:
             end = offset + side * end * grid.voxel_size / 2
-            raise _too_near(offset, grid.voxel_size, end, FILL_MARGIN, outwards=side > 0)
+            raise _too_near(grid, offset, end, FILL_MARGIN, outwards=side > 0)
 
 
 def _too_near(
-    offset: float, voxel_size: float, end: float, needed: float, *, outwards: bool
+    grid: SdfGrid, offset: float, end: float, needed: float, *, outwards: bool
 ) -> GridError:
     """Return the error for distances that end (world units) within ``needed`` half voxels."""
-    room = needed / 2 * voxel_size
+    room = needed / 2 * grid.voxel_size
     limit, which = (end - room, "largest") if outwards else (end + room, "smallest")
     works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"
     return GridError(

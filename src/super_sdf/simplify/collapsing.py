@@ -28,21 +28,16 @@ ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # of the sum of squares), in each pass. What an early pass gets wrong costs most time, so they rise;
 # with an end of 1.4 or 2.8, more triangles are left.
 PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0, 2.0
-ROUNDS, RISE = 30, 3.0  # of the threshold to its end; from more rounds, meshes get no smaller
-LARGE = 1 << 12  # triangles from which on rounds take time: fewer serve nearly as well
-FEW_ROUNDS, STEEP_RISE = 8, 5.0
-MOST_REPEATS = 16  # of passes, before smaller distances are tried
-HALVINGS = 3
-POINTS_AT_ONCE = 1 << 18
-SIDES = 2 / 3  # of the unsimplified mesh, between points of the pattern
+ROUNDS = 30, 3.0  # of the threshold, and its rise; from more rounds, meshes get no smaller
+FEW_ROUNDS, LARGE = (8, 5.0), 1 << 12  # nearly as well, from this many triangles on
+MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
+POINTS_AT_ONCE, SIDES = 1 << 18, 2 / 3  # sides of the unsimplified mesh between points
 # A number of triangles is sought by the error that leaves as many.
 MOST_ERRORS = 12  # that are tried
 FIRST_ERROR = 0.006  # in sides of a triangle, over the share of the triangles that is wanted
 STRIDE, CLOSE = 4.0, 1.02  # largest ratio of an error to the next, and smallest of two in the end
-FARTHEST = 0.05  # over the diagonal of the box: larger errors leave no fewer
-NEAR_END = 1.2  # ratio of the largest error that is of use to one that need not rise any more
-# Simplified once more within the same error, meshes have fewer triangles, by about this factor.
-MARGIN = 1.06
+FARTHEST, NEAR_END = 0.05, 1.2  # over the diagonal: larger errors leave no fewer; near it, to stop
+MARGIN = 1.06  # fewer triangles by about this factor if simplified again within the same error
 
 Collapse = Callable[[Mesh, NDArray[np.bool_]], Mesh]
 """Collapses edges of a mesh, but those of the triangles in a mask, (m,)."""
@@ -161,9 +156,9 @@ def collapsed(
         del meshes[first + 1 :], solids[first + 1 :], kept[first:]
         for number, collapse in enumerate(passes[first:], first):
             base = meshes[number]
-            chosen = np.zeros(len(base.vertices), bool)
+            chosen: NDArray[np.bool_] = np.zeros(len(base.vertices), bool)
             chosen[base.faces[solids[number].nearest_face(places[since <= number])]] = True
-            kept.append(chosen[base.faces].any(1))
+            kept.append(np.any(chosen[base.faces], axis=1))
             meshes.append(collapse(base, kept[number]))
             solids.append(Solid(meshes[-1]))
             if not len(meshes[-1].faces):
@@ -287,7 +282,7 @@ def same_topology(one: Mesh, other: Mesh) -> bool:
         triangles = np.bincount(component[mesh.faces[:, 0]], minlength=len(component))
         vertices = np.bincount(component[np.unique(mesh.faces)], minlength=len(component))
         numbers.append(np.sort((2 * vertices - triangles)[triangles > 0]))
-    return np.array_equal(*numbers)
+    return np.array_equal(numbers[0], numbers[1])
 
 
 def collapse_edges(
@@ -304,8 +299,7 @@ def collapse_edges(
     target = max(triangles - int(np.count_nonzero(kept)), 0)
     options: dict[str, Any] = {"target_count": target, "update_rate": 1}
     if distance:
-        few = len(mesh.faces) > LARGE
-        rounds, rise = (FEW_ROUNDS, STEEP_RISE) if few else (ROUNDS, RISE)
+        rounds, rise = FEW_ROUNDS if len(mesh.faces) > LARGE else ROUNDS
         options = {"target_count": 0, "max_iterations": rounds}
         options |= {"alpha": rounds**-rise, "K": 1, "aggressiveness": rise}  # to the distance
     unit = distance or mean_side(mesh)  # the length that pyfqmr's thresholds have
@@ -342,6 +336,6 @@ def irregular_places(mesh: Mesh) -> NDArray[np.float64]:
     for rows in (positions, np.sort(faces, axis=1).astype(np.float64)):
         _, inverse, uses = np.unique(row_keys(rows), return_inverse=True, return_counts=True)
         points.append(np.flatnonzero(uses[inverse] > 1))
-    points[2] = faces[points[2]].ravel()
+    points[2] = faces[points[2]].ravel().astype(np.intp)
     sides = (faces.ravel()[unpaired], np.roll(faces, -1, 1).ravel()[unpaired])
     return np.concatenate([positions[np.concatenate([end, *points])] for end in sides], axis=1)

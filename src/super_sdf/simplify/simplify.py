@@ -10,10 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from ..errors import OutOfMemoryError, check_modules
+from ..errors import check_modules
 from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
-from ..threads import give_back, held_memory, in_words, memory_bound
+from ..threads import check_bound, give_back
 
 # Peak of memory beside the mesh, measured on meshes of 120,000 to 760,000 triangles: 680 to 1,230,
 # with the libraries that it loads.
@@ -81,25 +81,19 @@ def simplify_mesh(
 
     Raises
     ------
-    OptionError
-        If not exactly one of ``error`` and ``triangles`` is given, or it is not positive.
-    FileError
-        If the extra ``simplify`` is not installed.
-    OutOfMemoryError
-        If it would not fit in memory.
+    OptionError, FileError, OutOfMemoryError
+        If not exactly one of ``error`` and ``triangles`` is given, or it is not positive; if the
+        extra ``simplify`` is not installed; if it would not fit in memory.
     """
     check_mesh(mesh)
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
-    bound, count = memory_bound(OPTIONS["max_memory"].check(max_memory)), len(mesh.faces)
-    need = count * BYTES_PER_TRIANGLE + (held_memory() or 0)
-    if bound is not None and need > bound:
-        raise OutOfMemoryError(
-            f"simplifying {count:,} triangles needs {in_words(need)} of memory; {in_words(bound)} "
-            "may be used; use a smaller factor, allow more (--max-memory), or do not simplify"
-        )
-    from .collapsing import Original, Solid, down_to, within  # need the extra
+    count, most = len(mesh.faces), OPTIONS["max_memory"].check(max_memory)
+    way_out = "use a smaller factor, do not simplify, or "
+    check_bound(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", most, way_out)
+    from ..truth.solid import Solid
+    from .collapsing import Original, down_to, within  # need the extra
 
     if not count:
         return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))

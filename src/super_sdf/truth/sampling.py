@@ -78,10 +78,7 @@ def fitted_layout(
         steps = np.ceil((high - low) / spacing + 2 * padding - 1e-6)
         origin = (low + high - steps * spacing) / 2  # not finite: refused by the grid
     if steps.max() >= MOST_ALONG_AXIS:
-        raise OptionError(
-            f"a spacing of {spacing:g} and a padding of {padding:g} voxels make {steps.max():.3g} "
-            "samples along an axis: give fewer"
-        )
+        raise OptionError(f"spacing is {spacing:g}: it makes {steps.max():.3g} samples an axis")
     nx, ny, nz = (int(count) + 1 for count in steps)
     return (nx, ny, nz), spacing, origin
 
@@ -121,14 +118,37 @@ def sample_grid(
         )
     need, size = prod(shape) * 4 + WORK_BYTES, " x ".join(map(str, shape))
     check_fits(need, f"a grid of {size}", "take fewer samples")
-    values = np.empty(shape, np.float32)
+    values, limit = np.empty(shape, np.float32), band * spacing
     corners = np.argwhere(np.ones([-(-n // EDGE) for n in shape], bool)) * EDGE
+    cube = np.moveaxis(np.indices((EDGE,) * 3), 0, -1)
+    within_cube = np.zeros((3, 3, 3, 3), bool)
+    within_cube[1] = ndimage.generate_binary_structure(3, 1)
     for start in range(0, len(corners), CHUNK):
         chunk = corners[start : start + CHUNK]
-        cubes = _sample_cubes(solid, chunk, layout, band * spacing)
-        for (i, j, k), cube in zip(chunk, cubes):
+        near = np.ones(len(chunk), bool)
+        cubes = np.empty((len(chunk), EDGE, EDGE, EDGE), np.float32)
+        if np.isfinite(limit) and solid.is_closed:
+            centres = (chunk + (EDGE - 1) / 2) * spacing + origin
+            near = solid.distance(centres) <= limit + 3**0.5 * (EDGE - 1) / 2 * spacing
+            sides = np.where(solid.is_inside(centres[~near]), -1, 1)
+            cubes[~near] = (sides * limit)[:, None, None, None]
+        points = (chunk[near][:, None, None, None] + cube).reshape(-1, 3) * spacing + origin
+        found = solid.distance(points)
+        # Neighbours that are both more than half a spacing from the surface are on the same side of
+        # it: one sample tells that of each connected region of them.
+        apart = (found > 0.5 * spacing * (1 + 1e-9)) & solid.is_closed
+        regions = ndimage.label(apart.reshape(-1, EDGE, EDGE, EDGE), within_cube)[0].ravel()
+        inside = np.zeros(len(points), bool)
+        inside[~apart] = solid.is_inside(points[~apart])
+        region, first = np.unique(regions[apart], return_index=True)
+        side = np.zeros(len(region) + 1, bool)
+        side[region] = solid.is_inside(points[apart][first])
+        inside[apart] = side[regions[apart]]
+        signed = np.where(inside, -found, found).clip(-limit, limit)
+        cubes[near] = signed.reshape(-1, EDGE, EDGE, EDGE)
+        for (i, j, k), one in zip(chunk, cubes):
             part = values[i : i + EDGE, j : j + EDGE, k : k + EDGE]
-            part[...] = cube[tuple(map(slice, part.shape))]
+            part[...] = one[tuple(map(slice, part.shape))]
         if progress:
             progress(min(start + CHUNK, len(corners)), len(corners))
     return values
@@ -138,38 +158,3 @@ def grid_points(layout: Layout) -> Points:
     """Return the position of every sample of a grid, (n, 3) in C order."""
     shape, spacing, origin = layout
     return np.indices(shape).reshape(3, -1).T * spacing + origin
-
-
-def _sample_cubes(
-    solid: Solid, corners: NDArray[np.int64], layout: Layout, limit: float
-) -> NDArray[np.float32]:
-    """Return the signed distances in cubes of samples, (c, 8, 8, 8), clamped at the limit.
-
-    Two neighbours that are both more than half a spacing from the surface are on the same side of
-    it. So the sign is evaluated at one sample of each connected region of such samples, and at
-    every other sample.
-    """
-    _, spacing, origin = layout
-    near = np.ones(len(corners), bool)
-    values = np.empty((len(corners), EDGE, EDGE, EDGE), np.float32)
-    if np.isfinite(limit) and solid.is_closed:
-        centres = (corners + (EDGE - 1) / 2) * spacing + origin
-        near = solid.distance(centres) <= limit + 3**0.5 * (EDGE - 1) / 2 * spacing
-        sides = np.where(solid.is_inside(centres[~near]), -1, 1)
-        values[~near] = (sides * limit)[:, None, None, None]
-    ijk = corners[near][:, None, None, None] + np.moveaxis(np.indices((EDGE,) * 3), 0, -1)
-    points = ijk.reshape(-1, 3) * spacing + origin
-    found = solid.distance(points)
-    away = (found > 0.5 * spacing * (1 + 1e-9)) & solid.is_closed
-    within_cube = np.zeros((3, 3, 3, 3), bool)
-    within_cube[1] = ndimage.generate_binary_structure(3, 1)
-    regions = ndimage.label(away.reshape(ijk.shape[:-1]), within_cube)[0].ravel()
-    inside = np.zeros(len(points), bool)
-    inside[~away] = solid.is_inside(points[~away])
-    region, first = np.unique(regions[away], return_index=True)
-    side = np.zeros(len(region) + 1, bool)
-    side[region] = solid.is_inside(points[away][first])
-    inside[away] = side[regions[away]]
-    signed = np.where(inside, -found, found).clip(-limit, limit)
-    values[near] = signed.reshape(-1, EDGE, EDGE, EDGE)
-    return values

@@ -8,7 +8,6 @@ gives the wrong sign on meshes that intersect themselves, as real ones do.
 from __future__ import annotations
 
 import logging
-import math
 import warnings
 import zipfile
 from functools import cached_property
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from ..errors import FileError, MeshError, OutOfMemoryError
 from ..files.regular import check_regular_file
 from ..surface.mesh import Mesh
-from ..threads import held_memory, in_words, memory_bound
+from ..threads import check_bound
 
 if TYPE_CHECKING:
     import igl
@@ -40,21 +39,15 @@ def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
     """Read any mesh file that trimesh reads, with merged float64 vertices.
 
     ``max_memory`` is how many bytes this process may hold, by default a share of the free memory.
-    FileError if no mesh can be read from the file; OutOfMemoryError if it is an archive, such as
-    ``.3mf``, that unpacks to more than fits in memory; MeshError if it has no triangles, faces with
-    missing vertices, or coordinates that are not finite or larger than ``LARGEST_COORDINATE``.
+    FileError if no mesh can be read; OutOfMemoryError if the file is an archive, such as ``.3mf``,
+    that unpacks to more than fits in memory; MeshError if what it holds is no finite surface.
     """
     path = check_regular_file(path)
     try:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 need = XML_BYTES * sum(info.file_size for info in archive.infolist())
-            left = (memory_bound(max_memory) or math.inf) - (held_memory() or 0)
-            if need > left:
-                raise OutOfMemoryError(
-                    f"{path}: to read it takes {in_words(need)} of memory, "
-                    f"{in_words(int(max(left, 0)))} are left; save it as .ply or .stl"
-                )
+            check_bound(need, str(path), max_memory, "save it as .ply or .stl, or ")
         import trimesh
 
         logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python prints them
@@ -145,9 +138,11 @@ class Solid:
 
         An edge of four faces counts as closed: the winding number is an integer on all its sides.
         """
-        faces = self.mesh.faces
-        start, end = faces.ravel().astype(np.int64), np.roll(faces, -1, axis=1).ravel()
-        key = np.minimum(start, end) * (faces.max(initial=0) + 1) + np.maximum(start, end)
+        start, end = (
+            self.mesh.faces.ravel().astype(np.int64),
+            np.roll(self.mesh.faces, -1, 1).ravel(),
+        )
+        key = np.minimum(start, end) * (start.max(initial=0) + 1) + np.maximum(start, end)
         _, edge = np.unique(key, return_inverse=True)
         return int(np.count_nonzero(np.bincount(edge, np.sign(end - start))))
 
