@@ -120,7 +120,7 @@ def bad_files() -> None:
 CASES = {
     "none.npy": "none.npy does not exist",
     "empty.npy": "empty.npy is empty",
-    "text.npz": "text.npz cannot be read as NumPy: ",
+    "text.npz": "text.npz is not a readable .npz archive: write it by numpy.savez",
     "objects.npy": "objects.npy holds Python objects",
     "other.npz": "other.npz has no key 'values' (it holds field, more)",
     "short.npy": "short.npy is truncated",
