@@ -1,8 +1,7 @@
 """Work on a Dask cluster (extra ``cluster``): the files of a batch, or the tiles of one grid.
 
-Dask distributes the tasks, and gives those of a worker that died to another one, as often as its
-scheduler allows (``allowed-failures``). A worker works at as many tasks at a time as Dask gave it
-threads, each on one thread and with its share of the memory.
+Dask gives the tasks of a worker that died to another one, as often as its scheduler allows
+(``allowed-failures``). Each thread of a worker has one task, and its share of the memory.
 """
 
 from __future__ import annotations
@@ -39,6 +38,9 @@ FIRST_WORKER_SECONDS = 10  # that a cluster has to show a worker
 LOOK_SECONDS = 1.0  # between two looks at whether there are workers
 PATIENCE_SECONDS = 60.0  # without any worker
 SHARE = 0.75  # of a worker's limit: Dask gives it no more work at 0.8, and kills it at 0.95
+ALONE = {"threads_per_worker": 1, "host": "127.0.0.1", "silence_logs": logging.CRITICAL} | {
+    f"{prefix}dashboard_address": None for prefix in ("", "worker_")
+}
 CONFIG = {
     "distributed.nanny.pre-spawn-environ": {},  # it would stay in the environment of this process
     "distributed.scheduler.allowed-failures": 1,
@@ -65,18 +67,12 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
             if address == LOCAL:
                 os.environ.setdefault("PYTHONSAFEPATH", "1")  # import nothing from this folder
                 stack.enter_context(dask.config.set(CONFIG))
-                cluster = LocalCluster(
-                    n_workers=workers or count_cores(),
-                    threads_per_worker=1,
-                    host="127.0.0.1",  # nobody else hears them
-                    dashboard_address=None,
-                    worker_dashboard_address=None,
-                    memory_limit=(max_memory or 0) // (workers or count_cores()),
-                    silence_logs=logging.CRITICAL,
-                )
-                server = {"address": stack.enter_context(cluster)}
+                count = workers or count_cores()
+                share = {"n_workers": count, "memory_limit": (max_memory or 0) // count}
+                server = {"address": stack.enter_context(LocalCluster(**share, **ALONE))}
             elif not is_file:
-                asyncio.run(_greet(address))
+                known = Security().get_connection_args("client")  # a Client would wait for ever
+                asyncio.run(asyncio.wait_for(comm.connect(address, **known), CONNECT_SECONDS))
             client = Client(**server, timeout=CONNECT_SECONDS, set_as_default=False)
         except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
             is_silent = isinstance(error, (OSError, *TIMEOUTS)) or not str(error)
@@ -90,25 +86,17 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
         # This question needs nothing of super-sdf where it is answered.
         answers = client.run(pkgutil.resolve_name, "super_sdf:__version__", on_error="return")
         if not answers:
-            way_out = f"start some with 'dask worker {address}'"
-            raise ClusterError(f"the Dask scheduler at {address} has no workers: {way_out}")
+            lack = f"the Dask scheduler at {address} has no workers"
+            raise ClusterError(f"{lack}: start some with 'dask worker {address}'")
         for worker, version in answers.items():
             _check_version(worker, version, __version__)
         yield client
 
 
-async def _greet(address: str) -> None:
-    """Raise if a scheduler does not answer in time: a Client would wait for ever."""
-    arguments = Security().get_connection_args("client")
-    peer = await asyncio.wait_for(comm.connect(address, **arguments), CONNECT_SECONDS)
-    await peer.close()
-
-
 def _check_version(worker: str, there: Any, here: str) -> None:
     """Raise ClusterError unless a worker has the version of the process that asks."""
     if there != here:
-        has = "none" if isinstance(there, Exception) else there
-        said = f"worker {worker} has another super-sdf ({has}) than here ({here})"
+        said = f"worker {worker} has another super-sdf ({there}) than here ({here})"
         raise ClusterError(f"{said}: install the same version there and here")
 
 
@@ -118,9 +106,8 @@ def completed(
     """Yield tasks with their results as the workers complete them.
 
     ``take`` returns the next task, None while there is none; ``work(task, memory)`` is called in a
-    worker with the bytes that it may hold, if known. The result is a Death if the workers died that
-    had the task, or if it raised an error that is not SuperSdfError. ClusterError if the scheduler
-    or all workers are lost.
+    worker with the bytes that it may hold, if known. The result is a Death if workers died of it or
+    a bug was met. ClusterError if the scheduler or all workers are lost.
     """
     running, threads, seen = dict[Any, Task](), 0, time.monotonic()
     try:
@@ -141,17 +128,18 @@ def completed(
             for future in done:
                 task = running.pop(future)
                 try:
-                    yield task, future.result()
+                    result = future.result()
                 except (SuperSdfError, *CANCELLED):
                     raise
-                except KilledWorker as error:
-                    times = error.allowed_failures + 1
-                    hint = "(most likely out of memory)"
-                    yield task, Death(f"was lost {times} times by the cluster {hint}")
                 except ImportError as error:
                     raise ClusterError(f"a worker cannot import super-sdf: {error}") from None
                 except Exception as error:
-                    yield task, Death(f"ended with {type(error).__name__}: {error}".split("\n")[0])
+                    said = f"ended with {type(error).__name__}: {error}".split("\n")[0]
+                    if isinstance(error, KilledWorker):
+                        said = f"was lost {error.allowed_failures + 1} times by the cluster (most "
+                        said += "likely out of memory)"
+                    result = Death(said)
+                yield task, result
     except CANCELLED:
         raise ClusterError("the Dask scheduler was lost: run it again") from None
     finally:
@@ -163,15 +151,12 @@ def _at_worker(version: str, work: Callable[..., Any], task: Any) -> Any:
     """Work at a task in a worker, which may have come after the others were checked."""
     worker = get_worker()
     _check_version(worker.address, __version__, version)
-    limit = worker.memory_manager.memory_limit
-    return work(task, memory=int(SHARE * limit / worker.state.nthreads) if limit else None)
+    limit = worker.memory_manager.memory_limit or 0
+    return work(task, memory=int(SHARE * limit / worker.state.nthreads) or None)
 
 
 def tiles_on(client: Client) -> Callable[..., Iterator[Any]]:
-    """Return the ``map_tiles`` of ``mesh_grid`` that has tiles made on a cluster.
-
-    A tile says which worker made it. ClusterError if workers died of a tile.
-    """
+    """Return the ``map_tiles`` of ``mesh_grid`` that has tiles made, and signed, by workers."""
 
     def map_tiles(make: Callable[[Any], Any], tasks: Iterator[Any]) -> Iterator[Any]:
         def work(task: Any, memory: int | None) -> Any:
@@ -190,8 +175,7 @@ def convert_on_cluster(
 ) -> Generator[tuple[Job, Any], None, None]:
     """Yield the jobs that ``take`` returns with their rows, as they are converted on a cluster.
 
-    The workers have to see the inputs, of which the ``first`` is looked for, and the output folder
-    by the same paths. ``workers`` are processes of this machine, for ``--cluster local``.
+    Workers have to see inputs, of which the ``first`` is looked for, and outputs by the same paths.
     """
     options, items, base = settings.options, settings.items, Path.cwd()
     files = [base / stage, base / split_member(first.source)[0]]

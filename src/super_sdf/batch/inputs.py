@@ -1,11 +1,7 @@
 """Finds the inputs of a batch and names their outputs: files, folders, patterns and lists.
 
 The folders below a given folder, or below the fixed part of a pattern, are mirrored in the output
-folder. A list is ``.txt`` with a path per line, or ``.jsonl`` with an object per line:
-
-    {"in": "a.npy", "out": "parts/a.stl", "spacing": 0.5, "inside": "negative"}
-
-Inputs are relative to the list, outputs to the output folder; the other keys are options.
+folder. A list is ``.txt`` with a path per line, or ``.jsonl`` with an object per line.
 """
 
 from __future__ import annotations
@@ -23,12 +19,10 @@ from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
 from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix, format_of
 from ..files.regular import is_store, reason_of
 from ..labels.files import Names, with_numbers
-from ..options import BATCH_LISTS, GOALS, OPTIONS, Options
+from ..options import BATCH_LISTS, GOALS, Options
 from .record import OWN_NAMES, Row
 
 LIST_SUFFIXES = (".txt", ".jsonl")
-TO_DO, DONE, FAILED = "to_do", "done", "failed"
-DONE_BEFORE, FAILED_BEFORE, REFUSED = "done_before", "failed_before", "refused"
 
 
 @dataclass
@@ -39,7 +33,7 @@ class Job:
     mesh: str  # the mesh, below the output folder
     options: Options
     wrong: str = ""  # why there is nothing to convert: of a folder that cannot be read
-    state: str = TO_DO
+    state: str = "to_do"  # or done, failed, done_before, failed_before, refused
     row: Row = field(default_factory=dict)  # its line of the report, once there is one
 
     @property
@@ -50,10 +44,9 @@ class Job:
     @property
     def target(self) -> str:
         """The name of the output: of the mesh, or for files of labels a pattern, ``a-*.stl``."""
-        if not self.has_label_files:
-            return self.mesh
         path = PurePath(self.mesh)
-        return path.with_name(f"{path.stem}-*{path.suffix}").as_posix()
+        end = "-*" * self.has_label_files + path.suffix
+        return path.with_name(path.stem + end).as_posix()
 
     def failed(self, reason: str, content: Any = None) -> Row:
         """Return the row of the job if it failed, and is to be tried again."""
@@ -64,7 +57,8 @@ class Job:
     def failure(self) -> str:
         """Return which file failed and why, in one line."""
         source, reason = str(self.source), str(self.row["reason"])
-        return one_line(reason if source in reason else f"{source}: {reason}")
+        said = reason if source in reason else f"{source}: {reason}"
+        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
 
 
 def find_jobs(
@@ -72,14 +66,14 @@ def find_jobs(
 ) -> list[Job]:
     """Return the jobs that the arguments name, each once: files, folders, patterns, lists.
 
-    ``suffix`` is the mesh file format, such as ".ply", and ``options`` are those of all jobs; a
-    list may say otherwise. ``names`` are those of labels, in place of which jobs have numbers.
-    OptionError if an argument names no grid, or if two inputs would become one output; FileError if
-    a list, or the only folder, cannot be read.
+    ``suffix`` is the mesh file format, such as ".ply"; a list may say otherwise, and have other
+    options. ``names`` are those of labels. OptionError if an argument names no grid, or if two
+    inputs would become one output; FileError if a list, or the only folder, cannot be read.
     """
-    by_target, chosen = dict[str, Job](), with_numbers(options, names)
+    by_target = dict[str, Job]()
     for argument in arguments:
-        for job in _expand(argument, suffix, chosen, names):
+        for job in _expand(argument, suffix, options):
+            job.options = with_numbers(job.options, names)
             other = by_target.setdefault(os.path.normcase(job.target), job)
             same = os.path.abspath(other.source) == os.path.abspath(job.source)
             if not (same and other.options == job.options):
@@ -92,12 +86,12 @@ def find_jobs(
     return list(by_target.values())
 
 
-def _expand(argument: str, suffix: str, options: Options, names: Names | None) -> list[Job]:
+def _expand(argument: str, suffix: str, options: Options) -> list[Job]:
     """Return the jobs that one argument stands for, with those of folders that cannot be read."""
     path, kinds, paths = Path(argument), ", ".join(GRID_SUFFIXES), list[Path]()
     unread = list[OSError]()
     if path.suffix.lower() in LIST_SUFFIXES and path.is_file():
-        return list(_read_list(path, suffix, options, names))
+        return list(_read_list(path, suffix, options))
     if argument and path.is_dir() and not is_store(path):
         root = path
         for at, folders, files in os.walk(path, onerror=unread.append):
@@ -121,26 +115,21 @@ def _expand(argument: str, suffix: str, options: Options, names: Names | None) -
         raise OptionError(said)
     # Anything with a grid's suffix counts. If it is no regular file, its job fails and names it.
     grids = sorted({p for p in paths if is_grid(p) and (is_store(p) or not p.is_dir())})
-    if not grids and unread:
-        raise FileError(f"{unread[-1].filename} {reason_of(unread[-1])}")
     if not grids:
+        if unread:
+            raise FileError(f"{unread[-1].filename} {reason_of(unread[-1])}")
         raise OptionError(f"{argument} holds no grid ({kinds})")
-    jobs = list[Job]()
-    for grid in grids:
-        target = mesh_path(grid.relative_to(root), suffix, options.label)
-        jobs.append(Job(grid, target.as_posix(), options))
+    targets = (mesh_path(grid.relative_to(root), suffix, options.label) for grid in grids)
+    jobs = [Job(grid, target.as_posix(), options) for grid, target in zip(grids, targets)]
     for error in unread:
         folder, why = Path(error.filename), f"{error.filename} {reason_of(error)}"
-        target = folder.relative_to(root) / f"*{suffix}"
-        jobs.append(Job(folder, target.as_posix(), options, wrong=why))
+        target = Path(folder.relative_to(root), f"*{suffix}").as_posix()
+        jobs.append(Job(folder, target, options, wrong=why))
     return jobs
 
 
-def _read_list(path: Path, suffix: str, options: Options, names: Names | None) -> Iterator[Job]:
-    """Yield a job for each line of a list; OptionError with the number of one that is not valid.
-
-    Blank lines, and in ``.txt`` lines that start with ``#``, are skipped.
-    """
+def _read_list(path: Path, suffix: str, options: Options) -> Iterator[Job]:
+    """Yield a job for each line of a list; OptionError with the number of one that is not valid."""
     try:
         lines = path.read_text("utf-8-sig").split("\n")
     except (OSError, UnicodeDecodeError) as error:
@@ -155,26 +144,22 @@ def _read_list(path: Path, suffix: str, options: Options, names: Names | None) -
             entry = {"in": line} if is_text else json.loads(line)
             if not isinstance(entry, dict):
                 raise OptionError(f'{seen(entry)}: give an object, {{"in": "a.npy"}}')
-            yield _job_of(entry, path.parent, suffix, options, names)
-        except OptionError as error:
-            raise OptionError(f"{path}, line {number}: {error}") from None
+            yield _job_of(entry, path.parent, suffix, options)
         except (ValueError, RecursionError) as error:
-            raise OptionError(f"{path}, line {number}: no JSON: {error}") from None
+            kind = "" if isinstance(error, OptionError) else "no JSON: "
+            raise OptionError(f"{path}, line {number}: {kind}{error}") from None
 
 
-def _job_of(
-    entry: dict[str, Any], home: Path, suffix: str, options: Options, names: Names | None
-) -> Job:
+def _job_of(entry: dict[str, Any], home: Path, suffix: str, options: Options) -> Job:
     """Return the job that a line describes."""
     source, target = entry.pop("in", None), entry.pop("out", None)
     if not isinstance(source, str) or PurePath(source).name in ("", "..") or "\0" in source:
         raise OptionError(f"'in' is {seen(source)}: give the path of a grid")
     if unknown := sorted(entry.keys() - set(BATCH_LISTS)):
         raise OptionError(f"{seen(unknown[0])} is unknown: give in, out, {', '.join(BATCH_LISTS)}")
-    asked = {name: OPTIONS[name].check(value, repr(name)) for name, value in entry.items()}
-    if asked.keys() & set(GOALS):  # one of them replaces the others
-        asked = {**dict.fromkeys(GOALS), **asked}
-    chosen = with_numbers(replace(options, **asked), names)
+    if entry.keys() & set(GOALS):  # one of them replaces the others
+        entry = {**dict.fromkeys(GOALS), **entry}
+    chosen = replace(options, **entry)
     if target is None:
         path = mesh_path(PurePath(source), suffix, chosen.label)
         inside = not path.is_absolute() and ".." not in path.parts
@@ -186,8 +171,3 @@ def _job_of(
     if give:
         raise OptionError(f"'out' is {seen(target)}: give {give}")
     return Job(home / source, path.as_posix(), chosen)
-
-
-def one_line(text: str) -> str:
-    """Return a text as one printable line; other characters, as in file names, are escaped."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -1,8 +1,7 @@
 """What a batch remembers: ``report.jsonl`` in its output folder, and fingerprints of files.
 
 The report has a JSON line for every file that was converted, or failed; the last line of an output
-counts. Lines are appended. A line that a killed process left unfinished is passed over, and cut off
-before the next one is written.
+counts. A line that a killed process left unfinished is passed over, and the next one replaces it.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from ..errors import FileError, WriteError
+from ..errors import FileError
 from ..files.formats import split_member
 from ..files.output import naming
 from ..files.regular import files_of, is_store
@@ -37,18 +36,13 @@ Row = dict[str, Any]
 
 
 class Record:
-    """The rows of an output folder; FileError if its ``report.jsonl`` is something else.
-
-    ``rows`` are the last ones by output. ``made`` are all contents that a batch wrote: SHA-256 by
-    output and name of the file.
-    """
+    """The rows of an output folder; FileError if its ``report.jsonl`` is something else."""
 
     def __init__(self, folder: Path) -> None:
         self.path, self.size = folder / NAME, 0  # bytes of whole lines
-        self.rows: dict[str, Row] = {}
+        self.rows: dict[str, Row] = {}  # the last ones, by output
+        # SHA-256 of all contents that a batch wrote, by output and name of the file
         self.made: dict[str, dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
-        if os.path.exists(self.path) and not self.path.is_file():  # opening a pipe would block
-            raise FileError(f"{self.path} is no regular file: remove it")
         try:
             with suppress(FileNotFoundError), self.path.open("rb") as file:
                 for line in file:
@@ -85,13 +79,14 @@ class Record:
         """Keep what is a row in memory; pass over a line that is none."""
         with suppress(TypeError, KeyError, AttributeError):
             known, content = outputs_of(row), row["content"] or {"sha256": ""}
-            texts = [row[key] for key in ("in", "out", "status")]
-            texts += [each["sha256"] for each in (content, *known.values())]
+            texts = [row["in"], row["out"], row["status"], content["sha256"]]
+            digests = {name: each["sha256"] for name, each in known.items()}
+            texts += digests.values()
             is_row = isinstance(row["asked"], dict) and isinstance(row["retry"], bool)
-            if is_row and " ".join(texts):
+            if is_row and all(isinstance(text, str) for text in texts):
                 self.rows[row["out"]] = row
-                for name, each in known.items():
-                    self.made[row["out"]][name].add(each["sha256"])
+                for name, digest in digests.items():
+                    self.made[row["out"]][name].add(digest)
 
 
 def outputs_of(row: Row) -> dict[str, Fingerprint]:
@@ -129,28 +124,27 @@ def file_state(path: Path) -> tuple[int, int]:
 
 def is_unchanged(path: Path, known: Fingerprint | None, *, same_path: bool = True) -> bool:
     """Return whether a file has a known fingerprint; None stands for one that cannot be read."""
-    if known is None:
-        file, _ = split_member(path)
-        return not ((os.path.isfile(file) or is_store(file)) and os.access(file, os.R_OK))
     with suppress(OSError):  # the content is read only if the time or the path is another
-        if same_path and file_state(path) == (known.get("size"), known.get("mtime_ns")):
+        state = (known or {}).get("size"), (known or {}).get("mtime_ns")
+        if same_path and file_state(path) == state:
             return True
-    return bool((fingerprint(path) or {}).get("sha256") == known["sha256"])
+    return (fingerprint(path) or {}).get("sha256") == (known or {}).get("sha256")
 
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
     """Make an output folder and hold its lock within the block; FileError if a batch has it."""
     lock = FileLock(folder / LOCK_NAME, timeout=0)
-    try:
+    with naming(folder):
         folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire()
-    except Timeout:
-        way_out = "wait for it, or give another"
-        raise FileError(f"{folder} is in use by another batch: {way_out}") from None
-    except OSError as error:
-        if error.errno not in NO_LOCKS:
-            raise WriteError(f"{folder} cannot be written: {error.strerror}") from error
+        try:
+            lock.acquire()
+        except Timeout:
+            said = f"{folder} is in use by another batch: wait for it, or give another"
+            raise FileError(said) from None
+        except OSError as error:
+            if error.errno not in NO_LOCKS:
+                raise
     try:
         yield
     finally:

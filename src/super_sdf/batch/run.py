@@ -1,8 +1,7 @@
-"""Runs a batch.
+"""Runs a batch; to go on after a kill, or with other inputs or options, it is run again.
 
-To resume after a kill, or with new inputs or other options, run it again: it does only what is not
-done yet with the same content and options. A failure caused by the input stands until the input
-changes; others, such as a killed process or a full disk, are tried again.
+Only what is not done yet with the same content and options is done. Failures caused by an input
+stand until it changes; others, such as a killed process or a full disk, are tried again.
 
 Meshes are made in a folder within the output folder. When one is complete, its row is added to the
 report, and then it is moved to its place: so whatever is killed, a file that is there and that the
@@ -28,11 +27,11 @@ from ..network.network import find_model
 from ..network.onnx import available_devices
 from ..progress import Progress
 from ..threads import allot_each, count_cores, free_memory
-from .inputs import DONE, DONE_BEFORE, FAILED, FAILED_BEFORE, REFUSED, TO_DO, Job
+from .inputs import Job
 from .record import STAGE_NAME, Record, Row, file_state, fingerprint, is_unchanged, outputs_of
 from .work import Death, Settings, convert_job, work_in_processes
 
-WORK_PER_WORKER = 30_000  # by ``expected_work``: done in the time that a process takes to start
+SMALL_BATCH, EACH = 4_000_000, 100_000  # bytes that are done while a process starts; for any file
 BYTES_PER_WORKER = 10**9  # for the network and a grid of 128^3, where --jobs is not given
 MIN_BYTES_PER_WORKER = 3 * 10**8  # with less a worker cannot convert anything
 
@@ -40,7 +39,7 @@ MIN_BYTES_PER_WORKER = 3 * 10**8  # with less a worker cannot convert anything
 class Batch:
     """A batch as it stands, first as planned: each job has its state and, if there is one, a row.
 
-    Jobs that are ``REFUSED`` would replace what is not theirs.
+    Jobs that are refused would replace what is not theirs.
     """
 
     def __init__(self, jobs: Sequence[Job], settings: Settings) -> None:
@@ -68,14 +67,13 @@ class Batch:
 
     def run(self, progress: Progress | None = None) -> None:
         """Convert what is to be converted; call ``progress`` after each file is in the report."""
-        for job in self.of(REFUSED):
-            if not job.wrong and job.row["reason"] != self.record.rows.get(job.target, {}).get(
-                "reason"
-            ):
+        for job in self.of("refused"):
+            known = self.record.rows.get(job.target, {})
+            if not job.wrong and job.row["reason"] != known.get("reason"):
                 self.record.add(job.row)
-        left = sorted(self.of(TO_DO), key=lambda job: -expected_work(job))
+        left = sorted(self.of("to_do"), key=size_of, reverse=True)
         total, done, died = len(left), 0, set[str]()  # outputs whose worker died once
-        if not left or (self.settings.fail_fast and self.of(FAILED_BEFORE, REFUSED)):
+        if not left or (self.settings.fail_fast and self.of("failed_before", "refused")):
             return
         parts = self.settings.folder / STAGE_NAME
         stage = parts / secrets.token_hex(4)  # orphans on a cluster write into another one
@@ -84,11 +82,11 @@ class Batch:
             stage.mkdir(parents=True)
         try:
             for job, row in self._results(left, stage):
-                if isinstance(row, Death) and job.target not in died:
-                    died.add(job.target)
-                    left.append(job)  # once more, after the others
-                    continue
                 if isinstance(row, Death):
+                    if job.target not in died:
+                        died.add(job.target)
+                        left.append(job)  # once more, after the others
+                        continue
                     row = job.failed(f"the process that converted it {row}, twice")
                 self._keep(job, row, stage)
                 done += 1
@@ -100,8 +98,8 @@ class Batch:
     def _results(self, left: list[Job], stage: Path) -> Generator[tuple[Job, Any], None, None]:
         """Convert in this process, in processes or on a cluster; yield jobs with their rows."""
         settings, options, count = self.settings, self.settings.options, len(left)
-        if not (settings.workers or settings.cluster):
-            count = min(count, 1 + int(sum(map(expected_work, left)) / WORK_PER_WORKER))
+        if not (settings.workers or settings.cluster):  # small ones are sooner done here
+            count = min(count, 1 + sum(map(size_of, left)) // SMALL_BATCH)
         count = count_workers(settings.workers, options.device, count, options.max_memory)
         threads, memory = options.threads, options.max_memory
         if count > 1:  # before the workers fill the memory
@@ -125,13 +123,13 @@ class Batch:
 
     def _keep(self, job: Job, row: Row, stage: Path) -> None:
         """Add the row of a finished job to the report, then move its files to their places."""
-        folder, names = self.settings.folder, list(outputs_of(row))
+        folder, names, how = self.settings.folder, list(outputs_of(row)), self._how(job)
         if why := self._why_not(job, names):
             row = job.failed(why, row["content"])
         if "labels" in row:
             others = self.record.made.get(job.target, {}).keys() - set(names)
             row["beside"] = sorted(name for name in others if os.path.lexists(folder / name))
-        job.row = row | self._how(job)
+        job.row = row | how
         self.record.add(job.row)
         try:
             for name in names if row["status"] == "ok" else ():
@@ -140,10 +138,10 @@ class Batch:
                 self.written[name] = job.target
         except OSError as error:
             why = f"{folder / name} cannot be written: {error.strerror}"
-            job.row = job.failed(why, row["content"]) | self._how(job)
+            job.row = job.failed(why, row["content"]) | how
             self.record.add(job.row)
-        job.state = DONE if job.row["status"] == "ok" else FAILED
-        self.has_failed |= job.state == FAILED
+        job.state = "done" if job.row["status"] == "ok" else "failed"
+        self.has_failed |= job.state == "failed"
 
     def _why_not(self, job: Job, names: Iterable[str]) -> str:
         """Return why a job may not write some files, "" if it may."""
@@ -151,8 +149,7 @@ class Batch:
             path = self.settings.folder / name
             known = self.record.made.get(job.target, {}).get(name, set())
             if self.written.get(name, job.target) != job.target:
-                way_out = "give its inputs other names (out)"
-                return f"{path} was written while this batch ran: {way_out}"
+                return f"{path} was written while this batch ran: give its inputs other names (out)"
             if os.path.islink(path):
                 return f"{path} is a link: remove it"
             if os.path.realpath(path) in self.inputs:
@@ -171,20 +168,19 @@ class Batch:
             now, old = ({**{k: each.get(k) for k in how}, **each["asked"]} for each in (how, row))
             keys = (now | old).keys() - {"asked", "precision"}
             changed = {key for key in keys if now.get(key) != old.get(key)}
+            again = settings.check and "check" not in row if is_ok else settings.retry
             same_path = row["in"] == os.path.abspath(job.source)
             if (
-                not (settings.force or row["retry"] or changed - {"model"})
-                and (is_ok or not settings.retry)
-                and not (is_ok and settings.check and "check" not in row)
+                not (settings.force or row["retry"] or again or changed - {"model"})
                 and is_unchanged(job.source, row["content"], same_path=same_path)
                 and all(is_unchanged(settings.folder / n, k) for n, k in outputs_of(row).items())
             ):
-                job.row, job.state = row, DONE_BEFORE if is_ok else FAILED_BEFORE
+                job.row, job.state = row, "done_before" if is_ok else "failed_before"
                 return
         # of files of labels those of the row are known; others show when the job has made its own
         targets = [job.target] if not job.has_label_files else outputs_of(row) if row else []
         if why := job.wrong or self._why_not(job, targets):
-            job.row, job.state = job.failed(why) | how, REFUSED
+            job.row, job.state = job.failed(why) | how, "refused"
         elif is_ok and changed - {"model"}:
             self.changed[job.target] = sorted(changed - {"turns"})
 
@@ -193,14 +189,12 @@ class Batch:
         asked, names = job.options.digest(), self.settings.names
         if job.options.labels is not None and names:  # a hash stands for the table
             asked["names"] = hashlib.sha256(json.dumps(names).encode()).hexdigest()
-        how: Row = json.loads(json.dumps({**self.network, "asked": asked}))
-        return how
+        return dict(json.loads(json.dumps({**self.network, "asked": asked})))
 
     def write_page(self, path: Path, lead: str, interrupted: str = "") -> None:
-        """Write the page of the batch as it stands, whose first sentence is ``lead``.
+        """Write the page of the batch as it stands, also of other runs' rows, but not of labels.
 
-        It has the rows of the report, also of runs with other inputs; those of labels are left out.
-        If the batch was interrupted, which is then said, no mesh is drawn that was not yet.
+        ``lead`` is its first sentence. After an interrupt no mesh is drawn that was not yet.
         """
         from ..pages import html, items
 
@@ -212,27 +206,27 @@ class Batch:
                 del rows[name]
 
         def draw(name: str) -> items.Item | None:
-            if interrupted or name not in jobs:
-                return None
-            return items.item_of_files(folder / name, jobs[name].source, jobs[name].options)
+            if (job := jobs.get(name)) and not interrupted:
+                return items.item_of_files(folder / name, job.source, job.options)
+            return None
 
-        left, why = len(self.of(TO_DO)), f", {interrupted}" * bool(interrupted)
+        left, why = len(self.of("to_do")), f", {interrupted}" * bool(interrupted)
         alert = f"Incomplete{why}: {left} not finished; run it again to go on"
         facts = {"title": f"Batch: {folder}", "lead": lead, "alert": alert if left or why else ""}
         html.write_batch_page(path, facts, rows, draw, force=self.settings.force)
 
 
-def expected_work(job: Job) -> float:
-    """Return the estimated work of a job: proportional to its surface, plus a constant."""
+def size_of(job: Job) -> int:
+    """Return the bytes of an input, and what any file costs."""
     with suppress(OSError):
-        return 1000 + float(file_state(job.source)[0] ** (2 / 3))
-    return 1000
+        return EACH + file_state(job.source)[0]
+    return EACH
 
 
 def count_workers(asked: int, device: str, jobs: int, max_memory: int | None = None) -> int:
     """Return how many processes to use: as asked, or one per core; no more than there is to do."""
-    if not asked and (device == "cuda" or (device == "auto" and "cuda" in available_devices())):
-        return 1
+    if not asked and device != "cpu" and (device == "cuda" or "cuda" in available_devices()):
+        return 1  # on a GPU
     free, cores = max_memory or free_memory(), count_cores()
     room = cores if free is None else free // (MIN_BYTES_PER_WORKER if asked else BYTES_PER_WORKER)
     return max(1, min(asked or cores, cores, room, jobs))

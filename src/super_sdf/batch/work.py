@@ -1,8 +1,4 @@
-"""The work of a batch: one file converted, and worker processes, of which any may die.
-
-A worker gets one task at a time: so the task of one that dies is known, and a new worker takes its
-place.
-"""
+"""The work of a batch: one file converted, and worker processes, of which any may die."""
 
 from __future__ import annotations
 
@@ -26,7 +22,7 @@ from ..files.output import naming
 from ..labels.files import Names, convert_labels
 from ..network.network import load_network
 from ..options import Options
-from .inputs import Job, one_line
+from .inputs import Job
 from .record import Row, fingerprint
 
 Task = TypeVar("Task")
@@ -55,10 +51,7 @@ class Settings:
 def convert_job(
     job: Job, settings: Settings, stage: Path, threads: int = 0, memory: int | None = None
 ) -> Row:
-    """Convert a file to meshes in the folder ``stage``, by the names that they will have.
-
-    An error becomes a row, too, unless the network cannot be loaded, once in each process.
-    """
+    """Convert a file to meshes in the folder ``stage``; an error is a row, too."""
     start, content = time.perf_counter(), fingerprint(job.source)
     bounds = [bound for bound in (memory, job.options.max_memory) if bound]
     options, target = replace(job.options, max_memory=min(bounds, default=None)), stage / job.mesh
@@ -85,13 +78,12 @@ def convert_job(
         row |= {"status": "ok", "reason": None, "retry": False}
     except Exception as error:  # a bug that one file shows must not cost the others
         by_input = isinstance(error, (GridError, OptionError, FileError))
-        row = job.failed(_reason(error), content)
-        row["retry"] = not by_input or isinstance(error, WriteError)
+        retry = not by_input or isinstance(error, WriteError)
+        row = job.failed(_reason(error), content) | {"retry": retry}
     row["seconds"] = round(time.perf_counter() - start, 4)
     # sentences may name files, which will be in the output folder
     staged, final = (json.dumps(str(path))[1:-1] for path in (stage, settings.folder))
-    moved: Row = json.loads(json.dumps(row).replace(staged, final))
-    return moved
+    return dict(json.loads(json.dumps(row).replace(staged, final)))
 
 
 def _check(job: Job, settings: Settings, mesh: Path, made: Conversion, sha256: str) -> Row:
@@ -111,13 +103,12 @@ def _check(job: Job, settings: Settings, mesh: Path, made: Conversion, sha256: s
 
 
 def _reason(error: Exception) -> str:
-    """Return what went wrong, in one line; the package's own messages are for users as they are."""
-    first = one_line(next(iter(str(error).splitlines()), ""))
+    """Return what went wrong; the package's own messages are for users as they are."""
     if isinstance(error, SuperSdfError):
-        return first
+        return str(error)
     if isinstance(error, MemoryError):
         return "out of memory: use a smaller --factor or grid"
-    return f"{type(error).__name__}: {first}"
+    return f"{type(error).__name__}: {error}"
 
 
 class Death(str):
@@ -125,7 +116,7 @@ class Death(str):
 
 
 class Worker:
-    """A process that works at one task at a time, and says in a pipe what came of it."""
+    """A process that gets one task at a time: so the task of one that dies is known."""
 
     def __init__(self, work: Callable[[Any], Any]) -> None:
         os.environ.setdefault("PYTHONSAFEPATH", "1")  # import nothing from the current folder
@@ -139,8 +130,7 @@ class Worker:
         self.process.join(seconds)
         self.process.kill()
         self.process.join()
-        code = self.process.exitcode or 0
-        if code >= 0:
+        if (code := self.process.exitcode or 0) >= 0:
             return Death(f"ended with exit code {code}")
         hint = " (most likely out of memory)" * (code == -9)
         return Death(f"was killed by {signal.Signals(-code).name}{hint}")
@@ -164,8 +154,7 @@ def work_in_processes(
 ) -> Generator[tuple[Task, Any], None, None]:
     """Yield tasks with their results, or a Death, as ``count`` processes complete them.
 
-    ``take`` returns the next task, None while there is none. What ``work`` raises is raised here;
-    SuperSdfError if processes only die.
+    ``take`` returns the next task, None while there is none. What ``work`` raises is raised here.
     """
     idle, running, deaths = list[Worker](), dict[Any, tuple[Worker, Task]](), 0
     try:
