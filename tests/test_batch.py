@@ -422,7 +422,7 @@ def test_after_kills_at_random_moments_nothing_is_lost_and_nothing_made_twice():
     """Workers and batches are killed; afterwards each mesh is as its only row says."""
     larger_grids(30)
     chance, words = random.Random(0), ("batch", "in", "--out", "out", "--jobs", 2, *SMALL)
-    for killed in range(4):
+    for _ in range(4):
         before, process = recorded(), start_command(*words)
         while process.poll() is None and recorded() == before:  # a fast machine may be through
             time.sleep(0.01)
