@@ -208,4 +208,4 @@ def test_no_permission_and_no_memory_are_one_line_each(here, command, monkeypatc
 def test_wrong_values_are_named_in_lists_by_their_names(here, command):
     Path("list.jsonl").write_text('{"in": "in.npy", "simplify": -1}')
     _, _, err = command("batch", "list.jsonl", "--out", "out", "--simplify", "0.5")
-    assert "'simplify' is -1: give a number" in err and "--simplify" not in err
+    assert "simplify is -1: give a number" in err and "--simplify" not in err
