@@ -49,7 +49,7 @@ def read_metaimage(request: Request) -> Volume:
     try:
         reader.ReadImageInformation()
     except RuntimeError:
-        raise FileError("ITK finds its header damaged, or that of no MetaImage") from None
+        raise FileError("its header is damaged, or not that of a MetaImage file") from None
     size, kept = reader.GetSize(), kept_axes(reader.GetSize())
     if len(kept) != 3 or reader.GetNumberOfComponents() != 1:
         more = f" of {reader.GetNumberOfComponents()} numbers"

@@ -169,7 +169,7 @@ def find_patches(
 
 
 def nth_of_run(counts: NDArray[Any]) -> Index:
-    """Return 0, 1, ... for each of runs of so many entries, one run after the other."""
+    """Return the index of each entry within its run, given the lengths of consecutive runs."""
     nth: Index = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     return nth
 
