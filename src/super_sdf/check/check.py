@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import OptionError
 from ..files.grids import read_grid
-from ..files.mesh_writers import write_coloured_ply
+from ..files.meshes import write_coloured_ply
 from ..files.output import check_free
 from ..grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from ..options import LENGTHS, MASK, Options

@@ -70,7 +70,7 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     from ..batch.record import folder_lock
     from ..batch.run import Batch
     from ..batch.work import Settings
-    from ..files.regular import files_of
+    from ..files.formats import files_of
     from ..labels.files import check_options, read_names
 
     names = read_names(given["names"]) if given["names"] else None

@@ -65,8 +65,8 @@ def command(mesh: Path, grid: Path, **given: Any) -> None:
     """Check the mesh, print the certificate, and fail where it exceeds a limit."""
     check_modules("check", "report", ("igl",))
     from ..check import check
+    from ..files.formats import files_of
     from ..files.output import check_apart
-    from ..files.regular import files_of
 
     out, force, quiet = given["out"], given["force"], given["quiet"]
     limits = {name: given[name] for name in check.LIMITS}

@@ -56,7 +56,7 @@ def command(source: str, target: str, **given: Any) -> None:
     if given["names"] and options.labels is None:
         raise OptionError(f"--names {given['names']} is for --labels: give that, too")
     if given["report"]:
-        from ..files.regular import files_of
+        from ..files.formats import files_of
 
         others = [*files_of(source), target, *[given["save_field"]] * bool(given["save_field"])]
         main.check_page("--report", given["report"], others, force=given["force"])
