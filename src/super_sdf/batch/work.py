@@ -80,7 +80,7 @@ def convert_job(
         by_input = isinstance(error, (GridError, OptionError, FileError))
         retry = not by_input or isinstance(error, WriteError)
         row = job.failed(_reason(error), content) | {"retry": retry}
-    row["seconds"] = round(time.perf_counter() - start, 4)
+    row |= {"precision": network.precision, "seconds": round(time.perf_counter() - start, 4)}
     # sentences may name files, which will be in the output folder
     staged, final = (json.dumps(str(path))[1:-1] for path in (stage, settings.folder))
     return dict(json.loads(json.dumps(row).replace(staged, final)))
@@ -105,7 +105,7 @@ def _check(job: Job, settings: Settings, mesh: Path, made: Conversion, sha256: s
 def _reason(error: Exception) -> str:
     """Return what went wrong; the package's own messages are for users as they are."""
     if isinstance(error, SuperSdfError):
-        return str(error)
+        return error.flagged
     if isinstance(error, MemoryError):
         return "out of memory: use a smaller --factor or grid"
     return f"{type(error).__name__}: {error}"
