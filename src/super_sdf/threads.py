@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from math import ceil, inf
 from pathlib import Path
+from threading import Thread
 from typing import TypeVar
 
 from .errors import OptionError, OutOfMemoryError
@@ -90,6 +91,28 @@ def map_chunks(
 ) -> list[Result]:
     """Return ``work(rows)`` for chunks of ``count`` rows that need ``width`` temporaries each."""
     return map_threads(work, chunks_of(count, width), worthwhile_threads(count * width, threads))
+
+
+def call_beside(work: Callable[[], object], stop: Callable[[], object]) -> None:
+    """Do some work in another thread, and ``stop`` it at an interrupt; errors are passed on."""
+    failures: list[Exception] = []
+
+    def run() -> None:
+        try:
+            work()
+        except Exception as error:
+            failures.append(error)
+
+    thread = Thread(target=run)
+    thread.start()
+    try:
+        thread.join()
+    except BaseException:
+        stop()
+        thread.join()
+        raise
+    if failures:
+        raise failures[0]
 
 
 def count_cores() -> int:

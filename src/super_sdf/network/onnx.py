@@ -14,16 +14,16 @@ import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout
+from functools import partial
 from math import ceil
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import DeviceError, ModelError
-from ..threads import count_cores
+from ..threads import call_beside, count_cores
 
 
 def first_line(error: Exception) -> str:
@@ -106,14 +106,6 @@ def run(session: ort.InferenceSession, feeds: Mapping[str, Any], device: str = "
     values = np.empty(shape if on_cpu else 0, np.float32)  # in the arena it could not be shrunk
     if not on_cpu or voxels > SMALL or values.size > SMALL_OUTPUT:
         options.add_run_config_entry(SHRINK, "cpu:0" if on_cpu else "gpu:0")
-    failures: list[Exception] = []
-
-    def work() -> None:
-        try:
-            session.run_with_iobinding(binding, options)
-        except Exception as error:
-            failures.append(error)
-
     with failures_on(device):
         binding, output, rows = session.io_binding(), session.get_outputs()[0].name, CUDA_CHUNK
         if on_cpu:
@@ -131,16 +123,10 @@ def run(session: ort.InferenceSession, feeds: Mapping[str, Any], device: str = "
         chunk = ort.OrtValue.ortvalue_from_numpy(np.array([rows]), "cpu", 0)
         if any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers()):
             binding.bind_ortvalue_input(CHUNK_INPUT, chunk)
-        running = Thread(target=work)
-        running.start()
-        try:
-            running.join()
-        except BaseException:
-            options.terminate = True
-            running.join()
-            raise
-        if failures:
-            raise failures[0]
+        call_beside(
+            partial(session.run_with_iobinding, binding, options),
+            stop=lambda: setattr(options, "terminate", True),
+        )
         return values if on_cpu else binding.copy_outputs_to_cpu()[0]
 
 
