@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from math import ceil, inf
 from pathlib import Path
@@ -73,6 +72,8 @@ def over_threads(
     if threads < 2:
         yield from map(work, pieces)
         return
+    from concurrent.futures import ThreadPoolExecutor  # imported here, as small grids need none
+
     with ThreadPoolExecutor(threads) as pool:
         yield from pool.map(work, pieces)
 

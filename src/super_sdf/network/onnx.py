@@ -13,10 +13,10 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, redirect_stdout
 from math import ceil
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -106,7 +106,15 @@ def run(session: ort.InferenceSession, feeds: Mapping[str, Any], device: str = "
     values = np.empty(shape if on_cpu else 0, np.float32)  # in the arena it could not be shrunk
     if not on_cpu or voxels > SMALL or values.size > SMALL_OUTPUT:
         options.add_run_config_entry(SHRINK, "cpu:0" if on_cpu else "gpu:0")
-    with failures_on(device), ThreadPoolExecutor(1) as pool:
+    failures: list[Exception] = []
+
+    def work() -> None:
+        try:
+            session.run_with_iobinding(binding, options)
+        except Exception as error:
+            failures.append(error)
+
+    with failures_on(device):
         binding, output, rows = session.io_binding(), session.get_outputs()[0].name, CUDA_CHUNK
         if on_cpu:
             threads = session.get_session_options().intra_op_num_threads or count_cores()
@@ -123,12 +131,16 @@ def run(session: ort.InferenceSession, feeds: Mapping[str, Any], device: str = "
         chunk = ort.OrtValue.ortvalue_from_numpy(np.array([rows]), "cpu", 0)
         if any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers()):
             binding.bind_ortvalue_input(CHUNK_INPUT, chunk)
-        running = pool.submit(session.run_with_iobinding, binding, options)
+        running = Thread(target=work)
+        running.start()
         try:
-            running.result()
+            running.join()
         except BaseException:
             options.terminate = True
+            running.join()
             raise
+        if failures:
+            raise failures[0]
         return values if on_cpu else binding.copy_outputs_to_cpu()[0]
 
 
