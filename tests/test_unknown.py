@@ -58,7 +58,8 @@ def test_an_unknown_region_between_inside_and_outside_cannot_be_closed():
     assert refusal(GridError, reconstruct, grid, trilinear) == (
         "96 samples are unknown, values[14, 0, 20] the first, in regions that touch samples on "
         "both sides of the surface, so whether they are inside is unknown; end the surface there "
-        "(cap=False), or replace each by a distance of the right sign (the cut-off value of its side)"
+        "(cap=False), or replace each by a distance of the right sign (the cut-off value of its "
+        "side)"
     )
 
 

@@ -37,6 +37,15 @@ def flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
+def in_a_line(error: BaseException) -> str:
+    """Return what went wrong, for users of the command line."""
+    if isinstance(error, SuperSdfError):
+        return " ".join(error.flagged.splitlines())
+    if isinstance(error, MemoryError):
+        return "out of memory: use a smaller --factor or grid"
+    return f"{type(error).__name__}: {error}"
+
+
 def _keyword(found: re.Match[str]) -> str:
     """Return the keyword of Python for a flag and the word behind it, which may be its value."""
     name, value, more = found[1].replace("-", "_"), found[2], ", " if found[3] else ""

@@ -46,12 +46,11 @@ class Batch:
         self.changed: dict[str, list[str]] = {}  # options of meshes that are made again
         self.written: dict[str, str] = {}  # in this run: the output of each file
         self.inputs = {os.path.realpath(job.source) for job in jobs}
-        self.has_failed, self.seconds = False, 0.0  # of the run, for those who measure it
+        self.has_failed, self.seconds = False, 0.0  # of the run
         chosen = settings.options.network()
         path, turns = find_model(chosen["model"], chosen["precision"])
-        self.network = {"version": __version__, "turns": turns}  # over which it is averaged
+        self.network = {"version": __version__, "turns": turns, "model": chosen["model"]}
         self.network["network"] = (fingerprint(path) or {}).get("sha256")
-        self.network["model"] = chosen["model"]
         for job in jobs:
             self._plan(job)
 
@@ -61,13 +60,13 @@ class Batch:
 
     def plan(self) -> dict[str, list[dict[str, Any]]]:
         """Return the files that are to be done, or were done or failed in earlier runs."""
-        said: dict[str, list[dict[str, Any]]] = {}
-        for state in ("to_do", "done_before", "failed_before", "refused"):
-            said[state] = []
-            for job in self.of(state):
-                reason = {"reason": job.row["reason"]} if job.row.get("reason") else {}
-                said[state].append({"in": os.path.abspath(job.source), "out": job.target, **reason})
-        return said
+
+        def known(job: Job) -> dict[str, Any]:
+            reason = {"reason": job.row["reason"]} if job.row.get("reason") else {}
+            return {"in": os.path.abspath(job.source), "out": job.target, **reason}
+
+        states = "to_do", "done_before", "failed_before", "refused"
+        return {state: [known(job) for job in self.of(state)] for state in states}
 
     def made_again(self) -> dict[str, Any]:
         """Return how many outputs are made again since options changed, and which options."""

@@ -73,28 +73,23 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
 
 def in_words(facts: dict[str, Any]) -> Iterator[str]:
     """Yield facts as lines: a line each, and one for each note and each grid of an OpenVDB file."""
-
-    def in_word(value: Any, unit: str = "") -> str:
-        if isinstance(value, float):
-            return f"{value:.10g}"
-        return (
-            "not stated"
-            if value is None
-            else f"{value:,}{unit}"
-            if isinstance(value, int)
-            else str(value)
-        )
-
     for key, value in facts.items():
         values = value if isinstance(value, (list, tuple)) else [value]
         if key == "notes":
             yield from (f"note: {note}" for note in values)
         elif key == "grids":
-            for grid in values:
-                shown = [in_word(x, " active voxels") for x in grid.values() if x]
-                yield f"grid: {', '.join(shown)}"
+            for name, kind, class_, count in map(dict.values, values):
+                active = f", {count:,} active voxels" if count is not None else ""
+                yield f"grid: {name}, {kind}, {class_}{active}"
         elif values:
             yield f"{key.replace('_', ' ')}: {', '.join(map(in_word, values))}"
+
+
+def in_word(value: Any) -> str:
+    """Return a value of a fact as text."""
+    if isinstance(value, float):
+        return f"{value:.10g}"
+    return "not stated" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def gather_facts() -> dict[str, Any]:

@@ -5,7 +5,6 @@ Options come from the table in ``options``; an error is one line on stderr and a
 
 from __future__ import annotations
 
-import difflib
 import io
 import json
 import os
@@ -21,7 +20,7 @@ from typing import Any
 import click
 
 from .. import __version__
-from ..errors import OptionError, SuperSdfError, check_modules, flag
+from ..errors import OptionError, SuperSdfError, check_modules, flag, in_a_line
 from ..options import GRID, MESH, OPTIONS, VALUES, WORK, Options
 
 COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
@@ -47,7 +46,9 @@ class Commands(click.Group):
         if cmd_name in COMMANDS:
             found: click.Command = import_module(f"..{cmd_name}", __name__).command
             return found
-        near = difflib.get_close_matches(cmd_name, COMMANDS, 1)
+        from difflib import get_close_matches  # imported here, as few need it
+
+        near = get_close_matches(cmd_name, COMMANDS, 1)
         way_out = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}"
         ctx.fail(f"there is no command {cmd_name!r}: {way_out}")
 
@@ -180,10 +181,7 @@ def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bo
 def progress_bar(
     label: str, quiet: bool, before: str = ""
 ) -> Iterator[Callable[[int, int], None] | None]:
-    """Draw a progress bar with the remaining time on stderr; None if stderr is no terminal.
-
-    Its label is ``before`` until there is progress: so a user sees what takes time at 0 %.
-    """
+    """Draw a progress bar on a terminal's stderr, labelled ``before`` until there is progress."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
@@ -232,6 +230,8 @@ def main() -> None:
     A signal raises KeyboardInterrupt, so that files that were begun are removed; one that the
     parent process ignores, as ``nohup`` does, stays ignored. Every error is one line on stderr.
     """
+    # NumPy's BLAS has only small matrices to multiply, and its idle threads would keep cores busy.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     heard: list[int] = []
 
     def hear(number: int, frame: FrameType | None) -> None:
@@ -273,10 +273,8 @@ def _fault(error: BaseException, heard: list[int]) -> tuple[str, int]:
         return f"{said}: {kept[0]}" if kept else said, 128 + heard[0]
     if isinstance(error, click.ClickException):
         return error.format_message(), error.exit_code
-    if isinstance(error, SuperSdfError):
-        return " ".join(error.flagged.splitlines()), 1 + isinstance(error, OptionError)
-    if isinstance(error, MemoryError):
-        return "out of memory: use a smaller --factor or grid", 1
+    if isinstance(error, (SuperSdfError, MemoryError)):
+        return in_a_line(error), 1 + isinstance(error, OptionError)
     if isinstance(error, OSError):  # the system refused something, such as a file handle
         named = f"{error.filename}: " if error.filename else ""
         return f"{named}{error.strerror or error}", 1
