@@ -34,6 +34,12 @@ def dot(a: Vectors, b: Vectors) -> Numbers:
     return product
 
 
+def inner(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """Return the products of vectors in columns, (3, ...): faster than in rows."""
+    product: NDArray[Any] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product
+
+
 def cross(a: Vectors, b: Vectors) -> Vectors:
     """Return the cross products of vectors, (n, 3)."""
     product: Vectors = np.empty_like(a)

@@ -163,7 +163,7 @@ def choose_cases(
     unsure = np.flatnonzero(table.ambiguous[corners])
     low, row = cells_low_nodes(field.factor)[cell[unsure]], row[unsure]
     steps = CORNERS @ strides(field.factor)
-    values = [field.blocks[low + step, row].astype(np.float64) for step in steps]
+    values = [field.at(low + step, row).astype(np.float64) for step in steps]
     joined = np.zeros(len(unsure), np.uint8)
     for n, (a, b, c, d) in enumerate(FACES):
         excess = values[a] * values[c] - values[b] * values[d]
@@ -190,13 +190,14 @@ def lattice_positions(
     ``border`` is that of the grid, see ``cap``.
     """
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
-    low = field.blocks[node, row].astype(np.float64)
-    high = field.blocks[edge_ends(field.factor)[edge], row].astype(np.float64)
+    low = field.at(node, row).astype(np.float64)
+    high = field.at(edge_ends(field.factor).take(edge), row).astype(np.float64)
     share = np.clip(low / (low - high), CLEARANCE, 1 - CLEARANCE)
     positions = np.empty((3, len(row)))
+    voxels, nodes = field.voxel_ijk.take(row, 0), block_ijk(field.factor).take(node, 0)
     for along, (before, after) in enumerate(border.T.tolist()):
-        voxel, runs = field.voxel_ijk[row, along], axis == along
-        start = field.factor * voxel + block_ijk(field.factor)[node, along]
+        voxel, runs = voxels[:, along], axis == along
+        start = field.factor * voxel + nodes[:, along]
         positions[along] = start + np.where(runs, share, 0.0)
         if ((voxel < before) | (voxel >= after)).any():  # voxels of a cap: moved onto the border
             ends = before * field.factor - CAP_HEIGHT, after * field.factor + CAP_HEIGHT
