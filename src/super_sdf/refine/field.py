@@ -10,7 +10,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
 from ..arrays import CENTRE, FloatArray, IntArray
@@ -114,16 +113,6 @@ class FineField:
         shape, nodes = " x ".join(map(str, self.shape)), self.parts.count_nodes(self.factor)
         voxels = f"{len(self.voxel_ijk):,} voxels of {shape}"
         return f"FineField(factor {self.factor}, {nodes:,} nodes of {voxels})"
-
-    def at(self, node: NDArray[Any], row: NDArray[Any]) -> FloatArray:
-        """Return the values at nodes of voxels' blocks, of the shape of both.
-
-        NumPy takes a third of the time for one index into a line of all values than for two.
-        """
-        size, last = self.blocks.itemsize, np.array(self.blocks.shape) - 1
-        steps = np.array(self.blocks.strides) // size
-        line = as_strided(self.blocks, (int(last @ steps) + 1,), (size,))
-        return np.asarray(line.take(node * steps[0] + row * steps[1]))
 
     @cached_property
     def numbers(self) -> IntArray:

@@ -12,7 +12,6 @@
    rule was fitted by ``export.edges``, on shapes with and without edges, to how far from the middle
    to that point the true surface lies; it is in ``rule.json``.
 5. Beside features, vertices are moved as much of the way onto the settled planes.
-6. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
 
 References
 ----------
@@ -40,15 +39,7 @@ from ...threads import map_chunks
 from ..marching import CAP_HEIGHT, Crossings, tables
 from ..mesh import CLEARANCE
 from .folds import REACH, Rounding, without_folds
-from .patches import (
-    Patches,
-    Placed,
-    beside,
-    find_patches,
-    triangles_of,
-    unfolded,
-    voxels_near_kinks,
-)
+from .patches import Patches, Placed, beside, find_patches, triangles_of, voxels_near_kinks
 from .planes import ROUNDS, Planes, planes_at_crossings, settle_planes, square_falloff
 
 RULE = Path(__file__).with_name("rule.json")
@@ -191,8 +182,7 @@ def place(patches: Patches, own: Planes, candidates: Candidates, share: Numbers)
     kept = share > LEAST_SHARE
     position = _move_beside(patches, own, candidates, share)
     vertex = candidates.middle + share[:, None] * (candidates.edge - candidates.middle)
-    placed = Placed(position, candidates.planes.normal, candidates.patch[kept], vertex[kept])
-    return unfolded(patches, placed)
+    return Placed(position, candidates.planes.normal, candidates.patch[kept], vertex[kept])
 
 
 def find_candidates(

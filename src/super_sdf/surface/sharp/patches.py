@@ -39,12 +39,19 @@ from ...arrays import (
 from ...refine.field import FineField
 from ...refine.nodes import block_ijk
 from ...threads import map_chunks
-from ..marching import Crossings, cells_low_nodes, edge_steps, edge_table, owners_of, tables
+from ..marching import (
+    Crossings,
+    cells_low_nodes,
+    edge_steps,
+    edge_table,
+    owners_of,
+    tables,
+    values_at,
+)
 
 NEAR_SURFACE = 1.0  # fine spacings: slopes count at nodes that are nearer
 BEND = 0.3  # change of the slopes at a node, 1 for a distance, from which there may be an edge
 TEMPORARIES = 8  # numbers per node of a block
-PULL = 0.5  # share of the way to the middle of its crossings that a vertex which folds its fan goes
 
 
 def voxels_near_kinks(field: FineField, threads: int = 1) -> BoolArray:
@@ -68,7 +75,7 @@ def _largest_bends(field: FineField, rows: slice) -> FloatArray:
         largest = np.multiply(bends, near[1:-1], out=bends).max((0, 1, 2))
         for step, beyond, face, within in ((-STRIDES[axis], -2, 0, 1), (STRIDES[axis], 1, -1, -2)):
             other = field.parts.table[CENTRE + step, rows]
-            after = field.at(node[beyond][..., None], other)
+            after = values_at(field, node[beyond][..., None], other)
             bends = after + mine[within] - 2 * mine[face]
             counts = near[face] & (other >= 0)
             largest = np.maximum(largest, (np.abs(bends) * counts).max((0, 1)))
@@ -210,18 +217,6 @@ def _sides_of(patches: Patches, placed: Placed) -> Sides:
     start = patches.crossing[patch, nth]
     end = patches.crossing[patch, np.where(nth + 1 < sides[fan], nth + 1, 0)]
     return Sides(patch, start, end, len(placed.position) + fan)
-
-
-def unfolded(patches: Patches, placed: Placed) -> Placed:
-    """Return the vertices, those that lie beyond a side of their fan moved inwards."""
-    sides = _sides_of(patches, placed)
-    corners = sides.start, sides.end, sides.peak
-    beyond = (placed.facing(corners, sides.start) < 0) & (placed.facing(corners, sides.end) < 0)
-    folded = np.zeros(len(placed.feature), bool)
-    folded[sides.peak[beyond] - len(placed.position)] = True
-    middle = patches.chosen(placed.feature).mean(placed.position)
-    inwards = np.where(folded[:, None], PULL * (middle - placed.peak), 0)
-    return replace(placed, peak=placed.peak + inwards)
 
 
 def triangles_of(patches: Patches, placed: Placed, chosen: BoolArray) -> Triangles:

@@ -23,7 +23,7 @@ from ...arrays import CENTRE, STRIDES, Index, IntArray, Numbers, Vectors, dot, i
 from ...refine.field import FineField
 from ...refine.nodes import block_ijk
 from ...threads import chunks_of, map_chunks, map_threads, worthwhile_threads
-from ..marching import Crossings, edge_ends, lattice_positions
+from ..marching import Crossings, edge_ends, lattice_positions, values_at
 from .patches import Patches
 
 ROUNDS = 4  # in each, every crossing looks at those it shares a patch with
@@ -110,11 +110,11 @@ def _gradient(field: FineField, row: NDArray[np.intp], node: NDArray[np.intp]) -
     Along each axis by the parabola through three of five nodes that bends least: it does not
     straddle a kink. It is 0 where all three have missing values.
     """
-    gradient, c = np.empty((3, len(row))), field.at(node, row).astype(np.float64)
+    gradient, c = np.empty((3, len(row))), values_at(field, node, row).astype(np.float64)
     table = np.ascontiguousarray(field.parts.table).ravel()
     for axis, (place, end) in enumerate(_walks(field.factor)):
         beside = table.take(place.take(node, 1) * len(field.voxel_ijk) + row)
-        values = field.at(end.take(node, 1), beside).astype(np.float64)
+        values = values_at(field, end.take(node, 1), beside).astype(np.float64)
         values[beside < 0] = np.nan  # there is no block
         a, b, d, e = values
         least, slope = np.full(len(c), np.inf), np.zeros(len(c))
