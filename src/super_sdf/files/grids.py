@@ -90,7 +90,7 @@ def read_array(
     space: Space | None,
     max_memory: int | None,
 ) -> dict[str, Any]:
-    """Return values, place (unless ``given``), space and notes: see ``read_grid``."""
+    """Return values, place (unless ``given``), hint, space and notes: see ``read_grid``."""
     path, direction = check_path(path, "path"), given["direction"]
     with open_volume(path, axes, memory_left(max_memory), direction) as (volume, request):
         volume = volume.in_space(space, str(path))
@@ -164,18 +164,18 @@ def memory_left(max_memory: int | None = None) -> int | None:
 
 
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
-    """Return values (nx, ny, nz), spacing, origin and direction of a volume, for ``make_grid``."""
+    """Return values (nx, ny, nz), place and hint of a volume, for ``make_grid``."""
     check_kind(volume.dtype, volume.shape)
     placement = find_placement(volume, given)
+    place = {**placement.place, "hint": volume.hint}
     size = prod(volume.shape) * volume.dtype.itemsize
     is_large = request.left is not None and size > ROOM_SHARE * request.left
     is_ordered = placement.order == (0, 1, 2) and all(step.step > 0 for step in placement.steps)
     if volume.is_mapped and (is_ordered or is_large):
-        return {"values": placement.ordered(volume.read()), **placement.place}
+        return {"values": placement.ordered(volume.read()), **place}
     request.check_fits(volume.shape, volume.dtype)
     values = placement.ordered(volume.read())
-    values = np.ascontiguousarray(values, values.dtype.newbyteorder("="))
-    return {"values": values, **placement.place}
+    return {"values": np.ascontiguousarray(values, values.dtype.newbyteorder("=")), **place}
 
 
 def grid_from_image(
