@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .files.formats import files_of
 from .files.grids import read_grid
 from .files.meshes import check_target, write_mesh
 from .files.output import check_apart, check_free
-from .files.regular import files_of
 from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
 from .pipeline import mesh_grid
 from .threads import TOTAL, Progress, Stopwatch, part_of
@@ -182,11 +182,8 @@ def find_warnings(
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if grid.field.kind in (
-        "mask",
-        "scaled",
-    ):  # only distances can be noisy, or contradict each other
-        return warnings
+    if grid.field.sides_only or grid.field.network is None:
+        return warnings  # only distances can be noisy, or contradict each other
     if counts["noisy_voxels"]:
         share = 100 * counts["noisy_voxels"] / counts["band_voxels"]
         percent = f"{share:.2g}" if share < 9.95 else f"{share:.0f}"

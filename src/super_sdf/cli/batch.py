@@ -108,7 +108,7 @@ def planned(
     options, page, items = main.chosen_options(given), given["report"], None
     from ..batch.inputs import find_jobs
     from ..batch.work import Settings
-    from ..files.regular import files_of
+    from ..files.formats import files_of
     from ..labels.files import check_options, read_names
 
     names = read_names(given["names"]) if given["names"] else None

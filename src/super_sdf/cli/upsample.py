@@ -61,7 +61,7 @@ def command(source: str, target: str, **given: Any) -> None:
         seconds[stage] = clock - start
 
     if page:
-        from ..files.regular import files_of
+        from ..files.formats import files_of
 
         others = [*files_of(source), target, *[given["save_field"]] * bool(given["save_field"])]
         main.check_page("--report", page, others, force=given["force"])
