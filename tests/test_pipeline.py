@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
 from super_sdf.errors import GridError
-from super_sdf.refine import survey
+from super_sdf.refine import band
 from super_sdf.refine.band import find_band
 from super_sdf.refine.nodes import block_ijk
 from super_sdf.surface.mesh import CLEARANCE
@@ -118,7 +118,7 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     noisy = SdfGrid.trusted(values, grid.spacing)
     some = upsample(noisy, trilinear)
     part = reconstruct(noisy, trilinear)
-    monkeypatch.setattr(survey, "DECODE_LIMIT", np.inf)
+    monkeypatch.setattr(band, "DECODE_LIMIT", np.inf)
     whole = reconstruct(noisy, trilinear)
     assert some.counts["pinned_nodes"] == 0
     assert len(part.faces) == len(whole.faces)

@@ -27,12 +27,19 @@ from .network.network import load_network, network_for
 from .options import MesherName, Options
 from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
-from .refine.band import neighbour_table
+from .refine.band import (
+    Band,
+    BandSummary,
+    BandTooLargeError,
+    neighbour_table,
+    no_surface,
+    summarise,
+    survey,
+)
 from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
-from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
@@ -93,8 +100,9 @@ def refine_band(
             "noisy_voxels": band.count_noisy(),
             "decoded_voxels": len(voxels),
             "nodes": parts.count_nodes(factor),
-            "pinned_nodes": pinned,
+            "pinned_nodes": int(pinned.sum()),
         },
+        pinned=pinned,
     )
 
 
@@ -293,7 +301,7 @@ class Result:
 
     mesh: Mesh
     open_edges: int
-    counts: dict[str, int]  # see ``FineField``; in tiles, a pinned node may count twice
+    counts: dict[str, int]  # see ``FineField``
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
     is_cut: bool  # whether the surface leaves the grid, or may end at unknown samples
     seconds: dict[str, float]  # by step
@@ -415,6 +423,7 @@ def make_tile(
         own = tile.owns(field.voxel_ijk + np.array(tile.low))
         counts["decoded_voxels"] = int(np.count_nonzero(own))
         counts["nodes"] = field.parts.count_nodes(factor, own)
+        counts["pinned_nodes"] = 0 if field.pinned is None else int(field.pinned[own].sum())
     more = {"counts": counts, "leaves": field.leaves, "is_cut": is_cut}
     del field
     return own_part(mesh, keys, tile, task.shape, factor, **more)

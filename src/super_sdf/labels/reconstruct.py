@@ -28,8 +28,8 @@ from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import load_network, network_for
 from ..pipeline import refine_band
 from ..progress import Progress, StepCounter, part_of
+from ..refine.band import survey
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
-from ..refine.survey import survey
 from ..surface.marching import strides
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import check_count, held_memory, in_words, memory_bound, useful_threads

@@ -94,6 +94,8 @@ class FineField:
         can; ``decoded_voxels``; ``nodes``; ``pinned_nodes``, whose sign had to be changed to that
         of a voxel that holds no surface: if there are any, the input is not a distance field there,
         or the network failed.
+    pinned : (D,) int32, optional
+        How many of the pinned nodes each voxel owns.
     """
 
     shape: tuple[int, int, int]
@@ -108,6 +110,7 @@ class FineField:
     border_inside: IntArray | None = None
     octants: NDArray[np.uint8] | None = None
     counts: dict[str, int] = field(default_factory=dict)
+    pinned: IntArray | None = None
 
     def __repr__(self) -> str:
         shape, nodes = " x ".join(map(str, self.shape)), self.parts.count_nodes(self.factor)
