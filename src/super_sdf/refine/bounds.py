@@ -156,9 +156,9 @@ def _bounded(
     first = (np.cumsum(spheres) - spheres)[most]
     tightest = np.full((len(most), values.shape[1]), -np.inf, np.float32)
     for end, nth in zip(np.searchsorted(-spheres[most], -np.arange(spheres.max())), count_up()):
-        some = first[:end] + nth  # the first sphere of each block, then the second
-        bound = to_nodes.take(place.take(some), 0)
-        np.subtract(size.take(some)[:, None], bound, out=bound)
+        number = first[:end] + nth  # the first sphere of each block, then the second
+        bound = to_nodes.take(place.take(number), 0)
+        np.subtract(size.take(number)[:, None], bound, out=bound)
         np.maximum(tightest[:end], bound, out=tightest[:end])
     moved, outside = values.copy(), most < count
     row = most[outside]

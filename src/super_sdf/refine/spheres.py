@@ -88,11 +88,11 @@ Columns = TypeVar("Columns", Spheres, FootPoints, Look)
 
 
 def _some(columns: Columns, which: NDArray[Any] | slice) -> Columns:
-    return columns._make(array[..., which] for array in columns)
+    return type(columns)(*(array[..., which] for array in columns))
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    return parts[0]._make(np.concatenate(arrays, -1) for arrays in zip(*parts))
+    return type(parts[0])(*(np.concatenate(arrays, -1) for arrays in zip(*parts)))
 
 
 def fit_to_spheres(
