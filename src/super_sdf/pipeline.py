@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
+from .arrays import CENTRE
 from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
@@ -91,16 +92,10 @@ def refine_band(
         parts,
         grid,
         band.offset,
-        SampleSpheres.of(grid.shape, band.voxel_ijk[band.exact], patches[band.exact]),
+        SampleSpheres(grid.shape, band.voxel_ijk[band.exact], patches[band.exact, CENTRE]),
         band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
-        counts={
-            "band_voxels": len(patches),
-            "noisy_voxels": band.count_noisy(),
-            "decoded_voxels": len(voxels),
-            "nodes": parts.count_nodes(factor),
-            "pinned_nodes": int(pinned.sum()),
-        },
+        found=(len(patches), band.count_noisy()),
         pinned=pinned,
     )
 
@@ -407,12 +402,7 @@ def make_tile(
     is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
     how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": task.threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
-    counts = dict(field.counts)
-    if task.whole:
-        own = tile.owns(field.voxel_ijk + np.array(tile.low))
-        counts["decoded_voxels"] = int(np.count_nonzero(own))
-        counts["nodes"] = field.parts.count_nodes(factor, own)
-        counts["pinned_nodes"] = 0 if field.pinned is None else int(field.pinned[own].sum())
+    counts = field.count(tile.owns(field.voxel_ijk + np.array(tile.low)))
     more = {"counts": counts, "leaves": field.leaves, "is_cut": is_cut}
     del field
     return own_part(mesh, keys, tile, task.shape, factor, **more)

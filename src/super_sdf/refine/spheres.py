@@ -88,11 +88,13 @@ Columns = TypeVar("Columns", Spheres, FootPoints, Look)
 
 
 def _some(columns: Columns, which: NDArray[Any] | slice) -> Columns:
-    return type(columns)(*(array[..., which] for array in columns))
+    arrays: Any = [array[..., which] for array in columns]
+    return type(columns)(*arrays)
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
-    return type(parts[0])(*(np.concatenate(arrays, -1) for arrays in zip(*parts)))
+    arrays: Any = [np.concatenate(each, -1) for each in zip(*parts)]
+    return type(parts[0])(*arrays)
 
 
 def fit_to_spheres(
@@ -135,9 +137,8 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
     def gather(rows: slice) -> tuple[Spheres, Spheres, FloatArray]:
         patch = band.patches[exact[rows]]  # (n, 27)
         gradient = _unit((patch[:, CENTRE + STRIDES] - patch[:, CENTRE - STRIDES]).T)
-        own = Spheres(
-            np.ascontiguousarray(band.voxel_ijk[exact[rows]].T), patch[:, CENTRE].copy(), gradient
-        )
+        centre = np.ascontiguousarray(band.voxel_ijk[exact[rows]].T)
+        own = Spheres(centre, patch[:, CENTRE].copy(), gradient)
         size, sign = np.abs(patch), np.copysign(np.float32(1), own.distance)
         slope = (sign[:, None] * patch - np.abs(own.distance)[:, None]) / APART
         found = np.asarray((size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND))
@@ -150,11 +151,12 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
         return own, beyond, slope[row, step]
 
     parts = map_chunks(gather, len(exact), 4 * TEMPORARIES, threads) or [gather(slice(0))]
-    own, others, slope = zip(*parts)
-    beyond = _joined(others)
+    beyond = _joined([part[1] for part in parts])
+    slope = np.concatenate([part[2] for part in parts])
     keys = VoxelIndex(beyond.centre.T, band.grid.shape).keys
-    order = np.lexsort((-np.concatenate(slope), keys))  # of equal samples the steepest
-    return _joined([*own, _some(beyond, order[np.diff(keys[order], prepend=-1) > 0])])
+    order = np.lexsort((-slope, keys))  # of equal samples the steepest
+    beyond = _some(beyond, order[np.diff(keys[order], prepend=-1) > 0])
+    return _joined([*(part[0] for part in parts), beyond])
 
 
 def find_foot_points(
@@ -226,9 +228,9 @@ def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex)
         better = new.clearance < found.clearance[rest]
         nearer, farther = np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
         turn[rest] = np.where(better, nearer, farther)
-        better = np.flatnonzero(better)
+        gained = np.flatnonzero(better)
         for mine, its in zip(found, new):
-            mine[..., rest[better]] = its[..., better]
+            mine[..., rest[gained]] = its[..., gained]
     return found
 
 
