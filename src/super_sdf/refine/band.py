@@ -190,6 +190,7 @@ def _found(
     An offset ``is_checked``: distances must not be cut off near it. At 0 no other one is better.
     """
     unseen, count = grid.field.unseen, grid.shape[0]
+    is_spline = grid.field.network is None
 
     def look(planes: tuple[int, int]) -> _Found:
         first, last = planes
@@ -197,7 +198,7 @@ def _found(
         rescaled = rescale(grid, offset, low, min(last + 1, count))
         let_go(grid.samples)
         own = slice(first - low, last - low)
-        inner, active = rescaled[own], is_active(rescaled)[own]
+        inner, active = rescaled[own], (is_near if is_spline else is_active)(rescaled)[own]
         if unseen is not None:
             hidden = np.asarray(unseen[first:last])
             inner, active = np.where(hidden, np.float32(FAR), inner), active & ~hidden
@@ -206,7 +207,7 @@ def _found(
         if len(ijk):
             start, stop = np.maximum(ijk.min(0) - 1, 0), ijk.max(0) + 2  # the rest is far away
             patches = gather_patches(rescaled[tuple(map(slice, start, stop))], ijk - start)
-            if (filled := is_filled_in(patches)).any():
+            if not is_spline and (filled := is_filled_in(patches)).any():
                 ijk, patches = ijk[~filled], patches[~filled]
         voxel_ijk, centre = ijk + np.array([low, 0, 0], np.int32), patches[:, CENTRE]
         if is_checked and offset:
@@ -218,9 +219,9 @@ def _found(
         lipschitz, sampled = is_lipschitz(patches), on_samples(grid, voxel_ijk)
         if grid.on_sample is not None:
             lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
-        if grid.field.smooth is not None:  # no distances: they say nothing certain of the voxels
+        if is_spline:
             decoded = np.ones(len(patches), bool)
-        elif grid.field.kind == "mask":
+        elif grid.field.sides_only:
             decoded = has_both_sides(patches)
         else:
             # only a patch that can be distances proves, by a sample far from the surface, that
@@ -311,6 +312,28 @@ def is_active(rescaled: FloatArray) -> BoolArray:
                 grown[:-1] |= source[1:]
             active |= own & near
     return active
+
+
+def is_near(values: FloatArray) -> BoolArray:
+    """Return which voxels a surface at 0 may pass, whatever the slope, (nx, ny, nz).
+
+    Values there are no farther from 0 than they change to neighbours, added up over the axes, or
+    some of the 26 samples round them are on the other side. Where values are constant they are not.
+    """
+    change = np.zeros_like(values)
+    sides: NDArray[np.uint8] = 1 + (values > 0).view(np.uint8)  # of samples, then of ... cells
+    for axis in range(3):
+        lines, cells = np.moveaxis(values, axis, 0), np.moveaxis(sides, axis, 0)
+        sides = np.moveaxis(np.bitwise_or(cells[1:], cells[:-1]), 0, axis)
+        steps = np.abs(lines[1:] - lines[:-1])
+        largest = np.concatenate([steps[:1], np.maximum(steps[1:], steps[:-1]), steps[-1:]])
+        change += np.moveaxis(largest, 0, axis)
+    mixed = sides == 3
+    for axis in range(3):
+        mixed = np.pad(mixed, [(int(n == axis),) * 2 for n in range(3)])
+        both = np.moveaxis(mixed, axis, 0)
+        mixed = np.moveaxis(both[1:] | both[:-1], 0, axis)
+    return np.asarray((np.abs(values) < change) | mixed)
 
 
 def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
