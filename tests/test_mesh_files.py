@@ -138,7 +138,7 @@ NO_MESHES = {
         np.eye(3),
         [[0.0, 1, 2]],
     ),
-    "the vertices of the mesh are float64 of shape (3, 2): give rows of three numbers": (
+    "the vertices of the mesh are float64 of shape (3, 2): give rows of three floats": (
         np.eye(3)[:, :2],
         [[0, 1, 2]],
     ),

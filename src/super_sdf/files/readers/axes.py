@@ -115,8 +115,8 @@ def placed(
     if beside is not None and spacing is None:
         unread = {n: each for n, each in {**beside, **attributes}.items() if SIZES.search(n)}
         listed = ", ".join(f"{n} {seen(_plain(x))}" for n, x in unread.items() if n not in STATED)
-        said = f"it states {listed}, which is not read (give --spacing and --origin)"
-        told += (said,) * bool(listed)
+        note = f"it states {listed}, which is not read (give --spacing and --origin)"
+        told += (note,) * bool(listed)
     return {
         "spacing": spacing,
         "origin": _stated(attributes, "origin", starts),
