@@ -66,4 +66,4 @@ def test_a_surface_may_stay_open_and_is_then_warned_of():
     done = convert("cut.npy", "open.ply", trilinear, Options(2, cap=False))
     assert not done.closed and not done.capped and "is open there" in done.warnings[-1]
     done = convert("cut.npy", "closed.ply", trilinear, Options(2))
-    assert done.closed and done.capped and "closed along the border" in done.remarks()[0]
+    assert done.closed and done.capped and "closed along the border" in done.notes[-1]

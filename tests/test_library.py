@@ -63,6 +63,8 @@ def test_what_is_no_array_of_samples_is_refused(make, values, message):
 
 
 GRID = ball(12, 3.0)
+EVEN = "give an even number from 2 to 16 (an odd one has no node on the samples)"
+BYTES = "give a number of bytes greater than 0, such as 1500M or 4G"
 BOOLEAN = "give True or False, in JSON true or false"
 MAKE_ONE = "make one with make_grid(values, spacing=...) or read_grid(path)"
 # of the wrong type, and of the right type with a wrong value
@@ -70,22 +72,20 @@ OF_OTHER_TYPES = {
     f"grid is an array of shape (20, 20, 20): {MAKE_ONE}": {"grid": VALUES},
     f"grid is 'part.npz': {MAKE_ONE}": {"grid": "part.npz"},
     "network is 'fast': give one from load_network()": {"network": "fast"},
-    "factor is '4': give a whole number": {"factor": "4"},
-    "factor is True: give a whole number": {"factor": True},
-    "offset is '1': give a number, in world units": {"offset": "1"},
+    f"factor is '4': {EVEN}": {"factor": "4"},
+    f"factor is True: {EVEN}": {"factor": True},
+    "offset is '1': give a finite number, in world units": {"offset": "1"},
     f"cap is 'no': {BOOLEAN}": {"cap": "no"},
     f"cap is 1: {BOOLEAN}": {"cap": 1},
     "mesher is None: give one of auto, marching, sharp": {"mesher": None},
-    "max_memory is 1.5: give a whole number of bytes": {"max_memory": 1.5},
+    f"max_memory is 1.5: {BYTES}": {"max_memory": 1.5},
     "progress is True: give a function of (done, total), in thousandths": {"progress": True},
 }
 WRONG = {
-    "factor is 0: give an even number from 2 to 16 (an odd one has no node on the samples)": {
-        "factor": np.int64(0)
-    },
+    f"factor is 0: {EVEN}": {"factor": np.int64(0)},
     "offset is -inf: give a finite number, in world units": {"offset": -np.inf},
     "mesher is 'dual': give one of auto, marching, sharp": {"mesher": "dual"},
-    "max_memory is -5: give a number of bytes greater than 0": {"max_memory": -5},
+    f"max_memory is -5: {BYTES}": {"max_memory": -5},
 }
 
 

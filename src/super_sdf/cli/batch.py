@@ -175,7 +175,7 @@ def remarks(batch: Batch) -> list[str]:
     checks = [row["check"] for row in rows if "check" in row]
     means = [check["residual"]["mean"] for check in checks if check.get("residual")]
     counts = {
-        "Note: {} have notes": sum(bool(r["inferred"] or r.get("missing")) for r in rows),
+        "Note: {} have notes": sum(bool(row["inferred"]) for row in rows),
         "Warning: {} have warnings": sum(bool(r["warnings"] or r.get("beside")) for r in rows),
         "Warning: {} have no residual": len(checks) - len(means),
         f"Check: mean residual {max(means, default=0):.4f} voxels at most, of {{}}": len(means),

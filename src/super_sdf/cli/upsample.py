@@ -97,11 +97,10 @@ def command(source: str, target: str, **given: Any) -> None:
             raise type(error)(said) from error
         report["check"] = certificate.report()
         lap("check")
-    notes = [*done.remarks(), *network.notes]
     if page:
         from ..pages.html import page_of_conversion, write_page
 
-        facts = {**report, "seconds": seconds, "notes": notes}
+        facts = {**report, "seconds": seconds, "notes": network.notes}
         text = page_of_conversion(facts, options, done, certificate)
         write_page(text, page, force=given["force"])
         lap("page")
@@ -110,7 +109,7 @@ def command(source: str, target: str, **given: Any) -> None:
         main.print_stdout(report, f"{target} is written")
     if given["quiet"]:
         return
-    lines = [f"Note: {note}" for note in (*done.notes, *notes)]
+    lines = [f"Note: {note}" for note in (*done.notes, *network.notes)]
     lines += [f"Warning: {warning}" for warning in done.warnings]
     if given["verbose"]:
         keys = ("shape", "spacing", "origin", "device", "band_voxels", "nodes")
