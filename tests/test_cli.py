@@ -81,6 +81,7 @@ def test_version_help_info_and_usage_errors(command):
     assert code == 0 and out.startswith(f"super-sdf: {super_sdf.__version__}\n")
     assert "models: base" in out and "devices: cpu" in out
     assert json.loads(command("info", "--json")[1])["models"]["base"]["format_version"] == 1
+    assert "an even number from 2 to 16" in command("upsample", "--help")[1]
     assert command("upsample")[0] == 2
     none = "Error: there is no command"
     assert command("upsampel") == (2, "", f"{none} 'upsampel': did you mean upsample?\n")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from conftest import ball, refusal
+from conftest import refusal
 
 from super_sdf.errors import GridError
 from super_sdf.grid.sdf_grid import make_grid
@@ -55,15 +55,6 @@ REFUSED = {
 @pytest.mark.parametrize("message", REFUSED)
 def test_what_is_no_signed_distance_grid_is_refused(message):
     assert refusal(GridError, make_grid, REFUSED[message]) == message
-
-
-def test_a_wrong_unit_is_refused_with_the_way_out():
-    values = ball(24, 8.0).values
-    assert refusal(GridError, make_grid, values, spacing=0.1) == (
-        "the values change by 0.9972 from sample to sample, but spacing is 0.1: distances need the "
-        "unit of the spacing: multiply the values, scale=0.1"
-    )
-    assert make_grid(values, spacing=0.1, scale=0.1, origin=0).notes == ()
 
 
 @pytest.mark.parametrize(

@@ -142,3 +142,19 @@ def test_mesh_and_field_say_what_they_are_in_a_line():
     assert repr(network) == said.replace("field 5", f"field {network.receptive_field}")
     for thing in (GRID, field, mesh, network):
         assert "\n" not in repr(thing) and len(repr(thing)) < 160
+
+
+SAID = {
+    "give a --level, such as --level -4 --inside negative": "give a level=, such as level=-4, "
+    "inside='negative'",
+    "--labels has 'lung': choose fewer (--labels 1,2)": "labels has 'lung': choose fewer "
+    "(labels=(1,2))",
+    "end it there (--open), or use --force": "end it there (cap=False), or use force=True",
+    "pip install --force-reinstall onnxruntime": "pip install --force-reinstall onnxruntime",
+}
+
+
+@pytest.mark.parametrize("flagged", SAID)
+def test_an_error_names_flags_on_the_command_line_and_keywords_in_python(flagged):
+    assert str(OptionError(flagged)) == SAID[flagged]
+    assert OptionError(flagged).flagged == flagged

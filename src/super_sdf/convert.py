@@ -88,13 +88,7 @@ def convert(
     watch, files = Stopwatch(), files_of(source)
     check_target(target, force=force, unit=options.unit)
     check_apart(target, files)
-    saving: Any = nullcontext()
-    if save_field is not None:
-        from .files.fields import saving_field
-
-        check_apart(save_field, files)
-        saving = saving_field(save_field, force=force)
-    with saving as file:
+    with _saving(save_field, files, force=force) as file:
         grid = read_grid(source, **options.reading())
         if options.keep_volume:
             from .labels.volumes import check_has_volume  # imported here, as few need it
@@ -140,6 +134,16 @@ def convert(
         seconds=watch.seconds,
         saved_field=file.report if file else None,
     )
+
+
+def _saving(path: str | Path | None, others: list[Path], *, force: bool) -> Any:
+    """Return the context of a file for the refined field, apart from others; None if unwanted."""
+    if path is None:
+        return nullcontext()
+    from .files.fields import saving_field
+
+    check_apart(path, others)
+    return saving_field(path, force=force)
 
 
 def reworked(

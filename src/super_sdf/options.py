@@ -270,7 +270,8 @@ class Options:
     simplify: float | None = _option(None, MESH, "list", VOXELS,
         "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
         "Needs the extra simplify.", metavar="ERROR")
-    tolerance: float | None = _option(None, MESH, "list", number("a number greater than 0, in world units", above=0),
+    tolerance: float | None = _option(None, MESH, "list",
+        number("a number greater than 0, in world units", above=0),
         "Simplify as with --simplify, but within D in world units.", metavar="D")
     triangles: int | None = _option(None, MESH, "list",
         number("a whole number, 4 or more, as a closed mesh has", above=3, step=1),
