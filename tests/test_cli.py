@@ -122,10 +122,10 @@ CASES = {
     "none.npy": "none.npy does not exist",
     "empty.npy": "empty.npy is empty",
     "text.npz": "text.npz is not a readable .npz archive: write it by numpy.savez",
-    "objects.npy": "objects.npy holds Python objects",
+    "objects.npy": "objects.npy: values have dtype object",
     "other.npz": "other.npz has no key 'values' (it holds field, more)",
-    "short.npy": "short.npy is truncated",
-    "short.npz": "short.npz[values] is truncated",
+    "short.npy": "short.npy cannot be read as NumPy",
+    "short.npz": "short.npz cannot be read as NumPy",
     "constant.npy": "every value is 1: a constant field has no surface",
     "in.npy --model huge": "no model 'huge': give an ONNX file or one of: fast, base, best",
 }

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .files.formats import files_of
 from .files.grids import read_grid
 from .files.meshes import check_target, write_mesh
 from .files.output import check_apart, check_free
-from .files.regular import files_of
 from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
 from .pipeline import mesh_grid
 from .threads import TOTAL, Progress, Stopwatch, part_of

@@ -176,8 +176,8 @@ def check_page(
     force: bool,
 ) -> None:
     """Raise if a page cannot be written, is a file that a source is read from, or an output."""
+    from ..files.formats import files_of
     from ..files.output import check_apart, check_free
-    from ..files.regular import files_of
 
     if page.suffix.lower() not in (".html", ".htm"):
         raise OptionError(f"{page} is not a page: give {word} a file .html or .htm")

@@ -27,9 +27,9 @@ from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import load_network, network_for
 from ..pipeline import refine_band
+from ..refine.band import survey
 from ..refine.field import FineField
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
-from ..refine.survey import survey
 from ..surface.marching import strides
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import Progress, StepCounter, check_bound, check_count, part_of, useful_threads
