@@ -271,9 +271,8 @@ def label_fields(
         shown = part_of(progress, turn / count, (turn + 1) / count)
         steps = StepCounter(shown, ["network", "nodes"])
         blocks = np.full((nodes, len(own_ijk)), np.nan, np.float32)
-        lattice = SdfGrid.trusted(
-            mask_distances(mask), 1.0, extremes=extremes_of_masks(1.0), field=grid.field
-        )
+        distances, extremes = mask_distances(mask), extremes_of_masks(1.0)
+        lattice = SdfGrid.trusted(distances, 1.0, extremes=extremes, field=grid.field)
         if field := _field_at(lattice, some_ijk, network, factor, steps):
             blocks[:, VoxelIndex(own_ijk, lattice.shape).find(field.voxel_ijk)] = field.blocks
         times[rows] += 1
