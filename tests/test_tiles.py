@@ -153,7 +153,7 @@ def spoilt(task, network, spoil):
     part = make_tile(task, network)
     if task.tile.inner_low != (0, 0, 0):
         return replace(part, worker="worker 7")
-    return spoil(part)
+    return spoil(replace(part, worker="worker 3"))
 
 
 def without_a_triangle(part):
@@ -173,6 +173,7 @@ def test_a_tampered_tile_is_an_error_that_names_it(monkeypatch, spoil, cap):
     monkeypatch.setattr(pipeline, "make_tile", partial(spoilt, spoil=spoil))
     said = refusal(MeshError, mesh_grid, balls(), CLOSE, Options(2, cap=cap), least_tiles=3)
     assert said.startswith("the mesh is torn, ") and "in samples 0 to " in said
+    assert "(worker 3)" in said and "use workers with the same processor" in said
 
 
 def test_a_bound_of_memory_chooses_the_tiles(monkeypatch):

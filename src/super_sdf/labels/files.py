@@ -60,11 +60,6 @@ class LabelConversion:
     warnings: tuple[str, ...] = ()
     closed: bool = True
 
-    def remarks(self) -> list[str]:
-        """Return a note on the labels that the image lacks, if there are some."""
-        names = ", ".join(row["name"] for row in self.missing)
-        return [f"no sample has a label that was asked for: {names}"] * bool(names)
-
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
         made = {"labels": self.labels, "missing": self.missing, "inferred": list(self.notes)}
@@ -132,6 +127,9 @@ def convert_labels(
     watch.lap("write")
     lacking = names_of(image.missing, known)
     missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
+    if missing:
+        listed = ", ".join(entry.name for entry in lacking.values())
+        off.append(f"no sample has a label that was asked for: {listed}")
     return LabelConversion(grid, rows, missing, (*grid.notes, *off), watch.seconds)
 
 
