@@ -18,7 +18,7 @@ from torch import Tensor
 
 from export.dataset import Sample, fill_shard, parser_of_options
 from super_sdf.arrays import NEIGHBOURHOOD, STRIDES, IntArray
-from super_sdf.grid import distances
+from super_sdf.grid import derived
 from super_sdf.network import contract
 from super_sdf.refine import band
 
@@ -116,7 +116,7 @@ def masked(rng: np.random.Generator, sample: Sample) -> Sample:
     """
     level = np.float32(rng.uniform(-1, 1))
     targets = sample.targets.astype(np.float32) - level
-    window = 2 * distances.mask_distances(sample.window < level)
+    window = 2 * derived.mask_distances(sample.window < level)
     return replace(sample, window=window, targets=targets)
 
 

@@ -122,11 +122,11 @@ def test_exact_distances_are_passed_on_as_they_are():
 def test_another_unit_than_that_of_the_spacing_is_an_error(unit):
     values = unit * box()
     said = refusal(GridError, make_grid, values, **PLACE)
-    scale = float(re.search(r"--scale (\S+) \(or", said).group(1))
+    scale = float(re.search(r"scale=(\S+) \(or", said).group(1))
     assert scale * unit == pytest.approx(1, rel=0.005)
     told = make_grid(values, **PLACE, scale=scale)
     assert told.notes == () and np.allclose(told.values, box(), rtol=5e-3)
-    shown = float(re.search(r"--spacing (\S+),", said).group(1))
+    shown = float(re.search(r"spacing=(\S+),", said).group(1))
     assert shown == pytest.approx(unit, rel=0.005)
     if unit < 0.1:
         return
@@ -194,7 +194,7 @@ LABELS = {
 def test_labels_without_a_choice_are_refused(name, spacing):
     said = refusal(GridError, make_grid, LABELS[name], spacing=spacing, origin=0)
     assert said.startswith("no solid is chosen: they look like labels (0, ")
-    assert re.search(r"choose one with --label \d+, or mesh all with --labels all$", said)
+    assert re.search(r"choose one with label=\d+, or mesh all with labels='all'$", said)
 
 
 LARGEST = 2**64 - 1
@@ -284,7 +284,7 @@ def overshoot() -> np.ndarray:
 )
 def test_densities_are_refused_with_a_level_between_both(values, low, high):
     said = refusal(GridError, make_grid, values, spacing=1.5)
-    level = float(re.search(r"--level (\S+) --inside positive", said).group(1))
+    level = float(re.search(r"level=(\S+), inside='positive'", said).group(1))
     assert low < level < high and not (values == level).any()
     assert make_grid(values, spacing=1.5, level=level).field.network is None
 
@@ -296,10 +296,10 @@ BAD = {
     "label is 1.5: give a whole number, -2^63 to 2^64 - 1": {"label": 1.5},
     "label is True: give a whole number, -2^63 to 2^64 - 1": {"label": True},
     f"label is {2**64}: give a whole number, -2^63 to 2^64 - 1": {"label": 2**64},
-    f"label {2**53 + 1} and level 2.5: give only one of them": {"label": 2**53 + 1, "level": 2.5},
+    f"label={2**53 + 1} and level=2.5: give only one of them": {"label": 2**53 + 1, "level": 2.5},
     "level is nan: give a finite number": {"level": float("nan")},
     "scale is -1: give a number greater than 0": {"scale": -1},
-    "label 1 and field noisy: the samples of a label are a mask": {"label": 1, "field": "noisy"},
+    "label=1 and field='noisy': the samples of a label are a mask": {"label": 1, "field": "noisy"},
 }
 
 

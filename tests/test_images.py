@@ -17,7 +17,7 @@ from super_sdf.errors import GridError, OptionError, OptionTypeError
 ROOT = Path(__file__).parent.parent
 SIZES = 20, 22, 24
 RADIUS = 4.2
-UNIT = "they are distances in another unit than the spacing: multiply the values, --scale 0.4 (or "
+UNIT = "they are distances in another unit than the spacing: multiply the values, scale=0.4 (or "
 TURNED = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 DIRECTIONS = {
     "straight": np.eye(3),

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import without_device
 from ..errors import GridError, OptionError, OptionTypeError, seen
-from ..grid.near import sample_near
+from ..grid.derived import sample_near
 from ..grid.samples import as_triple, check_spacing
 from ..grid.sdf_grid import SdfGrid, check_grid, make_grid
 

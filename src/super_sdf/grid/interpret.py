@@ -14,10 +14,18 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Triple
 from ..errors import GridError
-from ..options import AUTO, DENSITY, DISTANCE, MASK, NOISY, SMOOTH, Options
-from . import distances
-from .advice import labelled, which_level
-from .look import Extremes, Floats, Look, border_share, look_at, typical_slope
+from ..options import AUTO, DISTANCE, MASK, NOISY, SMOOTH, Options
+from . import derived
+from .look import (
+    Extremes,
+    Floats,
+    Look,
+    border_share,
+    look_at,
+    named,
+    typical_slope,
+    which_level,
+)
 from .recognise import Answer, cut_values, recognise
 from .samples import (
     LEAST_SPACING,
@@ -32,6 +40,7 @@ from .samples import (
 from .unknown import Known, with_known
 
 NONE_EXACT: Extremes = (0.0, 0.0)
+DENSITY = "density"  # what values with a level are
 # Voxels from the surface at which values are cut off: where the rest is filled in, and below which
 # too few are left for that.
 FILLED, TOO_NEAR = 1.75, 0.85
@@ -57,7 +66,7 @@ class Field:
 
     @property
     def has_exact(self) -> bool:
-        """Whether some samples may be exact distances."""
+        """Whether some samples may be exact derived."""
         return self.exact[0] < self.exact[1]
 
     def report(self) -> dict[str, Any]:
@@ -215,6 +224,33 @@ def _with_known(case: Case, value: float | None) -> Case:
     return replace(case, samples=known.samples, look=look, known=known)
 
 
+def labelled(samples: SampleArray, label: int) -> SampleArray:
+    """Return which samples have a label; GridError if none or all have."""
+    value = as_sample(label, samples.dtype)
+    found, others = False, False
+    labels: set[Any] = set()
+    for plane in samples:
+        has = np.asarray(plane == value if value is not None else np.zeros(plane.shape, bool))
+        found, others = found or bool(has.any()), others or not has.all()
+        if not (found and others):
+            labels |= {x.item() for x in np.unique(plane)[:9]}
+    if found and others:
+        return changed(samples, partial(np.equal, value), np.bool_)
+    raise GridError(
+        f"{'every' if found else 'no'} sample has the label {label}: the labels are {named(labels)}"
+    )
+
+
+def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
+    """Return the sample that is exactly a label, None if the type has none."""
+    if dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            value = dtype.type(label)
+        return value if np.isfinite(value) and int(value) == label else None
+    low, high = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+    return dtype.type(label) if low <= label <= high else None
+
+
 # Masks
 
 
@@ -265,8 +301,8 @@ def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None)
         "values taken as a mask (--field mask): they show the surface to half a voxel only"
     )
     h = min(steps_of(spacing))
-    more = {"extremes": distances.extremes_of_masks(h), "positive_inside": False}
-    samples = distances.mask_planes(mask, h)
+    more = {"extremes": derived.extremes_of_masks(h), "positive_inside": False}
+    samples = derived.mask_planes(mask, h)
     return case.taken(spacing, mask_field(spacing), facts or {}, samples=samples, **more)
 
 
@@ -329,7 +365,7 @@ def _slope_at_surface(look: Look, steps: Floats) -> float:
 def _of_distances(case: Case, facts: dict[str, Any]) -> Taken:
     """Return distances, of which some may be cut off; what is missing is filled in if it helps."""
     spacing, look, cut = case.spacing, case.look, facts["cut"]
-    if case.known is not None and case.known.count:  # unknown samples are taken as cut off
+    if case.known is not None and case.known.unknown:  # unknown samples are taken as cut off
         cut = [look.low, look.high]
     assert spacing is not None
     positive = case.positive_inside
@@ -345,7 +381,7 @@ def _of_distances(case: Case, facts: dict[str, Any]) -> Taken:
         cubic = is_cubic(spacing)
         own = Field(exact=exact if cubic else NONE_EXACT, network=None, own_lattice=not cubic)
     elif at < FILLED:
-        samples = distances.filled_planes(samples, steps, (look.low, look.high))
+        samples = derived.filled_planes(samples, steps, (look.low, look.high))
     return case.taken(spacing, own, facts, samples=samples, positive_inside=positive)
 
 

@@ -27,6 +27,9 @@ BOXES, LINES, PAIRS = 1 << 12, 1 << 13, 1 << 15  # that are kept
 ORDINARY = 1e-30, 1e30  # of the largest value: others are divided by it, so that squares are finite
 MOST_LABELS, FEW = 1000, 3  # different values that are listed; that are looked for first
 ENOUGH = 30  # samples that tell a slope
+LEVELS = 63  # that are tried
+AS_GOOD, LEAST = 0.9, 20  # of the largest mean step over a level: as good; of so many steps
+MOST_NAMED = 8  # labels that a message lists
 TRIED = 4096  # samples whose different values are counted first
 
 AXES = np.array([[0, 0, 0], *np.kron(np.eye(3, dtype=int), [[-2], [-1], [1], [2]])])
@@ -319,3 +322,68 @@ def valleys(slab: Slab, slope: float, sign: int) -> tuple[int, int]:
         low = (x >= 0) & (x < 0.52) & (before > x) & ((after > x) | ((after == x) & (x > 0.25)))
         count += int((low & (before + after - 2 * x > 0.9)).sum())
     return count, changes
+
+
+# What a refusal names
+
+
+def which_level(look: Look, *, signed: bool = False, shift: float = 0.0, unit: float = 1.0) -> str:
+    """Return the advice to give a level: the one over which neighbours differ most.
+
+    It is the shortest number among those that are about as good, and never a value of a sample.
+    ``shift`` was taken from all values, which then were multiplied by ``unit``.
+    """
+    pairs = look.all_pairs * (look.scale / unit) + shift
+    low, high = np.sort(pairs, axis=0)
+    ends = np.quantile(pairs, [0.002, 0.998]).tolist()
+    levels = np.linspace(ends[0], ends[1], LEVELS + 2)[1:-1]
+    first, last = np.searchsorted(levels, [low, high])
+    sums, counts = np.zeros((2, LEVELS + 1))
+    for at, side in ((first, 1), (last, -1)):
+        sums += side * np.bincount(at, high - low, LEVELS + 1)
+        counts += side * np.bincount(at, None, LEVELS + 1)
+    total = np.cumsum(counts)[:-1]
+    steps = np.where(total >= LEAST, np.cumsum(sums)[:-1] / total.clip(1), 0)
+    good = levels[steps >= AS_GOOD * steps.max()]
+    level = _short_number(good)
+    values = np.unique(pairs)
+    at = int(np.searchsorted(values, level))
+    if at < len(values) and values[at] == level:
+        beside = values[at - 1] if at else values[at + 1]
+        level = float(beside + values[at]) / 2
+    outside = border_share(look, lambda x: x / unit > level - shift) > 0.5
+    option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
+    other = "; or --field smooth, if it is at 0" if signed else ""
+    return f"they look like densities: give the level of their surface, such as {option}{other}"
+
+
+def _short_number(good: Floats) -> float:
+    middle = float(np.median(good))
+    for digits in (1, 2, 3):
+        short = float(f"{middle:.{digits}g}")
+        if good.min() <= short <= good.max():
+            return short
+    return middle
+
+
+def which_label(samples: SampleArray) -> str:
+    """Return the advice to choose a label: the most frequent one that is not the border's."""
+    found = different_values(samples)
+    if found is None:
+        return "they are labels: choose one with --label, or some with --labels"
+    distinct, counts = found
+    ends = np.concatenate([np.asarray(samples[i]).ravel() for i in (0, -1)])
+    values, frequent = np.unique(ends, return_counts=True)
+    at = np.flatnonzero(distinct != values[frequent.argmax()])
+    best = distinct[at[counts[at].argmax()]] if len(at) else distinct[0]
+    return (
+        f"they look like labels ({named(distinct.tolist())}): choose one with "
+        f"--label {int(np.rint(best))}, or mesh all with --labels all"
+    )
+
+
+def named(labels: Any) -> str:
+    """Return labels in words, the first eight in order."""
+    ordered = sorted(labels)
+    words = ", ".join(f"{x:g}" if x % 1 else str(int(x)) for x in ordered[:MOST_NAMED])
+    return words + (", ..." if len(ordered) > MOST_NAMED else "")

@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .advice import which_label, which_level
 from .look import (
     BOX,
     Floats,
@@ -33,6 +32,8 @@ from .look import (
     equal_neighbours,
     typical_slope,
     valleys,
+    which_label,
+    which_level,
 )
 from .samples import SampleArray
 

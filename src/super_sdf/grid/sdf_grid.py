@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
 from ..options import AUTO, FieldKind, Inside, Options
+from .derived import Resampled
 from .interpret import Field, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
-from .resample import Resampled
 from .samples import (
     EQUAL_SPACING,
     STRAIGHT,
@@ -305,7 +305,7 @@ def make_grid(
     OptionError
         If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
-    told = {"label": label, "level": level, "scale": scale, "unknown": unknown}
+    told: dict[str, Any] = {"label": label, "level": level, "scale": scale, "unknown": unknown}
     wanted = Options(inside=inside, field=field, **told)
     given = placed(values, spacing, origin)
     taken, origin = interpret(as_samples(given.values), wanted, given.spacing, hint), given.origin

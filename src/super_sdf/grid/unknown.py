@@ -38,7 +38,7 @@ class Known(NamedTuple):
 
     samples: SampleArray
     extremes: Extremes
-    count: int  # of the samples that were unknown
+    unknown: int  # how many samples were
     unseen: SampleArray | None
     why_open: str
 

@@ -95,18 +95,18 @@ def is_near(values: FloatArray) -> BoolArray:
     some of the 26 samples round them are on the other side. Where values are constant they are not.
     """
     change = np.zeros_like(values)
-    sides = 1 + (values > 0).view(np.uint8)  # of samples, then of edges ... cells
+    sides: NDArray[np.uint8] = 1 + (values > 0).view(np.uint8)  # of samples, then of ... cells
     for axis in range(3):
         lines, cells = np.moveaxis(values, axis, 0), np.moveaxis(sides, axis, 0)
-        sides = np.moveaxis(cells[1:] | cells[:-1], 0, axis)
+        sides = np.moveaxis(np.bitwise_or(cells[1:], cells[:-1]), 0, axis)
         steps = np.abs(lines[1:] - lines[:-1])
         largest = np.concatenate([steps[:1], np.maximum(steps[1:], steps[:-1]), steps[-1:]])
         change += np.moveaxis(largest, 0, axis)
     mixed = sides == 3
     for axis in range(3):
         mixed = np.pad(mixed, [(int(n == axis),) * 2 for n in range(3)])
-        lines = np.moveaxis(mixed, axis, 0)
-        mixed = np.moveaxis(lines[1:] | lines[:-1], 0, axis)
+        both = np.moveaxis(mixed, axis, 0)
+        mixed = np.moveaxis(both[1:] | both[:-1], 0, axis)
     return np.asarray((np.abs(values) < change) | mixed)
 
 
