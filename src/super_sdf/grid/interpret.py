@@ -39,6 +39,7 @@ from .samples import (
 )
 from .unknown import Known, with_known
 
+INNER = 0.25  # spacings: as deep at least samples inside are, where parts of a solid touch
 NONE_EXACT: Extremes = (0.0, 0.0)
 DENSITY = "density"  # what values with a level are
 # Voxels from the surface at which values are cut off: where the rest is filled in, and below which
@@ -346,7 +347,11 @@ def _of_spline(case: Case, facts: dict[str, Any], kind: str = SMOOTH) -> Taken:
     own = Field(kind, exact=NONE_EXACT, network=None, own_lattice=not cubic,
                 has_jumps=bool(facts.get("cut")) and kind == SMOOTH)  # fmt: skip
     low, high = (x / slope for x in (case.look.low, case.look.high))
-    samples = changed(case.samples, lambda values: values / slope)
+    samples: SampleArray = changed(case.samples, lambda values: values / slope)
+    if "inside" in facts:
+        samples = derived.without_inner_faces(
+            samples, facts["inside"], INNER * min(steps_of(spacing))
+        )
     return case.taken(spacing, own, facts, samples=samples, extremes=(low, high))
 
 

@@ -96,6 +96,15 @@ def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
             jumps = np.clip((rough - JUMPING) / (JUMPED - JUMPING), 0, 1)
             straight = np.pad(values, 2, mode="reflect", reflect_type="odd")
             found += jumps * (_evaluate(straight, ijk + 2, linear) - found)
+        cube, middle = found.reshape(factor + 1, factor + 1, factor + 1, -1), factor // 2
+        for axis in range(3):  # beyond the outermost samples the surface goes straight on
+            nodes, at = np.moveaxis(cube, axis, 0), voxel_ijk[rows, axis]
+            for outer, ends in (
+                (range(middle), 0),
+                (range(middle + 1, factor + 1), shape[axis] - 1),
+            ):
+                for node in outer:
+                    nodes[node, ..., at == ends] = nodes[middle, ..., at == ends]
         blocks[:, rows] = found
     blocks[:, :-1] -= np.float32(band.offset / unit)
     return blocks
