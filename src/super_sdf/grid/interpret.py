@@ -67,12 +67,13 @@ class Field:
 
     @property
     def has_exact(self) -> bool:
-        """Whether some samples may be exact derived."""
+        """Whether some samples may be exact distances."""
         return self.exact[0] < self.exact[1]
 
     def report(self) -> dict[str, Any]:
         """Return kind and facts as a dictionary that can be written as JSON."""
-        facts = {name: np.round(x, 4).tolist() for name, x in self.facts.items() if x is not None}
+        known = {name: np.asarray(x, float) for name, x in self.facts.items() if x is not None}
+        facts = {name: np.round(x, 4).tolist() for name, x in known.items()}
         return {"kind": self.kind, "given": self.given, **facts}
 
 
@@ -392,16 +393,13 @@ def _of_distances(case: Case, facts: dict[str, Any]) -> Taken:
 
 def _estimated(case: Case, facts: dict[str, Any]) -> Triple:
     """Return the spacing that the values show, with a note; GridError if they show none."""
-    look, found = case.look, facts.get("spacing")
-    if found is None and "unit" in facts:
-        found = np.ones(3) * facts["unit"] * look.scale
+    look = case.look
+    if facts.get("spacing") is None and "unit" not in facts:
+        facts = recognise(case.samples, look).facts
+    found = facts.get("spacing")
     if found is None:
-        answer = recognise(case.samples, look)
-        found = answer.facts.get("spacing")
-        if found is None and "unit" in answer.facts:
-            found = np.ones(3) * answer.facts["unit"] * look.scale
-    if found is None:
-        found = np.ones(3) * _slope_at_surface(look, np.ones(3))
+        unit = facts["unit"] * look.scale if "unit" in facts else None
+        found = np.full(3, unit or _slope_at_surface(look, np.ones(3)))
     found = np.array(found, np.float64)
     if not LEAST_SPACING <= found.min() <= found.max() <= MOST_SPACING:
         raise GridError(
