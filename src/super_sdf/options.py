@@ -233,8 +233,9 @@ class Options:
     """
 
     # fmt: off
-    factor: int = _option(4, MESH, "list labels", FACTOR,
-        "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.", metavar="K")
+    factor: int | None = _option(None, MESH, "list labels", FACTOR,
+        "Refinement per axis: 2, 4, 8 or 16 times finer than the grid. Default: 2 for masks and "
+        "labels, else 4.", metavar="K")
     _: KW_ONLY
     spacing: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
         "World distance between neighbouring samples: one number, or X,Y,Z. Default: from the "
@@ -277,10 +278,10 @@ class Options:
     mesher: MesherName = _option(AUTO, MESH, "list", one_of(MESHERS),
         "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
         "them; auto is sharp for distances, marching for masks and noise.")
-    simplify: float | None = _option(None, MESH, "list", VOXELS,
+    simplify: float | None = _option(None, MESH, "list labels", VOXELS,
         "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
         "Needs the extra simplify.", metavar="ERROR")
-    tolerance: float | None = _option(None, MESH, "list", WORLD,
+    tolerance: float | None = _option(None, MESH, "list labels", WORLD,
         "Simplify as with --simplify, but within D in world units.", metavar="D")
     triangles: int | None = _option(None, MESH, "list",
         number(WHOLE, "4 or more, as a closed mesh has", above=3, step=1),
@@ -327,6 +328,10 @@ class Options:
         """Return the mesher; by itself ``sharp`` if samples are exact: else it finds no edges."""
         automatic: MesherName = SHARP if exact else MARCHING
         return automatic if self.mesher == AUTO else self.mesher
+
+    def factor_for(self, kind: str) -> int:
+        """Return the factor for values of a kind: masks show no details for which 2 is too few."""
+        return self.factor or (2 if kind == MASK else 4)
 
     def values(self) -> Values:
         """Return what the values are: keywords of ``make_grid``."""

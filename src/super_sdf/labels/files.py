@@ -25,13 +25,13 @@ from ..files.meshes import check_mesh_suffix, check_target, format_of, write_mes
 from ..files.output import check_apart
 from ..files.regular import check_regular_file, files_of
 from ..files.volume import PLACE
-from ..grid.sdf_grid import SdfGrid, describe_place, mean_spacing
+from ..grid.sdf_grid import SdfGrid, describe_place
 from ..network.decoder import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..progress import Progress, Stopwatch
 from ..surface.mesh import Mesh
 from .reconstruct import find_image, in_order, label_meshes
-from .volumes import keep_volumes, volume_notes
+from .volumes import volume_notes
 
 LONGEST = 80  # characters of a name
 
@@ -108,15 +108,14 @@ def convert_labels(
         check_target(path, force=force)
         check_apart(path, files_of(source))
     watch.lap("read")
-    meshes = label_meshes(image, network, options.factor, options.max_memory, progress)
+    meshes, notes, warnings = label_meshes(image, network, options, progress)
     for label, mesh in zip(called, meshes):
         if mesh.open_edges():
             raise MeshError(f"the mesh of label {label} is torn: run it again, and report it")
-    volumes, off = image.volumes, list[str]()
+    volumes = image.volumes
     if options.keep_volume:
-        meshes = keep_volumes(meshes, volumes, mean_spacing(grid))
         made = zip(called.values(), meshes, volumes)
-        off = volume_notes({entry.name: (mesh.volume(), volume) for entry, mesh, volume in made})
+        notes += volume_notes({entry.name: (mesh.volume(), volume) for entry, mesh, volume in made})
     watch.lap("mesh")
     files: dict[Path, dict[str, Mesh]] = {path: {} for path in paths}
     rows = []
@@ -131,7 +130,8 @@ def convert_labels(
     watch.lap("write")
     lacking = names_of(image.missing, known)
     missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
-    return LabelConversion(grid, rows, missing, (*grid.notes, *off), watch.seconds)
+    said = (*grid.notes, *notes)
+    return LabelConversion(grid, rows, missing, said, watch.seconds, tuple(warnings))
 
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:
