@@ -9,10 +9,10 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from math import ceil, inf
 from pathlib import Path
+from threading import Thread
 from typing import TypeVar
 
 from .errors import OptionError, OutOfMemoryError
@@ -73,6 +73,8 @@ def over_threads(
     if threads < 2:
         yield from map(work, pieces)
         return
+    from concurrent.futures import ThreadPoolExecutor  # imported here, as small grids need none
+
     with ThreadPoolExecutor(threads) as pool:
         yield from pool.map(work, pieces)
 
@@ -89,6 +91,28 @@ def map_chunks(
 ) -> list[Result]:
     """Return ``work(rows)`` for chunks of ``count`` rows that need ``width`` temporaries each."""
     return map_threads(work, chunks_of(count, width), worthwhile_threads(count * width, threads))
+
+
+def call_beside(work: Callable[[], object], stop: Callable[[], object]) -> None:
+    """Do some work in another thread, and ``stop`` it at an interrupt; errors are passed on."""
+    failures: list[Exception] = []
+
+    def run() -> None:
+        try:
+            work()
+        except Exception as error:
+            failures.append(error)
+
+    thread = Thread(target=run)
+    thread.start()
+    try:
+        thread.join()
+    except BaseException:
+        stop()
+        thread.join()
+        raise
+    if failures:
+        raise failures[0]
 
 
 def count_cores() -> int:

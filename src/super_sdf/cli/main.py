@@ -5,7 +5,6 @@ Options come from the table in ``options``; an error is one line on stderr and a
 
 from __future__ import annotations
 
-import difflib
 import io
 import json
 import os
@@ -47,7 +46,9 @@ class Commands(click.Group):
         if cmd_name in COMMANDS:
             found: click.Command = import_module(f"..{cmd_name}", __name__).command
             return found
-        near = difflib.get_close_matches(cmd_name, COMMANDS, 1)
+        from difflib import get_close_matches  # imported here, as few need it
+
+        near = get_close_matches(cmd_name, COMMANDS, 1)
         way_out = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}"
         ctx.fail(f"there is no command {cmd_name!r}: {way_out}")
 
@@ -219,6 +220,8 @@ def _discard(number: int) -> None:
 
 def main() -> None:
     """Run the command line and exit with its exit code; every error is one line on stderr."""
+    # NumPy's BLAS has only small matrices to multiply, and its idle threads would keep cores busy.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if code := run():
         sys.exit(code)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from contextlib import ExitStack
 from typing import Any
@@ -94,12 +93,15 @@ def command(source: str, target: str, **given: Any) -> None:
         "version": __version__,
         "asked": options.digest(),
         "model": model,
-        "network": hashlib.sha256(network.path.read_bytes()).hexdigest(),
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),
         **done.report(),
     }
+    if given["as_json"] or given["report"]:
+        from hashlib import sha256  # imported here, as it loads OpenSSL
+
+        report["network"] = sha256(network.path.read_bytes()).hexdigest()
     certificate = None
     if given["check"]:
         from ..check.check import check_mesh, read_for_check
