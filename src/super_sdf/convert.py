@@ -107,9 +107,9 @@ def convert(
             from .labels.volumes import check_has_volume  # imported here, as few need it
 
             check_has_volume(grid, options.offset, cap=options.cap)
-        lattice = cubic_grid(grid, options.offset)
+        lattice, factor = cubic_grid(grid, options.offset), options.factor_for(grid.field.kind)
         if file:
-            file.check_fits(grid.shape, options.factor)
+            file.check_fits(grid.shape, factor)
         watch.lap("read")
         shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
         write_field = file.write if file else None
@@ -133,7 +133,8 @@ def convert(
     if options.mesher == "sharp" and not lattice.field.has_exact:
         why = f"{lattice.field.kind} values show no edges"
         notes.append(f"{why}: the mesh is that of marching cubes")
-    sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "tiles": made.tiles}
+    sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    sizes |= {"tiles": made.tiles, "factor": factor}
     return Conversion(
         grid,
         mesh,
@@ -154,10 +155,10 @@ def reworked(
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
     simplified, off = None, list[str]()
     if options.keep_volume:
-        from .labels.volumes import keep_volumes, volume_notes
+        from .labels.volumes import keep_volume, volume_notes
 
         volume = volume_of_samples(grid)
-        (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))
+        mesh = keep_volume(mesh, volume, mean_spacing(grid))
     if options.goals():
         from .simplify.simplify import simplify_mesh
 

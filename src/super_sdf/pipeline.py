@@ -101,7 +101,7 @@ def refine_band(
 def upsample(
     grid: SdfGrid,
     network: Decoder,
-    factor: int = 4,
+    factor: int | None = None,
     *,
     offset: float = 0.0,
     progress: Progress | None = None,
@@ -115,8 +115,9 @@ def upsample(
         axes, they are resampled to the finest first; the field has that spacing.
     network : Network
         From ``load_network``.
-    factor : int
-        How many times finer per axis, K: an even number from 2 to 16.
+    factor : int, optional
+        How many times finer per axis, K: an even number from 2 to 16; by default 2 for masks,
+        else 4.
     offset : float
         Refine the surface at this distance from the solid (world units) instead of the solid's own
         (Sec. 5.3). Positive is outwards, whichever sign the input had inside, since ``grid.values``
@@ -144,7 +145,7 @@ def upsample(
     options.check_network(network)
     options.check_progress(progress)
     asked = Options(factor, offset=offset)  # checks them
-    factor, offset = asked.factor, asked.offset
+    factor, offset = asked.factor_for(grid.field.kind), asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
@@ -207,7 +208,7 @@ def extract_mesh(
 def reconstruct(
     grid: SdfGrid | None = None,
     network: Decoder | None = None,
-    factor: int = 4,
+    factor: int | None = None,
     *,
     function: Function | None = None,
     bounds: ArrayLike | None = None,
@@ -284,7 +285,7 @@ def reconstruct(
         return mesh
     from .functions.zero import put_on_zero
 
-    return put_on_zero(mesh, exact, grid, factor, offset)
+    return put_on_zero(mesh, exact, grid, chosen.factor_for(grid.field.kind), offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,6 +310,7 @@ class Task:
     shape: tuple[int, int, int]  # samples of the whole grid
     whole: BandSummary | None  # None of a tile that is the whole grid
     options: Options
+    factor: int
     mesher: MesherName
     threads: int
 
@@ -336,7 +338,8 @@ def mesh_grid(
     options.check_network(network)
     options.check_progress(progress)
     check_can_close(grid, cap=chosen.cap)
-    steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
+    factor = chosen.factor_for(grid.field.kind)
+    steps, offset = StepCounter(progress), chosen.offset
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
     mesher = chosen.mesher_for(exact=lattice.field.has_exact)
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
@@ -359,7 +362,7 @@ def mesh_grid(
 
     def task_of(tile: Tile) -> Task:
         part = crop(lattice, tile.low, tile.high) if whole else lattice
-        return Task(tile, part, shape, whole, chosen, mesher, threads)
+        return Task(tile, part, shape, whole, chosen, factor, mesher, threads)
 
     if band:
         bands, band = [band], None  # so that it is freed when it has been used
@@ -391,7 +394,7 @@ def make_tile(
     save_field: Callable[[FineField], None] | None = None,
 ) -> Part:
     """Return the part of the mesh that belongs to a tile, which may be the whole grid."""
-    tile, chosen, factor = task.tile, task.options, task.options.factor
+    tile, chosen, factor = task.tile, task.options, task.factor
     band = band or survey(task.grid, chosen.offset, threads=task.threads, whole=task.whole)
     if not band.decoded.any():
         return Part.without_surface(tile)

@@ -21,9 +21,10 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import NEIGHBOURHOOD, IntArray, Vectors
+from ..arrays import NEIGHBOURHOOD, IntArray, Vectors, dot, face_normals, unit
 from ..surface.collapse import FEW_ROUNDS, collapse, up_to_1
 from ..surface.mesh import Mesh, row_keys
+from ..surface.sharp.folds import intersecting, overlapping_boxes
 from ..threads import check_count, chunks_of
 from .walls import Walls
 
@@ -31,6 +32,7 @@ Rows = NDArray[np.intp]
 SLIGHT = 0.01  # voxels from planes, by default
 WITHIN = 0.7, 1.2, 1.7  # errors from planes, in passes: the last get little wrong
 MOST_REPEATS, HALVINGS = 8, 3
+SHARP = -0.9  # cosine between the normals of a label's triangles: walls all but touch
 ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 
@@ -57,16 +59,41 @@ def of_labels(walls: Walls, count: int) -> tuple[IntArray, Rows, list[int], list
     return faces, np.concatenate(points), first, [end - ends[0] for end in ends]
 
 
-def irregular(walls: Walls, count: int) -> Rows:
-    """Return the points at which the surface of a label is no manifold, or folded flat."""
+def meshes_of(walls: Walls, count: int) -> list[Mesh]:
+    """Return the closed meshes of labels 1 to ``count``."""
+    faces, point, first, ends = of_labels(walls, count)
+    return [
+        Mesh(walls.points[point[low:high]], faces[start:stop] - np.int32(low))
+        for (low, high), (start, stop) in zip(pairwise(first), pairwise(ends))
+    ]
+
+
+def faults(walls: Walls, count: int, spacing: float) -> Rows:
+    """Return the points at which something is wrong with the walls.
+
+    There a label's surface is no manifold, or two points or triangles are one, or two triangles
+    intersect that have corners at edges with an angle near 0. ``spacing`` is that of the lattice.
+    """
     faces, point, _, _ = of_labels(walls, count)
-    mesh = Mesh(np.zeros((len(point), 3), np.float32), faces)
+    mesh = Mesh(walls.points[point], faces)
     opposite = mesh.pair_edges()[0]
-    beside = np.sort(opposite.reshape(-1, 3) // 3, axis=1)
-    flat = faces[(beside[:, 1:] == beside[:, :-1]).any(1)]
-    crowded = faces.ravel()[opposite < 0], np.roll(faces, -1, axis=1).ravel()[opposite < 0]
-    pinched = np.flatnonzero(mesh.count_fans(opposite) > 1)
-    return np.unique(point[np.concatenate([*crowded, flat.ravel(), pinched])])
+    start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    wrong = [point[start[opposite < 0]], point[end[opposite < 0]]]
+    wrong.append(point[np.flatnonzero(mesh.count_fans(opposite) > 1)])
+    for rows in (np.sort(walls.faces, axis=1), walls.points.astype(np.float32)):
+        keys = row_keys(rows.astype(np.float64))
+        _, which, times = np.unique(keys, return_inverse=True, return_counts=True)
+        double = np.flatnonzero(times[which] > 1)
+        wrong.append(walls.faces[double].ravel() if len(which) == len(walls.faces) else double)
+    normals = unit(face_normals(mesh.vertices, faces))
+    sharp = np.flatnonzero(dot(normals.repeat(3, 0), normals[opposite // 3]) < SHARP)
+    suspect = np.zeros(len(walls.points), bool)
+    suspect[point[start[sharp]]] = suspect[point[end[sharp]]] = True
+    some = walls.faces[suspect[walls.faces].any(1)].astype(np.int64)
+    points = walls.points / spacing
+    one, other = overlapping_boxes(points, some, np.ones(len(points), bool))
+    wrong += [both.ravel() for both in intersecting(points, some[one], some[other])]
+    return np.unique(np.concatenate(wrong))
 
 
 def simplified(
@@ -94,20 +121,20 @@ def with_fewer(
     walls: Walls,
     count: int,
     distances: Sequence[float],
-    reach: float,
+    spacing: float,
     find_wrong: Callable[[Walls], Vectors] | None = None,
 ) -> Walls | None:
     """Return the walls after collapses within distances of planes, one pass for each.
 
     ``find_wrong`` returns places of further faults, (n, 3), round which points up to about
-    ``reach`` are to be held. None if faults remain.
+    a ``spacing`` are to be held. None if faults remain.
     """
-    held: Rows = np.zeros(0, np.intp)
+    held, reach = np.zeros(0, np.intp), spacing
     for _ in range(MOST_REPEATS):
         made, kept = walls, held
         for distance in distances:
             made, kept = _pass(made, kept, distance)
-        places = made.points[irregular(made, count)]
+        places = made.points[faults(made, count, spacing)]
         if not len(places) and find_wrong:
             places = find_wrong(made)
         if not len(places):
@@ -122,42 +149,61 @@ def with_fewer(
 
 
 def within(walls: Walls, count: int, error: float, spacing: float) -> Walls | None:
-    """Return the walls within a distance of these, both ways, and without intersections.
+    """Return the walls with each label within a distance of what it was, both ways.
 
     ``spacing`` is that of the fine lattice. None if none of several ways leads to it.
     """
-    import igl.predicates
-
-    from ..truth.solid import Solid
-
-    base = Solid(Mesh(walls.points, walls.faces))
-    near = np.zeros(len(walls.points), np.uint64)  # keys of triangles, within the error
-    known = np.zeros(0, np.uint64)  # keys of triangles of which all points are
+    labels = [_Label(mesh) for mesh in meshes_of(walls, count)]
 
     def find_wrong(made: Walls) -> Vectors:
-        nonlocal known
-        keys = row_keys(made.points[made.faces].reshape(-1, 9))
-        new = np.flatnonzero(~np.isin(near, keys))
-        distance, face, _ = Solid(Mesh(made.points, made.faces)).nearest(walls.points[new])
-        near[new] = np.where(distance <= error, keys[face], 0)
-        far = walls.points[new[distance > error]]
+        found = zip(labels, meshes_of(made, count))
+        far = np.concatenate([label.far_from(mesh, error, spacing) for label, mesh in found])
         if not len(far):
-            new, wrong = np.flatnonzero(~np.isin(keys, known)), np.zeros(0, np.intp)
-            for points, nth in points_on(made.points[made.faces[new]], spacing):
-                distance, _, feet = base.nearest(points)
-                far = np.concatenate([far, feet[distance > error]])
-                wrong = np.append(wrong, nth[distance > error])
-            known = np.union1d(known, np.delete(keys[new], wrong))
-        if not len(far):
-            pairs = igl.predicates.find_self_intersections(made.points, made.faces)[1]
+            pairs = find_self_intersections(made.points, made.faces.astype(np.int64))[1]
             far = made.points[made.faces[np.unique(pairs)]].mean(1)
         return far
+
+    from igl.predicates import find_self_intersections
 
     for halving in range(HALVINGS):
         distances = error / 2**halving * np.array(WITHIN)
         if made := with_fewer(walls, count, distances.tolist(), spacing, find_wrong):
             return made
     return None
+
+
+class _Label:
+    """A label's mesh, to measure others against; what was measured holds while triangles stay."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        from ..truth.solid import Solid
+
+        self.solid_of, self.solid = Solid, Solid(mesh)
+        self.near = np.zeros(len(mesh.vertices), np.uint64)  # keys of triangles within the error
+        self.known = np.zeros(0, np.uint64)  # keys of triangles of which all points are
+
+    def far_from(self, made: Mesh, error: float, step: float) -> Vectors:
+        """Return points of this mesh that are farther than the error from another, or it from them.
+
+        Of the other mesh, points at most a ``step`` apart count.
+        """
+        vertices, keys = (
+            self.solid.mesh.vertices,
+            row_keys(made.vertices[made.faces].reshape(-1, 9)),
+        )
+        new = np.flatnonzero(~np.isin(self.near, keys))
+        distance, face, _ = self.solid_of(made).nearest(vertices[new])
+        self.near[new] = np.where(distance <= error, keys[face], 0)
+        far = vertices[new[distance > error]]
+        if len(far):
+            return far
+        new, wrong = np.flatnonzero(~np.isin(keys, self.known)), np.zeros(0, np.intp)
+        for points, nth in points_on(made.vertices[made.faces[new]], step):
+            distance, _, feet = self.solid.nearest(points)
+            far = np.concatenate([far, feet[distance > error]])
+            wrong = np.append(wrong, nth[distance > error])
+        self.known = np.union1d(self.known, np.delete(keys[new], wrong))
+        return far
 
 
 def points_on(triangles: Vectors, step: float) -> Iterator[tuple[Vectors, Rows]]:

@@ -39,7 +39,9 @@ class Contest:
     able: NDArray[np.int8]  # (Q, D), how many labels could hold it; 2: or more
     times: Labels  # (D,), how many labels meet others in a voxel
 
-    def enter(self, label: int, rows: NDArray[np.int64], blocks: FloatArray, can: BoolArray) -> None:
+    def enter(
+        self, label: int, rows: NDArray[np.int64], blocks: FloatArray, can: BoolArray
+    ) -> None:
         """Let a label with values at the nodes of some voxels, (Q, n), hold those that it can."""
         self.times[rows] += 1
         for value, can_here, lowest, holder, able in zip(

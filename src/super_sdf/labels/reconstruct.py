@@ -7,7 +7,7 @@ triangles, and ``volumes`` makes up for what smooth surfaces lack.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from typing import Any
 
@@ -27,7 +27,7 @@ from ..network.network import load_network, network_for
 from ..progress import Progress
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import memory_bound
-from .fewer import of_labels, simplified
+from .fewer import meshes_of, simplified
 from .fields import label_fields
 from .volumes import keep_volumes
 from .walls import Walls, extract_walls
@@ -216,13 +216,9 @@ def label_meshes(
     del fields
     faces = walls.faces[:, ::-1] if grid.is_mirrored else walls.faces
     walls = Walls(grid.to_world(walls.points / factor - 0.5), faces, walls.sides)
-    voxel = grid.voxel_size
-    walls, notes, warnings = simplified(walls, count, voxel, factor, chosen.error(voxel))
     if chosen.keep_volume:
         walls = keep_volumes(walls, image.volumes, mean_spacing(grid))
-    faces, point, vertices, triangles = of_labels(walls, count)
-    meshes = []
-    for first, last, start, stop in zip(vertices, vertices[1:], triangles, triangles[1:]):
-        places = walls.points[point[first:last]].astype(kind)
-        meshes.append(Mesh(places, faces[start:stop] - np.int32(first)))
+    voxel = grid.voxel_size
+    walls, notes, warnings = simplified(walls, count, voxel, factor, chosen.error(voxel))
+    meshes = meshes_of(replace(walls, points=walls.points.astype(kind)), count)
     return meshes, notes, warnings

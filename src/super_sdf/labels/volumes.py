@@ -22,12 +22,12 @@ from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..options import MASK
 from ..surface.mesh import Mesh
-from .fewer import Rows, of_labels
+from .fewer import Rows, faults, of_labels
 from .walls import Walls
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
-ROUNDS = 12
+ROUNDS, TURNS = 12, 6
 GOOD, NOTED = 1e-6, 1e-3  # of a volume
 
 
@@ -66,9 +66,22 @@ def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Wall
     another one.
     """
     middle, most = walls.points.mean(0), MOST * spacing
-    start = points = walls.points - middle
+    start = walls.points - middle
     lattice = _mean_normals(replace(walls, points=start), len(volumes), CELL * spacing)
-    effects, distances = lattice.effects(len(volumes)), np.zeros(len(volumes))
+    for _ in range(TURNS):
+        moved = _solved(walls, start, lattice, volumes, most)
+        wrong = faults(replace(walls, points=moved), len(volumes), CELL * spacing)
+        if not len(wrong):
+            return replace(walls, points=middle + moved)
+        lattice.normals[np.isin(lattice.node, lattice.nodes[wrong])] = 0
+    return walls
+
+
+def _solved(
+    walls: Walls, start: Vectors, lattice: _Lattice, volumes: Sequence[float], most: float
+) -> Vectors:
+    """Return the points, moved so that the labels have their volumes."""
+    effects, distances, points = lattice.effects(len(volumes)), np.zeros(len(volumes)), start
     for _ in range(ROUNDS):
         off = np.asarray(volumes) - _volumes(points, walls, len(volumes))
         if (np.abs(off) <= GOOD * np.abs(volumes)).all():
@@ -77,7 +90,7 @@ def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Wall
         step = np.linalg.lstsq(effects[np.ix_(free, free)], off[free], rcond=None)[0]
         distances[free] = np.clip(distances[free] + step, -most, most)
         points = start + lattice.moves(distances, most)
-    return replace(walls, points=middle + points)
+    return points
 
 
 def _volumes(points: Vectors, walls: Walls, count: int) -> Numbers:

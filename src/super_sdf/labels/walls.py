@@ -76,11 +76,11 @@ class Labelled:
 def extract_walls(field: Labelled) -> Walls:
     """Return the walls of all labels, in fine spacings from node (0, 0, 0)."""
     low, label = _crossed_cells(field)
-    _, ny, nz = (2 * field.factor * (n + 2) + 1 for n in field.shape)  # a voxel beyond the grid, too
+    # of the lattice of half the fine spacing, a voxel beyond the grid to every side
+    nx, ny, nz = (2 * field.factor * (n + 2) + 1 for n in field.shape)
     along = np.array([ny * nz, nz, 1], np.int64)
-    total = (2 * field.factor * (field.shape[0] + 2) + 1) * int(along[0])
     steps = PLACES @ along
-    steps[CELL_POINTS:] += total * np.arange(len(PLACES) - CELL_POINTS)
+    steps[CELL_POINTS:] += nx * ny * nz * np.arange(len(PLACES) - CELL_POINTS)
     base = 2 * (low + field.factor) @ along
 
     # the triangles of each cell's case, by the names of their points
@@ -128,7 +128,7 @@ def extract_walls(field: Labelled) -> Walls:
 
 
 def _crossed_cells(field: Labelled) -> tuple[Keys, Labels]:
-    """Return the cells that a wall crosses: their low nodes, (n, 3), and corners' labels, (n, 8)."""
+    """Return the low nodes of the cells that a wall crosses, (n, 3), and their labels, (n, 8)."""
     factor = field.factor
     least = most = field.holder.reshape(*(factor + 1,) * 3, -1)
     for axis in range(3):
