@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,6 @@ from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
 from .options import MesherName, Options
-from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.band import neighbour_table
 from .refine.bounds import keep_within_bounds
@@ -36,7 +35,7 @@ from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, sum
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
-from .threads import in_words, useful_threads
+from .threads import STEPS, Progress, StepCounter, in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
 
 if TYPE_CHECKING:
@@ -56,10 +55,10 @@ def refine_band(
     table = neighbour_table(band.voxel_ijk, grid.shape)
     voxels = np.flatnonzero(band.decoded).astype(np.int32)
     own_ijk = band.voxel_ijk[voxels]
-    if grid.field.smooth is None:
+    if grid.field.network is not None:
         blocks = predict(band, table, voxels, network, factor, threads, steps.within("network"))
     else:
-        blocks = interpolate(band, table, voxels, network, factor, threads)
+        blocks = interpolate(band, voxels, factor)
     steps.finish("network")
 
     row_of = np.full(len(table) + 1, -1, np.int32)  # of each voxel of the band, if it is decoded
@@ -70,7 +69,7 @@ def refine_band(
     index = nodes.VoxelIndex(own_ijk, grid.shape)
     fit_to_spheres(blocks, parts, factor, spheres_of_band(band, threads), index, threads)
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
-    if grid.field.kind == options.MASK:
+    if grid.field.sides_only:
         nodes.hold_sides(blocks, factor, patches, voxels)
     pinned = nodes.pin_to_skipped(
         blocks[:, :-1], parts, factor, own_ijk, patches, voxels, grid.shape
@@ -123,7 +122,7 @@ def upsample(
         (Sec. 5.3). Positive is outwards, whichever sign the input had inside, since ``grid.values``
         are always negative inside. The distances must reach 1.5 spacings beyond the offset.
     progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
+        Called with (done, total), see ``threads.Progress``; an exception in it ends the work.
 
     Returns
     -------
@@ -142,12 +141,11 @@ def upsample(
         which shows only at the end: a thin part may lie between samples that are all outside.
     """
     check_grid(grid)
-    options.check_network(network)
-    options.check_progress(progress)
+    options.check_called(network, progress)
     asked = Options(factor, offset=offset)  # checks them
-    factor, offset = asked.factor_for(grid.field.kind), asked.offset
+    factor, offset = asked.factor_for(mask=grid.field.sides_only), asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
-    lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
+    lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     threads = useful_threads(chosen.threads)
     band = survey(lattice, offset, threads=threads)  # Eqs. 2 and 4
@@ -285,7 +283,7 @@ def reconstruct(
         return mesh
     from .functions.zero import put_on_zero
 
-    return put_on_zero(mesh, exact, grid, chosen.factor_for(grid.field.kind), offset)
+    return put_on_zero(mesh, exact, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +294,6 @@ class Result:
     open_edges: int
     counts: dict[str, int]  # see ``FineField``; in tiles, a pinned node may count twice
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
-    is_cut: bool  # whether the surface leaves the grid, or may end at unknown samples
     seconds: dict[str, float]  # by step
     tiles: int
 
@@ -308,11 +305,11 @@ class Task:
     tile: Tile
     grid: SdfGrid  # the samples of the tile
     shape: tuple[int, int, int]  # samples of the whole grid
-    whole: BandSummary | None  # None of a tile that is the whole grid
     options: Options
     factor: int
     mesher: MesherName
     threads: int
+    whole: BandSummary | None = None  # of a tile that is not the whole grid
 
 
 MapTiles = Callable[[Callable[[Task], Part], Iterator[Task]], Iterable[Part]]
@@ -335,45 +332,44 @@ def mesh_grid(
     made elsewhere, ``least_tiles`` or more, each within the memory bound.
     """
     check_grid(grid)
-    options.check_network(network)
-    options.check_progress(progress)
+    options.check_called(network, progress)
     check_can_close(grid, cap=chosen.cap)
-    factor = chosen.factor_for(grid.field.kind)
+    factor = chosen.factor_for(mask=grid.field.sides_only)
     steps, offset = StepCounter(progress), chosen.offset
-    lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
-    mesher = chosen.mesher_for(exact=lattice.field.has_exact)
+    lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
-    threads, shape = useful_threads(decoder.threads), lattice.shape
-    room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
-    tiles, whole = [Tile((0, 0, 0), shape, (0, 0, 0), shape)], None
+    mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
+    everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
+    task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
+    room, whole = Room.of(chosen.max_memory, factor, decoder.memory_bytes), None
+    most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
     try:
-        is_one = map_tiles is None and least_tiles == 1
-        band = survey(lattice, offset, threads=threads, most=room.voxels() if is_one else -1)
+        bands = [survey(lattice, offset, threads=threads, most=most)]
     except BandTooLargeError:
-        band, whole = None, summarise(lattice, offset, threads)
-        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
-        tiles = plan(shape, whole, margin, room, least_tiles)
-    steps.finish("band")
-    if whole and save_field:
+        whole = summarise(lattice, offset, threads)
+    if not whole:
+        steps.finish("band")
+        parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
+    elif save_field:
         raise OutOfMemoryError(
             f"the refined field does not fit in the {in_words(room.bound)} that may be used: use a "
             "smaller factor, allow more (--max-memory), or leave --save-field out"
         )
-
-    def task_of(tile: Tile) -> Task:
-        part = crop(lattice, tile.low, tile.high) if whole else lattice
-        return Task(tile, part, shape, whole, chosen, factor, mesher, threads)
-
-    if band:
-        bands, band = [band], None  # so that it is freed when it has been used
-        parts = [make_tile(task_of(tiles[0]), decoder, bands.pop(), steps, save_field)]
     else:
+        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
+        tiles = plan(shape, whole, margin, room, least_tiles)
+        steps.finish("band")
+        tasks = (
+            replace(task, tile=tile, grid=crop(lattice, tile.low, tile.high), whole=whole)
+            for tile in tiles
+        )
         parts = []
-        for part in (map_tiles or map)(partial(make_tile, network=decoder), map(task_of, tiles)):
+        for part in (map_tiles or map)(partial(make_tile, network=decoder), tasks):
             parts.append(part)
-            steps.show(len(parts) / len(tiles))
+            steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
-    leaves, is_cut = (any(getattr(part, name) for part in parts) for name in ("leaves", "is_cut"))
+    count = len(parts)
+    leaves, is_cut = any(part.leaves for part in parts), any(part.is_cut for part in parts)
     counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
     if whole:
         counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
@@ -381,9 +377,9 @@ def mesh_grid(
     if not len(mesh.faces):
         raise no_surface(grid, offset)
     ends = lattice.field.unseen is not None
-    count = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
+    edges = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
     steps.finish("isosurface")
-    return Result(mesh, count, counts, leaves, is_cut, steps.seconds, len(tiles))
+    return Result(mesh, edges, counts, leaves, steps.seconds, count)
 
 
 def make_tile(
@@ -404,15 +400,8 @@ def make_tile(
         save_field(field)
     border = np.array([(0, 0, 0), task.shape]) - np.array(tile.low)
     is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
-    mesh, keys = extract(
-        field,
-        task.grid,
-        mesher=task.mesher,
-        cap=chosen.cap,
-        threads=task.threads,
-        first=tile.low,
-        shape=task.shape,
-    )
+    how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": task.threads}
+    mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
     counts = dict(field.counts)
     if task.whole:
         own = tile.owns(field.voxel_ijk + np.array(tile.low))

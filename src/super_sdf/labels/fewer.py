@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -78,13 +79,13 @@ def faults(walls: Walls, count: int, spacing: float) -> Rows:
     mesh = Mesh(walls.points[point], faces)
     opposite = mesh.pair_edges()[0]
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
-    wrong = [point[start[opposite < 0]], point[end[opposite < 0]]]
-    wrong.append(point[np.flatnonzero(mesh.count_fans(opposite) > 1)])
-    for rows in (np.sort(walls.faces, axis=1), walls.points.astype(np.float32)):
-        keys = row_keys(rows.astype(np.float64))
-        _, which, times = np.unique(keys, return_inverse=True, return_counts=True)
-        double = np.flatnonzero(times[which] > 1)
-        wrong.append(walls.faces[double].ravel() if len(which) == len(walls.faces) else double)
+    pinched, split = mesh.count_fans(opposite) > 1, opposite < 0
+    wrong: list[Rows] = [point[pinched], point[start[split]], point[end[split]]]
+    corners = row_keys(np.sort(walls.faces, axis=1).astype(np.float64))
+    wrong += [walls.faces[_repeated(corners)].ravel().astype(np.intp)]
+    wrong += [
+        np.flatnonzero(_repeated(row_keys(walls.points.astype(np.float32).astype(np.float64))))
+    ]
     normals = unit(face_normals(mesh.vertices, faces))
     sharp = np.flatnonzero(dot(normals.repeat(3, 0), normals[opposite // 3]) < SHARP)
     suspect = np.zeros(len(walls.points), bool)
@@ -94,6 +95,13 @@ def faults(walls: Walls, count: int, spacing: float) -> Rows:
     one, other = overlapping_boxes(points, some, np.ones(len(points), bool))
     wrong += [both.ravel() for both in intersecting(points, some[one], some[other])]
     return np.unique(np.concatenate(wrong))
+
+
+def _repeated(keys: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Return which keys are there more than once."""
+    _, which, times = np.unique(keys, return_inverse=True, return_counts=True)
+    found: NDArray[np.bool_] = times[which] > 1
+    return found
 
 
 def simplified(
@@ -219,7 +227,7 @@ def points_on(triangles: Vectors, step: float) -> Iterator[tuple[Vectors, Rows]]
             yield points.reshape(-1, 3), np.repeat(some, len(i))
 
 
-def _among(rows: Vectors, others: Vectors) -> NDArray[np.bool_]:
+def _among(rows: NDArray[Any], others: NDArray[Any]) -> NDArray[np.bool_]:
     """Return which rows of whole numbers, (n, 3), are among others."""
     low, size = others.min(0), np.ptp(others, axis=0) + 1
     along = np.array([size[1] * size[2], size[2], 1])

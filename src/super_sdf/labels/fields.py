@@ -18,11 +18,17 @@ from ..grid.derived import REACH, extremes_of_masks, mask_distances
 from ..grid.sdf_grid import SdfGrid
 from ..network.decoder import Adapter
 from ..pipeline import refine_band
-from ..progress import Progress, StepCounter, part_of
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
 from ..refine.survey import survey
 from ..surface.marching import strides
-from ..threads import held_memory, in_words, useful_threads
+from ..threads import (
+    Progress,
+    StepCounter,
+    held_memory,
+    in_words,
+    part_of,
+    useful_threads,
+)
 from .walls import Labelled, Labels
 
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend

@@ -18,15 +18,14 @@ from .. import options
 from ..errors import GridError, OptionError, check_modules, seen
 from ..files.grids import read_array
 from ..grid.derived import extremes_of_masks
-from ..grid.field import NONE_EXACT, Field
-from ..grid.interpret import as_sample, labelled, named
-from ..grid.samples import as_samples, check_kind, check_spacing, is_cubic, placed
+from ..grid.interpret import as_sample, labelled, mask_field
+from ..grid.look import named
+from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.decoder import Decoder, adapt
 from ..network.network import load_network, network_for
-from ..progress import Progress
 from ..surface.mesh import Mesh, vertex_type
-from ..threads import memory_bound
+from ..threads import Progress, memory_bound
 from .fewer import meshes_of, simplified
 from .fields import label_fields
 from .volumes import keep_volumes
@@ -125,7 +124,7 @@ def find_image(
         place = read_array(values, place, axes, space, max_memory)
         values, notes = place["values"], list(place["notes"])
     elif axes is not None:
-        raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
+        raise OptionError(f"--axes is {seen(axes)}: that is for files; transpose the array")
     given = placed(values, place["spacing"], place["origin"])
     samples, origin = as_samples(given.values), given.origin
     check_kind(samples.dtype, samples.shape)
@@ -139,10 +138,11 @@ def find_image(
         said = "solids of labels run out of the grid: closed along the border"
         notes.append(f"{said} ({named(cut)})")
     steps = check_spacing(1.0 if given.spacing is None else given.spacing)
-    field = Field(options.MASK, True, NONE_EXACT, on_lattice=not is_cubic(steps))
     where = (samples, steps, 0.0 if origin is None else origin, tuple(notes))
     more = {"direction": place["direction"], "extremes": extremes_of_masks(min(steps))}
-    grid = with_fields(SdfGrid.trusted(*where, **more, field=field), space=place.get("space"))
+    grid = with_fields(
+        SdfGrid.trusted(*where, **more, field=mask_field(steps)), space=place.get("space")
+    )
     missing = [label for label in wanted or () if label not in labels]
     volumes = [float(np.prod(steps)) * count for count in counts.tolist()]
     return LabelImage(grid, labels, numbers, missing, volumes)
@@ -153,9 +153,9 @@ def in_order(labels: Any) -> list[int] | None:
     given = options.check_labels(labels)
     if isinstance(given, str):
         return None
-    chosen = sorted({options.check_label(label, "labels") for label in given})
+    chosen = sorted({options.check_label(label, "--labels") for label in given})
     if not 0 < len(chosen) <= MOST_LABELS:
-        raise OptionError(f"labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
+        raise OptionError(f"--labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
     return chosen
 
 
@@ -203,9 +203,8 @@ def label_meshes(
 
     OutOfMemoryError if the fields do not fit in memory.
     """
-    options.check_network(network)
-    options.check_progress(progress)
-    grid, factor, count = image.grid, chosen.factor_for(options.MASK), len(image.labels)
+    options.check_called(network, progress)
+    grid, factor, count = image.grid, chosen.factor_for(mask=True), len(image.labels)
     if chosen.goals():
         check_modules("simplifying", "simplify")
     bound = memory_bound(chosen.max_memory)

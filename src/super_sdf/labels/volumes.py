@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from ..arrays import CORNERS, Numbers, Vectors, dot, face_normals, length, sums_at
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
-from ..options import MASK
 from ..surface.mesh import Mesh
 from .fewer import Rows, faults, of_labels
 from .walls import Walls
@@ -34,14 +33,14 @@ GOOD, NOTED = 1e-6, 1e-3  # of a volume
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
     if offset:
-        said = f"is for the surface of the samples, offset is {offset:g}: give one only"
-    elif grid.field.kind != MASK:
+        said = f"is for the surface of the samples, --offset is {offset:g}: give one only"
+    elif not grid.field.sides_only:
         said = f"is for masks and labels, the values are {grid.field.kind}: leave it out"
     elif cap:
         return
     else:
         said = "needs a closed mesh: leave out --open"
-    raise OptionError(f"keep-volume {said}")
+    raise OptionError(f"--keep-volume {said}")
 
 
 def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -98,7 +97,8 @@ def _volumes(points: Vectors, walls: Walls, count: int) -> Numbers:
     a, b, c = (points[corner] for corner in walls.faces.T)
     each = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
     one, other = (np.bincount(side, each, count + 1) for side in walls.sides.T)
-    return (one - other)[1:]
+    volumes: Numbers = (one - other)[1:]
+    return volumes
 
 
 class _Lattice(NamedTuple):
@@ -117,8 +117,7 @@ class _Lattice(NamedTuple):
         moves = self.normals * distances[self.label, None]
         moves = sums_at(self.node, moves, int(self.node[-1]) + 1)
         moves *= np.minimum(1, most / np.maximum(length(moves), 1e-300))[:, None]
-        total: Vectors = sum(self.weights[:, [n]] * moves[self.nodes[:, n]] for n in range(8))
-        return total
+        return np.sum([self.weights[:, [n]] * moves[self.nodes[:, n]] for n in range(8)], axis=0)
 
     def effects(self, count: int) -> NDArray[np.float64]:
         """Return by how much each label's volume grows as each other one's surface moves."""
@@ -146,7 +145,7 @@ def _mean_normals(walls: Walls, count: int, cell: float) -> _Lattice:
     faces, point, first, _ = of_labels(walls, count)
     label = np.repeat(np.arange(count), np.diff(first))
     slopes = face_normals(walls.points[point], faces).repeat(3, 0) / 6
-    slopes = sums_at(faces.ravel(), slopes, len(point))
+    slopes = sums_at(faces.ravel().astype(np.int64), slopes, len(point))
     keys, at = np.unique(nodes[point] * count + label[:, None], return_inverse=True)
     at, shares = at.ravel(), weights[point]
     sums = sums_at(at, (shares[..., None] * slopes[:, None]).reshape(-1, 3), len(keys))
