@@ -17,13 +17,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from itertools import pairwise
+from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import NEIGHBOURHOOD, IntArray, Vectors, dot, face_normals, unit
-from ..surface.collapse import FEW_ROUNDS, collapse, up_to_1
 from ..surface.mesh import Mesh, row_keys
 from ..surface.sharp.folds import intersecting, overlapping_boxes
 from ..threads import check_count, chunks_of
@@ -32,6 +32,8 @@ from .walls import Walls
 Rows = NDArray[np.intp]
 SLIGHT = 0.01  # voxels from planes, by default
 WITHIN = 0.7, 1.2, 1.7  # errors from planes, in passes: the last get little wrong
+ROUNDS, RISE = 8, 5.0  # of the threshold of pyfqmr, which ends at 1
+ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 MOST_REPEATS, HALVINGS = 8, 3
 SHARP = -0.9  # cosine between the normals of a label's triangles: walls all but touch
 ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
@@ -250,7 +252,14 @@ def _pass(walls: Walls, held: Rows, distance: float) -> tuple[Walls, Rows]:
     one, other = len(points) - len(tips) + np.arange(len(tips)).reshape(2, -1)
     faces = np.concatenate([faces, np.stack([held, one, other], 1)]).astype(np.int32)
 
-    points, faces = collapse(points, faces, **up_to_1(*FEW_ROUNDS))
+    from pyfqmr import Simplify
+
+    options = {"max_iterations": ROUNDS, "alpha": ROUNDS**-RISE, "aggressiveness": RISE, "K": 1}
+    with ONE_AT_A_TIME:
+        library = Simplify()
+        library.setMesh(points, faces)
+        library.simplify_mesh(target_count=0, preserve_border=True, verbose=False, **options)
+        points, faces, _ = library.getMesh()
     faces, kept = faces[: len(faces) - len(held)], faces[len(faces) - len(held) :, 0]
     number = len(points) - len(tips) - len(ends)
     mark = faces[:, 0] >= number

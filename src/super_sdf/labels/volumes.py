@@ -97,8 +97,7 @@ def _volumes(points: Vectors, walls: Walls, count: int) -> Numbers:
     a, b, c = (points[corner] for corner in walls.faces.T)
     each = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
     one, other = (np.bincount(side, each, count + 1) for side in walls.sides.T)
-    volumes: Numbers = (one - other)[1:]
-    return volumes
+    return np.asarray((one - other)[1:], np.float64)
 
 
 class _Lattice(NamedTuple):
@@ -117,7 +116,10 @@ class _Lattice(NamedTuple):
         moves = self.normals * distances[self.label, None]
         moves = sums_at(self.node, moves, int(self.node[-1]) + 1)
         moves *= np.minimum(1, most / np.maximum(length(moves), 1e-300))[:, None]
-        return np.sum([self.weights[:, [n]] * moves[self.nodes[:, n]] for n in range(8)], axis=0)
+        total = np.zeros((len(self.nodes), 3))
+        for near, shares in zip(self.nodes.T, self.weights.T):
+            total += shares[:, None] * moves[near]
+        return total
 
     def effects(self, count: int) -> NDArray[np.float64]:
         """Return by how much each label's volume grows as each other one's surface moves."""
