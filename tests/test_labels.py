@@ -113,7 +113,9 @@ def test_without_pyfqmr_the_walls_stay_as_they_are(monkeypatch, image, command):
 
 
 def test_what_does_not_fit_in_memory_is_refused():
-    with pytest.raises(OutOfMemoryError, match=r"^8 labels in 210 samples, .* \(max_memory=\)$"):
+    with pytest.raises(
+        OutOfMemoryError, match=r"^meshing 8 labels in 210 samples, .* \(max_memory=\)$"
+    ):
         reconstruct_labels(IMAGES["no ground"], network=trilinear, spacing=1, max_memory=10**6)
 
 

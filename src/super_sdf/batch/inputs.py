@@ -15,9 +15,8 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ..errors import FileError, OptionError, seen
-from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
-from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix, format_of
-from ..files.regular import is_store, reason_of
+from ..files.formats import GRID_SUFFIXES, is_grid, is_store, mesh_path, reason_of, split_member
+from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix, has_parts
 from ..labels.files import Names, with_numbers
 from ..options import BATCH_LISTS, GOALS, Options
 from .record import OWN_NAMES, Row
@@ -39,7 +38,7 @@ class Job:
     @property
     def has_label_files(self) -> bool:
         """Whether each label has its own file, of a name that is known when it is written."""
-        return self.options.labels is not None and not format_of(self.mesh).has_scene
+        return self.options.labels is not None and not has_parts(self.mesh)
 
     @property
     def target(self) -> str:

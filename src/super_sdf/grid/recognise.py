@@ -114,8 +114,6 @@ def recognise(
     if look.is_finite and not hint and _are_labels(samples, look, facts):
         why = "whole numbers in regions of equal ones"
         return Answer("labels", why, facts, which_label(samples))
-    if hint == "density":
-        return Answer("density", "the file says so", facts, which_level(look))
     if not hint and _follow_from_signs(look, given, facts):
         why = "a distance transform, so only their sign says something"
         return Answer("mask", why, facts | _side_of_zeros(look))
@@ -131,6 +129,8 @@ def recognise(
         facts["contradictions"] = _contradictions(look, steps, facts["digit"])
         if facts["contradictions"] <= CONTRADICTIONS:
             return _distances(look, unit, given, facts)
+    if hint == "density":
+        return Answer("density", "the file says so", facts, which_level(look))
     if look.is_one_sided:
         return _of_one_side(look, facts)
     if "perhaps_unknown" in facts:

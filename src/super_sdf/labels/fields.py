@@ -13,19 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
-from ..errors import OutOfMemoryError
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
 from ..grid.sdf_grid import SdfGrid
 from ..network.decoder import Adapter
 from ..pipeline import refine_band
+from ..refine.band import survey
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
-from ..refine.survey import survey
 from ..surface.marching import strides
 from ..threads import (
     Progress,
     StepCounter,
-    held_memory,
-    in_words,
+    check_bound,
     part_of,
     useful_threads,
 )
@@ -112,12 +110,8 @@ def label_fields(
 def check_room(samples: int, voxels: int, labels: int, nodes: int, bound: int | None) -> None:
     """Raise OutOfMemoryError if labels with so many voxels at their walls need too much memory."""
     need = SAMPLE_BYTES * samples + voxels * (VOXEL_BYTES + NODE_BYTES * nodes)
-    if bound is not None and need + (held_memory() or 0) > bound:
-        raise OutOfMemoryError(
-            f"{labels} labels in {samples:,} samples, {voxels:,} of them at walls, need "
-            f"{in_words(need)} of memory, {in_words(bound)} may be held: choose fewer (--labels) "
-            "or a smaller factor, cut the image, or allow more (--max-memory)"
-        )
+    what = f"meshing {labels} labels in {samples:,} samples, {voxels:,} of them at walls,"
+    check_bound(need, what, bound, "choose fewer (--labels), a smaller factor, cut the image, or ")
 
 
 def refined(

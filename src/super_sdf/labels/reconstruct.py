@@ -25,7 +25,7 @@ from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.decoder import Decoder, adapt
 from ..network.network import load_network, network_for
 from ..surface.mesh import Mesh, vertex_type
-from ..threads import Progress, memory_bound
+from ..threads import Progress
 from .fewer import meshes_of, simplified
 from .fields import label_fields
 from .volumes import keep_volumes
@@ -207,10 +207,9 @@ def label_meshes(
     grid, factor, count = image.grid, chosen.factor_for(mask=True), len(image.labels)
     if chosen.goals():
         check_modules("simplifying", "simplify")
-    bound = memory_bound(chosen.max_memory)
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
     adapter = adapt(network_for(network, options.MASK))
-    fields = label_fields(image.numbers, count, grid, adapter, factor, bound, progress)
+    fields = label_fields(image.numbers, count, grid, adapter, factor, chosen.max_memory, progress)
     walls = extract_walls(fields)
     del fields
     faces = walls.faces[:, ::-1] if grid.is_mirrored else walls.faces

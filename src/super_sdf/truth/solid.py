@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import FileError, MeshError, OutOfMemoryError
-from ..files.regular import check_regular_file
+from ..files.formats import check_regular_file
 from ..surface.mesh import Mesh
 from ..threads import check_bound
 

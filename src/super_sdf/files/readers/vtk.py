@@ -3,48 +3,37 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from math import prod
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...errors import FileError, GridError, OptionTypeError, seen
 from ...grid.samples import even_steps
-from ..volume import XYZ, Request, Volume, of_array, triple
+from . import XYZ, Request, Volume, of_array, triple
 
 NAME = "the image"  # in memory, in error messages
 MARKS = ("vtkGhostType", "vtkValidPointMask")
 
 
-def read_vti(request: Request) -> Volume:
-    """Read an array of points or of cells of a ``.vti`` file: the named one, else the only one."""
-    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
-
-    return _read(request, vtkXMLImageDataReader())
+READERS = {
+    ".vti": ("vtkIOXML", "vtkXMLImageDataReader"),
+    ".vtk": ("vtkIOLegacy", "vtkDataSetReader"),
+    ".vtkhdf": ("vtkIOHDF", "vtkHDFReader"),
+}
 
 
 def read_vtk(request: Request) -> Volume:
-    """Read a legacy file, in text or binary."""
-    from vtkmodules.vtkIOLegacy import vtkDataSetReader
-
-    reader = vtkDataSetReader()
-    reader.ReadAllScalarsOn()
-    reader.ReadAllFieldsOn()
-    return _read(request, reader)
-
-
-def read_vtkhdf(request: Request) -> Volume:
-    """Read a ``.vtkhdf`` file."""
-    from vtkmodules.vtkIOHDF import vtkHDFReader
-
-    return _read(request, vtkHDFReader())
-
-
-def _read(request: Request, reader: Any) -> Volume:
+    """Read an array of points or of cells: the named one, else the only one."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
     from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 
+    module, name = READERS[request.path.suffix.lower()]
+    reader = getattr(import_module(f"vtkmodules.{module}"), name)()
+    if request.path.suffix.lower() == ".vtk":
+        reader.ReadAllScalarsOn()
+        reader.ReadAllFieldsOn()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     said, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
     vtkOutputWindow.SetInstance(said)
@@ -60,7 +49,12 @@ def _read(request: Request, reader: Any) -> Volume:
     if image is None or "error" in said.GetOutput().lower():
         raise FileError("VTK finds it damaged, or truncated")
     arrays = _arrays(image)
-    _check_text(request.path, sum(array.GetNumberOfValues() for array, _ in arrays.values()))
+    promised = sum(array.GetNumberOfValues() for array, _ in arrays.values())
+    text = request.path.read_bytes()
+    if re.match(rb"# vtk.*\n.*\nASCII\s", text):  # VTK makes up what is missing
+        start = re.search(rb"^(?:POINT|CELL)_DATA ", text, re.M)
+        if len(text[start.start() if start else 0 :].split()) < promised:
+            raise FileError(f"it is truncated: fewer values follow than the {promised:,} promised")
     # what has several numbers a sample, and VTK's own marks, is read only if it is named
     plain = [
         name
@@ -71,26 +65,17 @@ def _read(request: Request, reader: Any) -> Volume:
     return _volume_of(image, *arrays[name], f"its array {name!r}")
 
 
-def _check_text(path: Path, promised: int) -> None:
-    """Raise FileError if text holds fewer values than it promises: VTK makes others up."""
-    text = path.read_bytes()
-    if re.match(rb"# vtk.*\n.*\nASCII\s", text):
-        start = re.search(rb"^(?:POINT|CELL)_DATA ", text, re.M)
-        if len(text[start.start() if start else 0 :].split()) < promised:
-            raise FileError(f"it is truncated: fewer values follow than the {promised:,} promised")
-
-
 def volume_of_image(image: Any, scalars: str | None) -> Volume:
     """Return an array of image data in memory: see ``files.grids.grid_from_image``."""
     if not (hasattr(image, "IsA") and image.IsA("vtkImageData")):
         raise OptionTypeError(f"image is {seen(image)}: give VTK image data")
     arrays = _arrays(image)
+    if not arrays:
+        raise GridError(f"{NAME} holds no array of points or cells")
     listed = ", ".join(arrays)
     active = [data.GetScalars() for data in (image.GetPointData(), image.GetCellData())]
     named = [str(each.GetName()) for each in active if each]
     ours = named or [name for name, (_, of_points) in arrays.items() if of_points] or list(arrays)
-    if not arrays:
-        raise GridError(f"{NAME} holds no array of points or cells")
     if scalars is None and not named and len(ours) > 1:
         raise GridError(f"{NAME} holds several arrays, {listed}: give scalars={ours[0]!r}, say")
     name = scalars or ours[0]
