@@ -186,9 +186,7 @@ class _Label:
     """A label's mesh, to measure others against; what was measured holds while triangles stay."""
 
     def __init__(self, mesh: Mesh) -> None:
-        from ..truth.solid import Solid
-
-        self.solid_of, self.solid = Solid, Solid(mesh)
+        self.mesh, self.nearest = mesh, _nearest(mesh)
         self.near = np.zeros(len(mesh.vertices), np.uint64)  # keys of triangles within the error
         self.known = np.zeros(0, np.uint64)  # keys of triangles of which all points are
 
@@ -198,22 +196,38 @@ class _Label:
         Of the other mesh, points at most a ``step`` apart count.
         """
         vertices, keys = (
-            self.solid.mesh.vertices,
+            self.mesh.vertices,
             row_keys(made.vertices[made.faces].reshape(-1, 9)),
         )
         new = np.flatnonzero(~np.isin(self.near, keys))
-        distance, face, _ = self.solid_of(made).nearest(vertices[new])
+        distance, face, _ = _nearest(made)(vertices[new])
         self.near[new] = np.where(distance <= error, keys[face], 0)
         far = vertices[new[distance > error]]
         if len(far):
             return far
         new, wrong = np.flatnonzero(~np.isin(keys, self.known)), np.zeros(0, np.intp)
         for points, nth in points_on(made.vertices[made.faces[new]], step):
-            distance, _, feet = self.solid.nearest(points)
+            distance, _, feet = self.nearest(points)
             far = np.concatenate([far, feet[distance > error]])
             wrong = np.append(wrong, nth[distance > error])
         self.known = np.union1d(self.known, np.delete(keys[new], wrong))
         return far
+
+
+def _nearest(mesh: Mesh) -> Callable[[Vectors], tuple[Vectors, Rows, Vectors]]:
+    """Return what finds the nearest point of a mesh: its distance, its triangle, and where it is."""
+    import igl
+
+    tree, faces = igl.AABB(), mesh.faces.astype(np.int32)
+    tree.init(mesh.vertices, faces)
+
+    def nearest(points: Vectors) -> tuple[Vectors, Rows, Vectors]:
+        if not len(points):
+            return np.zeros(0), np.zeros(0, np.intp), np.zeros((0, 3))
+        squared, face, feet = tree.squared_distance(mesh.vertices, faces, points)
+        return np.sqrt(squared), np.ravel(face), feet
+
+    return nearest
 
 
 def points_on(triangles: Vectors, step: float) -> Iterator[tuple[Vectors, Rows]]:
