@@ -215,7 +215,7 @@ class _Label:
 
 
 def _nearest(mesh: Mesh) -> Callable[[Vectors], tuple[Vectors, Rows, Vectors]]:
-    """Return what finds the nearest point of a mesh: its distance, its triangle, and where it is."""
+    """Return what finds a mesh's nearest point: the distance, the triangle, and where it is."""
     import igl
 
     tree, faces = igl.AABB(), mesh.faces.astype(np.int32)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
 from ..grid.sdf_grid import SdfGrid
-from ..network.decoder import Adapter
+from ..network.contract import Adapter
 from ..pipeline import refine_band
 from ..refine.band import survey
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node

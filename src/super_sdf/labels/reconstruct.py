@@ -22,7 +22,7 @@ from ..grid.interpret import as_sample, labelled, mask_field
 from ..grid.look import named
 from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
-from ..network.decoder import Decoder, adapt
+from ..network.contract import Decoder, adapt
 from ..network.network import load_network, network_for
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import Progress
