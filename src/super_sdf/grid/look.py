@@ -251,8 +251,8 @@ def border_share(look: Look, is_marked: Callable[[NDArray[Any]], BoolArray]) -> 
 def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float:
     """Return the median slope beside the surface, between samples that are not ``cut`` off.
 
-    Along each axis it is the steeper one to both sides of a sample, if some are cut off, and the
-    mean if none are. NaN if it is not known.
+    Along each axis it is the steeper one to both sides of a sample, if most are beside some that
+    are cut off, else the mean. NaN if it is not known.
     """
     boxes = look.boxes[:, 1:4, 1:4, 1:4]
     lines = np.stack([boxes[:, :, 1, 1], boxes[:, 1, :, 1], boxes[:, 1, 1]], 1)
@@ -260,7 +260,7 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
     rise = np.diff(lines) / (steps[:, None] / look.scale)
     mean = np.sqrt((rise.mean(2) ** 2).sum(1))
     known = np.isfinite(mean) & (mean > 0)
-    if known.sum() >= ENOUGH or not len(cut):
+    if known.sum() >= max(ENOUGH, len(lines) / 2) or not len(cut):
         return float(np.median(mean[known])) if known.any() else float("nan")
     steep = np.nan_to_num(np.abs(rise)).max(2)
     length = np.sqrt((steep**2).sum(1))[(steep > 0).all(1)]

@@ -68,8 +68,10 @@ EXACT = 0.02  # spacings, and share of a slope: the error of differences of exac
 SAME_UNIT = 0.01  # from 1: exact to .002; saturating and smooth unions from .019
 MOST_DIGIT = 0.12  # spacings: the last digit of rounded distances
 MATTERS = 3.0  # spacings: values farther from 0 may be anything
-NARROW = 2.5  # spacings up to which values that are cut off have too few slopes to judge
-SLOPE_OFF = 0.25  # of the slope between these from 1: cut off at half a voxel .05, fused .4
+NARROW = 4.5  # spacings up to which values that are cut off have too few slopes to judge
+NEVER = 5e-4  # contradictions of these: cut off 0, fused depth images from .0018
+SLOPE_NEAR = 0.5, 1.25  # of these: cut off at half a voxel .55 to 1.05, in half the unit .5 and 2
+SLOPE_OFF = 0.25  # of rounded distances from 1
 CROWDED = 0.7  # of the uncut samples, those in the last tenth: cut off to .55, tanh from .85
 SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
 THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
@@ -476,10 +478,10 @@ def _is_cut_near(look: Look, given: Floats, facts: dict[str, Any]) -> bool:
     size = np.abs(look.lines[:, 0, 2]) / (min(cut) / look.scale)
     size = size[np.isfinite(size)]
     facts["crowded"] = float((size > 0.9).mean()) if size.size else 0.0
-    if _contradictions(look, given / look.scale, facts["digit"]) > CONTRADICTIONS:
+    if _contradictions(look, given / look.scale, facts["digit"]) > NEVER:
         return False
     slope = typical_slope(look, given, facts["cut"])
-    return facts["crowded"] < CROWDED and abs(slope - 1) < SLOPE_OFF
+    return facts["crowded"] < CROWDED and SLOPE_NEAR[0] < slope < SLOPE_NEAR[1]
 
 
 # Questions 6 to 8: noise, densities, smooth fields
