@@ -143,7 +143,8 @@ def survey(
         number, value = np.append(own, every.number), np.append(sample[exact], every.value)
         order = np.argsort(number, kind="stable")
         number, value = number[order], value[order]
-    trusted = TrustedSamples(np.array(np.unravel_index(number, grid.shape), np.int32), value)
+    ijk = np.array(np.unravel_index(number, grid.shape), np.int32)
+    trusted = TrustedSamples(grid.shape, ijk, value)
     return Band(grid, offset, *rows, exact, limits, trusted, whole.leaves)
 
 
