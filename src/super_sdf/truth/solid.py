@@ -177,6 +177,17 @@ class Solid:
         found = self.distance(points)
         return np.where(self.is_inside(points), -found, found)
 
+    def intersecting(self) -> NDArray[np.int64]:
+        """Return the pairs of triangles, (k, 2), that meet off a common vertex or edge.
+
+        Vertices at the same position must be one vertex.
+        """
+        import igl.predicates
+
+        faces = self.mesh.faces.astype(np.int64)
+        whole = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(1))
+        return whole[igl.predicates.find_self_intersections(self.mesh.vertices, faces[whole])[1]]
+
     def count_overlapping(self) -> int:
         """Count the faces with a winding number of 2 or more, or below 0, on one side."""
         a, b, c = self.mesh.vertices[self.mesh.faces.T]
