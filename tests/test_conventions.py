@@ -41,7 +41,7 @@ REFUSED = {
     "no value is below 0 (the smallest is 0.5): every wall is nearer to some sample than "
     "that, so there is no surface": np.abs(torus(8)) + 0.5 - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): they look like densities: give the level of their "
-    "surface, such as --level -4 --inside negative": (-1 - np.indices((3, 3, 3)).sum(0)),
+    "surface, such as level=-4, inside='negative'": (-1 - np.indices((3, 3, 3)).sum(0)),
     "values[0, 0, 0] is nan: every sample must be finite; replace unknown far samples by a large "
     "distance of the right sign": np.full((3, 3, 3), np.nan),
     "values have shape (4, 4): give three axes (x, y, z)": np.zeros((4, 4)),
@@ -61,7 +61,7 @@ def test_a_wrong_unit_is_refused_with_the_way_out():
     values = ball(24, 8.0).values
     assert refusal(GridError, make_grid, values, spacing=0.1) == (
         "the values change by 0.9972 from sample to sample, but spacing is 0.1: distances need the "
-        "unit of the spacing: multiply the values, --scale 0.1"
+        "unit of the spacing: multiply the values, scale=0.1"
     )
     assert make_grid(values, spacing=0.1, scale=0.1, origin=0).notes == ()
 
@@ -89,7 +89,7 @@ def test_a_spacing_that_the_values_contradict_on_one_axis_is_refused():
     values = box_with_unequal_spacing()
     assert refusal(GridError, make_grid, values, spacing=1) == (
         "the values change by 1 along x, 1 along y, 2 along z from sample to sample, but spacing "
-        "is 1: give the spacing of each axis (they show --spacing 1,1,1.995)"
+        "is 1: give the spacing of each axis (they show spacing=(1,1,1.995))"
     )
     for each in (2, 1.995):
         assert make_grid(values, spacing=(1, 1, each), origin=0).notes == ()

@@ -42,19 +42,19 @@ def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():
         convert("flat.npy", "out.ply", trilinear, Options())
     assert sorted(os.listdir()) == ["flat.npy", "in.npy"]
     convert("in.npy", "out.ply", trilinear, Options(2))
-    with pytest.raises(FileError, match=r"^out.ply exists: remove it or use --force$"):
+    with pytest.raises(FileError, match=r"^out.ply exists: remove it or use force=True$"):
         convert("in.npy", "out.ply", trilinear, Options(2))
     convert("in.npy", "out.ply", trilinear, Options(4), force=True)
 
 
-def test_mesh_and_field_appear_together_or_not_at_all():
-    def refuse(part):
-        assert part.exists()
+def test_mesh_and_field_appear_together_or_not_at_all(monkeypatch):
+    def refuse(path, *, force):
         raise GridError("no")
 
     told = {"save_field": "out.npz"}
-    with pytest.raises(GridError):
-        convert("in.npy", "out.ply", trilinear, Options(2), before_rename=refuse, **told)
+    with monkeypatch.context() as patch, pytest.raises(GridError):
+        patch.setattr("super_sdf.convert.check_free", refuse)  # when both are complete
+        convert("in.npy", "out.ply", trilinear, Options(2), **told)
     assert os.listdir() == ["in.npy"]
     done = convert("in.npy", "out.ply", trilinear, Options(2), **told)
     assert sorted(os.listdir()) == ["in.npy", "out.npz", "out.ply"]

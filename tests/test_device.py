@@ -128,10 +128,10 @@ def test_a_provider_that_falls_back_or_fails_is_an_error(cuda_session, monkeypat
     failed = "the network failed on cuda: CUDA failure 2: out of memory"
     with pytest.raises(DeviceError, match=f"^{failed}$"):
         loaded(*TRIAL.values())
-    with pytest.raises(DeviceError, match=f"^{ASKED}{failed}; or use --device cpu$"):
+    with pytest.raises(DeviceError, match=f"^{ASKED}{failed}; or use device='cpu'$"):
         load_network(device="cuda")
     monkeypatch.setattr(cuda_session, "get_providers", lambda: [CPU])
-    with pytest.raises(DeviceError, match="could not start its CUDA provider; or use --device"):
+    with pytest.raises(DeviceError, match="could not start its CUDA provider; or use device"):
         load_network(device="cuda")
 
 

@@ -139,7 +139,7 @@ def test_labels_without_a_choice_are_refused(dtype, spacing):
     for field in ("auto", "exact", "scaled"):
         place = {"spacing": spacing, "origin": 0, "field": field}
         assert refusal(GridError, make_grid, labels, **place) == (
-            "no solid is chosen: they look like labels (0, 1, 2, 3): choose one with --label 1"
+            "no solid is chosen: they look like labels (0, 1, 2, 3): choose one with label=1"
         )
 
 
@@ -210,10 +210,10 @@ BAD = {
     "label is 1.5: give a whole number, -2^63 to 2^64 - 1": {"label": 1.5},
     "label is True: give a whole number, -2^63 to 2^64 - 1": {"label": True},
     f"label is {2**64}: give a whole number, -2^63 to 2^64 - 1": {"label": 2**64},
-    f"label {2**53 + 1} and level 2.5: give only one of them": {"label": 2**53 + 1, "level": 2.5},
+    f"label={2**53 + 1} and level=2.5: give only one of them": {"label": 2**53 + 1, "level": 2.5},
     "level is nan: give a finite number": {"level": float("nan")},
     "scale is -1: give a number greater than 0": {"scale": -1},
-    "label 1 and field exact: the samples of a label are a mask": {"label": 1, "field": "exact"},
+    "label=1 and field='exact': the samples of a label are a mask": {"label": 1, "field": "exact"},
 }
 
 
@@ -259,11 +259,11 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
     grid = make_grid(depth, **PLACE, field="mask", inside="negative")
     np.testing.assert_array_equal(grid.values < 0, depth < 0)
     for values, side, level in (
-        (depth - 1, "below", "-2.39 --inside negative"),
-        (1 - depth, "above", "2.39 --inside positive"),
+        (depth - 1, "below", "-2.39, inside='negative'"),
+        (1 - depth, "above", "2.39, inside='positive'"),
     ):
         assert refusal(GridError, make_grid, values, **PLACE, field="mask") == (
             f"every value is {side} 0 (they go from {values.min():.6g} to {values.max():.6g}), so "
             "their signs make no mask: they look like densities: give the level of their surface, "
-            f"such as --level {level}"
+            f"such as level={level}"
         )

@@ -276,7 +276,7 @@ def test_targets_are_refused_before_anything_is_written(command):
     no_field = "field.obj is not a field file: give one of .npz, .vdb, .npy, .vti"
     for given, name, kind, said in (
         (field, "field.obj", OptionError, no_field),
-        (field, "old.npz", WriteError, "old.npz exists: remove it or use --force"),
+        (field, "old.npz", WriteError, "old.npz exists: remove it or use force=True"),
         (3, "field.npz", OptionTypeError, "field is 3: give one from upsample"),
     ):
         assert refusal(kind, write_field, given, name).startswith(said)

@@ -101,7 +101,7 @@ def test_other_mistakes_are_one_line():
     ):
         assert refusal(kind, call).startswith(said)
     image.spacing = (0.2, 0.2, 0.2)
-    assert refusal(GridError, contour).endswith("multiply the values, --scale 0.40123")
+    assert refusal(GridError, contour).endswith("multiply the values, scale=0.40123")
 
 
 def test_pyvista_finds_the_accessor_and_super_sdf_does_not_load_pyvista(tmp_path):

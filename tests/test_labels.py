@@ -86,7 +86,7 @@ def test_meshes_are_closed_and_share_their_walls(name, factor):
 
 
 def test_what_does_not_fit_in_memory_is_refused():
-    with pytest.raises(OutOfMemoryError, match=r"^8 labels in 210 samples, .* \(--max-memory\)$"):
+    with pytest.raises(OutOfMemoryError, match=r"^8 labels in 210 samples, .* \(max_memory=\)$"):
         reconstruct_labels(IMAGES["no ground"], network=trilinear, spacing=1, max_memory=10**6)
 
 
@@ -169,8 +169,8 @@ def test_the_command_writes_a_file_for_each_label(image, command):
 
 
 @pytest.mark.parametrize(("words", "name"), [
-    ("--simplify 0.1", "simplify 0.1"), ("--mesher sharp", "mesher 'sharp'"),
-    ("--open", "open"), ("--save-field f.npz", "save-field"),
+    ("--simplify 0.1", "--simplify 0.1"), ("--mesher sharp", "--mesher 'sharp'"),
+    ("--open", "--open"), ("--save-field f.npz", "--save-field"),
 ])  # fmt: skip
 def test_options_that_would_tear_the_walls_are_refused(words, name, image, command):
     code, _, err = command("upsample", image, "a.ply", "--labels", "all", *words.split(), *PLAIN)
@@ -274,7 +274,7 @@ def test_labels_are_chosen_by_name(command, boxes):
         assert [row["output"] for row in rows] == [f"t-{end}.stl" for end in ends]
     known = "names of the table (Background, liver&co, left_kidney)"
     for words, said in (
-        (("--labels", "lung"), f"labels has 'lung': give numbers, or {known}"),
+        (("--labels", "lung"), f"--labels has 'lung': give numbers, or {known}"),
         ((), "--names names.ctbl is for --labels: give that, too"),
     ):
         run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words
@@ -330,10 +330,10 @@ def test_what_has_no_volume_to_keep_is_refused(tmp_path, command):
     np.save(tmp_path / "mask.npy", MASK)
     for name, option, message in (
         ("exact", (), " is for masks and labels, the values are exact: leave it out"),
-        ("mask", ("--offset", "0.1"), " is for the surface of the samples, offset is 0.1: "),
+        ("mask", ("--offset", "0.1"), " is for the surface of the samples, --offset is 0.1: "),
         ("mask", ("--open",), " needs a closed mesh: leave out --open"),
     ):  # fmt: skip
         run = "upsample", tmp_path / f"{name}.npy", tmp_path / "out.ply", "--keep-volume"
         code, _, err = command(*run, "--spacing", 1, *option)
-        assert code == 2 and f"Error: keep-volume{message}" in err
+        assert code == 2 and f"Error: --keep-volume{message}" in err
         assert not (tmp_path / "out.ply").exists()

@@ -40,9 +40,9 @@ def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
     for values in (VALUES, np.abs(np.indices((20, 20, 20)) - 9.3).max(0) - 5.1):
         with pytest.raises(GridError) as caught:
             make(values * unit, spacing)
-        want = "distances need the unit of the spacing: multiply the values, --scale "
-        advice, scale = str(caught.value).rsplit(maxsplit=1)
-        assert advice.endswith(want.strip())
+        want = "distances need the unit of the spacing: multiply the values, scale="
+        advice, scale = str(caught.value).rsplit("=", 1)
+        assert advice.endswith(want.strip("="))
         assert make(values * unit * float(scale), spacing).notes[:-1] == ()
 
 

@@ -37,7 +37,7 @@ def test_a_failed_write_leaves_what_was_there(mesh, monkeypatch):
     said = refusal(FileError, write_mesh, mesh, "out.ply", force=True)
     assert said == "out.ply cannot be written: No space left on device"
     said = refusal(FileError, write_mesh, mesh, "out.ply")
-    assert said == "out.ply exists: remove it or use --force"
+    assert said == "out.ply exists: remove it or use force=True"
     said = refusal(OptionError, write_mesh, mesh, "out.xyz")
     assert f"give one of {', '.join(MESH_SUFFIXES)}" in said
     assert Path("out.ply").read_text() == "before" and os.listdir() == ["out.ply"]
@@ -51,7 +51,7 @@ def test_of_several_files_all_appear_or_none(mesh):
         Path("b.ply").write_text("theirs")
 
     said = refusal(FileError, write_meshes, files, before_rename=take_a_name)
-    assert said == "b.ply exists: remove it or use --force"
+    assert said == "b.ply exists: remove it or use force=True"
     assert os.listdir() == ["b.ply"] and Path("b.ply").read_text() == "theirs"
     write_meshes(files, force=True)
     assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()

@@ -74,7 +74,7 @@ REFUSED = [
     (OptionError, r"none\.onnx has no int8 variant, .*none-int8\.onnx: write",
      {"model": "none.onnx", "precision": "int8"}),
     (OptionError, "precision is 'int4': give one of auto, float32, int8", {"precision": "int4"}),
-    (DeviceError, "int8 is for the CPU: use --precision float32",
+    (DeviceError, "int8 is for the CPU: use precision='float32'",
      {"precision": "int8", "device": "cuda"}),
     (FileError, "no model 'other': give an ONNX file or one of: fast, base, best",
      {"model": "other"}),
@@ -142,7 +142,7 @@ def test_values_that_are_not_finite_are_refused_with_their_count(tmp_path, last,
     count, _, whole = bad.replace(",", "").split(" ", 2)
     assert int(count) == int(whole.split()[-1]) > 0
     assert rest == (
-        "NaN, infinite or beyond 1e15: it cannot be used for this grid; use another --model"
+        "NaN, infinite or beyond 1e15: it cannot be used for this grid; use another model="
     )
 
 

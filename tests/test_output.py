@@ -35,7 +35,7 @@ def test_a_file_that_appears_meanwhile_is_kept_unless_forced(monkeypatch, has_li
         refused = OSError(errno.EPERM, "Operation not permitted")
         monkeypatch.setattr(output.os, "link", Mock(side_effect=refused))
     make("one.ply")
-    want = r"^out.ply was created by another program meanwhile: remove it or use --force$"
+    want = r"^out.ply was created by another program meanwhile: remove it or use force=True$"
     with pytest.raises(WriteError, match=want):
         make("out.ply", meanwhile=lambda: Path("out.ply").write_text("theirs"))
     assert Path("out.ply").read_text() == "theirs"
@@ -52,7 +52,7 @@ def test_by_force_a_link_stays_one_and_what_it_leads_to_is_written(there):
     if there:
         Path("disk/there.ply").write_text(there)
     os.symlink("disk/there.ply", "out.ply")
-    assert refusal("out.ply") == "out.ply exists: remove it or use --force"
+    assert refusal("out.ply") == "out.ply exists: remove it or use force=True"
     make("out.ply", force=True)
     assert os.readlink("out.ply") == "disk/there.ply"
     assert Path("disk/there.ply").read_text() == "mine" and os.listdir("disk") == ["there.ply"]

@@ -104,7 +104,7 @@ def test_an_offset_needs_distances_in_the_world(name):
     grid = make_grid(values, spacing=SPACING, **options)
     assert refusal(GridError, reconstruct, grid, trilinear, offset=0.5) == (
         f"offset 0.5: the values are taken as {name}, and with the spacing 1, 1, 2.5 they are no "
-        "distances by which an offset surface could be found; mesh the solid itself (--offset 0), "
+        "distances by which an offset surface could be found; mesh the solid itself (offset=0), "
         "sample the mesh (super-sdf sample), and mesh that grid with the offset"
     )
 

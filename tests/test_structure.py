@@ -29,13 +29,13 @@ ROOMS = [
     "refine",
     "network",
     "grid",
-    "progress options threads",
+    "options threads",
     "errors arrays",
     "__init__ __main__ models",
 ]
-TOP = "pipeline convert options errors progress threads arrays __init__ __main__"
+TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together: they may shrink only; the design's figure beside
-    TOP: 1600,  # 1,250
+    TOP: 1590,  # 1,250
     "grid": 3650,  # 1,800, once what a grid is is decided on one page
     "network": 550,  # 500: CUDA's missing library is named
     "refine": 1780,  # 1,300
@@ -47,9 +47,9 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     "simplify check truth": 1240,  # 1,100
     "batch": 940,  # 900
     "pages": 420,  # 400
-    "cli": 1060,  # 800
+    "cli": 1058,  # 800
 }
-MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 102, 53, 112  # 95, 45, 110 in the design
+MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 101, 52, 110  # 95, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 19_000, 38_300  # 17,800 and 36,000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {

@@ -69,7 +69,7 @@ NO_SURFACE = {
     "steps": np.maximum(R - 9, 0) + 0.5,
     "slow": 0.1 * R + 0.05,
 }
-DENSITY = "they look like densities: give the level of their surface, such as --level "
+DENSITY = "they look like densities: give the level of their surface, such as level="
 FIELDS = {f"unsigned {name}": values for name, values in UNSIGNED.items()} | NO_SURFACE
 
 
@@ -77,13 +77,13 @@ FIELDS = {f"unsigned {name}": values for name, values in UNSIGNED.items()} | NO_
 @pytest.mark.parametrize("spacing", [None, 1.0])
 def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
     if "unsigned" in name or "shrank" in name:
-        want = "mesh the shell round the surface with --inside negative --offset 1"
+        want = "mesh the shell round the surface with inside='negative', offset=1"
     elif name in ("a ball that grew away", "never near"):
         want = FAR
     elif name in ("off the border", "a ball beyond the border"):
         want = BEYOND
     elif name == "slow":
-        want = "multiply the values, --scale 10" if spacing else FAR
+        want = "multiply the values, scale=10" if spacing else FAR
     else:
         want = DENSITY
     said = refusal(GridError, make_grid, FIELDS[name], spacing=spacing)
@@ -109,5 +109,5 @@ def test_thin_solids_alone_are_meshed_with_a_warning(folder, command):
 def test_the_level_that_is_named_for_densities_is_one_of_the_values(width, options):
     steps = np.indices((28, 28, 28)) - np.reshape([15.0, 14.6, 14.3], (3, 1, 1, 1))
     values = 1 / (1 + np.exp((np.linalg.norm(steps, axis=0) - 8) / width))
-    with pytest.raises(GridError, match=rf"{DENSITY}0\.5 --inside positive"):
+    with pytest.raises(GridError, match=rf"{DENSITY}0\.5, inside='positive'"):
         make_grid(values, spacing=1.0, **options)

@@ -58,7 +58,8 @@ def test_an_unknown_region_between_inside_and_outside_cannot_be_closed():
     assert refusal(GridError, reconstruct, grid, trilinear) == (
         "96 samples are unknown, values[14, 0, 20] the first, in regions that touch samples on "
         "both sides of the surface, so whether they are inside is unknown; end the surface there "
-        "(--open), or replace each by a distance of the right sign (the cut-off value of its side)"
+        "(cap=False), or replace each by a distance of the right sign (the cut-off value of its "
+        "side)"
     )
 
 
@@ -117,7 +118,7 @@ def test_what_needs_the_whole_surface_is_refused(folder, command):
 def test_unequal_spacings_of_distances_that_end_need_the_spline():
     values = half_seen()[:, :, ::2]
     grid = make_grid(values, spacing=(1, 1, 2), origin=0)
-    with pytest.raises(GridError, match=r"mesh the spline of the values \(--field scaled\)$"):
+    with pytest.raises(GridError, match=r"mesh the spline of the values \(field='scaled'\)$"):
         reconstruct(grid, trilinear, cap=False)
     scaled = make_grid(values, spacing=(1, 1, 2), origin=0, field="scaled")
     mesh = reconstruct(scaled, trilinear, cap=False)

@@ -179,9 +179,9 @@ def test_a_file_that_ends_early_or_is_another_one(tmp_path):
 def test_info_lists_the_grids_of_a_file(command):
     """Shape and place are those of the first that can be read, or of the one that is named."""
     listed = [
-        "grid: density, float, fog volume, 64",
-        "grid: surface, float, level set, 619",
-        "grid: velocity, vec3s, unknown, 8",
+        "grid: density, float, fog volume, 64 active voxels",
+        "grid: surface, float, level set, 619 active voxels",
+        "grid: velocity, vec3s, unknown, 8 active voxels",
     ]
     path = DATA / "three-grids.vdb"
     for name, member, shape in (("density", "", "8, 8, 8"), ("surface", ":surface", "15, 15, 15")):

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +17,7 @@ from .files.output import check_apart, check_free
 from .files.regular import files_of
 from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
 from .pipeline import mesh_grid
-from .progress import Progress, Stopwatch, part_of, share_of
+from .threads import TOTAL, Progress, Stopwatch, part_of
 
 if TYPE_CHECKING:
     from .network.decoder import Decoder
@@ -30,7 +29,7 @@ CAPPED = (
     "the solid runs out of the grid: its surface is closed along the border (leave it open with "
     "--open)"
 )
-SHARE_BEFORE = 0.2  # of the time, until the mesh is simplified
+READ, MESHED = 0.1, 0.3  # of the time, when the grid is read, and before a mesh is simplified
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +54,7 @@ class Conversion:
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
         points = self.mesh.vertices
+        some = {"saved_field": self.saved_field, "simplified": self.simplified}
         return {
             **describe_place(self.grid),
             **self.counts,
@@ -62,8 +62,7 @@ class Conversion:
             "closed": self.closed,
             "capped": self.capped,
             "field": self.grid.field.report(),
-            **({"saved_field": self.saved_field} if self.saved_field else {}),
-            **({"simplified": self.simplified} if self.simplified else {}),
+            **{key: value for key, value in some.items() if value},
             "inferred": list(self.notes),
             "warnings": list(self.warnings),
         }
@@ -78,16 +77,14 @@ def convert(
     force: bool = False,
     progress: Progress | None = None,
     save_field: str | Path | None = None,
-    before_rename: Callable[[Path], None] | None = None,
     **how: Any,
 ) -> Conversion:
     """Convert a grid file to a mesh file, in formats of ``read_grid`` and ``write_mesh``.
 
     ``force`` replaces the target, and the field's file, if they exist. ``progress`` is called with
-    (done, total), see ``progress.Progress``; an exception in it ends the work. ``save_field`` is a
+    (done, total), see ``threads.Progress``; an exception in it ends the work. ``save_field`` is a
     file for the refined field, in a format of ``write_field``: it and the mesh file are both
-    complete at the end, or neither is written. ``before_rename`` is called with the path of the
-    finished temporary file, before it gets the name ``target``. ``how`` is passed to ``mesh_grid``.
+    complete at the end, or neither is written. ``how`` is passed to ``mesh_grid``.
 
     SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
     Nothing is written then.
@@ -110,22 +107,22 @@ def convert(
         lattice = cubic_grid(grid, options.offset)
         if file:
             file.check_fits(grid.shape, options.factor)
+            how["save_field"] = file.write
         watch.lap("read")
-        shown = part_of(progress, 0, SHARE_BEFORE) if options.goals() else progress
-        write_field = file.write if file else None
-        made = mesh_grid(grid, network, options, progress=shown, save_field=write_field, **how)
+        if progress:
+            progress(round(READ * TOTAL), TOTAL)
+        shown = part_of(progress, READ, MESHED if options.goals() else 1)
+        made = mesh_grid(grid, network, options, progress=shown, **how)
         watch.take(made.seconds)
-        mesh, simplified, off = reworked(made.mesh, grid, options, progress)
+        mesh, simplified, off = reworked(made.mesh, grid, options, part_of(progress, MESHED, 1))
         watch.lap("simplify" if simplified else "isosurface")
 
-        def complete(part: Path) -> None:
+        def both_appear(part: Path) -> None:
             if file:
-                check_free(file.path, force=force)  # both files appear, or none
-            if before_rename:
-                before_rename(part)
+                check_free(file.path, force=force)
 
         stated: Any = {"unit": options.unit, "space": grid.space}
-        write_mesh(mesh, target, force=force, before_rename=complete, **stated)
+        write_mesh(mesh, target, force=force, before_rename=both_appear, **stated)
         watch.lap("write")
     is_open = made.open_edges > 0
     warnings = find_warnings(grid, options.offset, made.counts, is_open=is_open)
@@ -152,11 +149,10 @@ def reworked(
     mesh: Mesh, grid: SdfGrid, options: Options, progress: Progress | None
 ) -> tuple[Mesh, Simplified | None, list[str]]:
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
-    simplified, off = None, list[str]()
-    if options.keep_volume:
+    simplified, volume = None, volume_of_samples(grid) if options.keep_volume else None
+    if volume is not None:
         from .labels.volumes import keep_volumes, volume_notes
 
-        volume = volume_of_samples(grid)
         (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))
     if options.goals():
         from .simplify.simplify import simplify_mesh
@@ -166,12 +162,12 @@ def reworked(
             error=options.error(grid.voxel_size),
             triangles=options.triangles,
             max_memory=options.max_memory,
-            progress=share_of(part_of(progress, SHARE_BEFORE, 1)),
+            progress=progress and (lambda share: progress(round(TOTAL * share), TOTAL)),
         )
         mesh = simplified.mesh
-    if options.keep_volume:  # simplifying may have changed it
-        off = volume_notes({"the mesh": (mesh.volume(), volume)})
-    return mesh, simplified, off
+    if volume is None:
+        return mesh, simplified, []
+    return mesh, simplified, volume_notes({"the mesh": (mesh.volume(), volume)})  # may be off now
 
 
 def find_warnings(

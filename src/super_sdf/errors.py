@@ -7,11 +7,55 @@ optional library is missing.
 
 from __future__ import annotations
 
+import re
 from importlib.util import find_spec
+
+FLAG = re.compile(r"(?<!install )--([a-z-]+)(?: ('[^']*'|[\w.,+-]*\w))?( (?=--))?")
+VERBS = ("is", "are", "has", "does", "needs")
+WORDS = ("and", "or", "if", "out", "to", "with", "for")
+SWITCHES = {"open": "cap=False", "cap": "cap=True", "force": "force=True"}
 
 
 class SuperSdfError(Exception):
-    """Base class of all errors of this package."""
+    """Base class of all errors of this package.
+
+    A message names options as flags, ``--max-memory 4G``: ``flagged``, for the command line. In
+    Python, ``str`` of an error names keywords: ``max_memory=4G``.
+    """
+
+    @property
+    def flagged(self) -> str:
+        """The message for users of the command line."""
+        return str(self.args[0]) if self.args else ""
+
+    def __str__(self) -> str:
+        return FLAG.sub(_keyword, self.flagged)
+
+
+def flag(name: str) -> str:
+    """Return an option as messages name it."""
+    return f"--{name.replace('_', '-')}"
+
+
+def in_a_line(error: BaseException) -> str:
+    """Return what went wrong, for users of the command line."""
+    if isinstance(error, SuperSdfError):
+        return " ".join(error.flagged.splitlines())
+    if isinstance(error, MemoryError):
+        return "out of memory: use a smaller --factor or grid"
+    return f"{type(error).__name__}: {error}"
+
+
+def _keyword(found: re.Match[str]) -> str:
+    """Return the keyword of Python for a flag and the word behind it, which may be its value."""
+    name, value, more = found[1].replace("-", "_"), found[2], ", " if found[3] else ""
+    if value in VERBS:
+        return f"{name} {value}"
+    if value is None or value in WORDS:
+        return SWITCHES.get(name, f"{name}=") + (f" {value}" if value else "") + more
+    if value.isalnum() and value[0].islower():
+        value = repr(value)
+    return f"{name}=({value})" if "," in value else f"{name}={value}{more}"
 
 
 class GridError(SuperSdfError, ValueError):

@@ -15,9 +15,9 @@ from math import inf, isfinite
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple, TypedDict, cast, get_args
+from typing import Any, Final, Literal, NamedTuple, TypedDict, get_args
 
-from .errors import OptionError, OptionTypeError, seen
+from .errors import OptionError, OptionTypeError, flag, seen
 
 FieldKind = Literal["auto", "exact", "truncated", "mask", "scaled", "noisy"]
 Inside = Literal["auto", "negative", "positive"]
@@ -45,7 +45,6 @@ INT8: Final = "int8"
 DEFAULT_QUALITY: Final = "base"
 FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
 MESHERS: tuple[MesherName, ...] = get_args(MesherName)
-DEVICES: tuple[Device, ...] = get_args(Device)
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
@@ -138,7 +137,7 @@ def _flag(value: Any, name: str) -> bool:
     return bool(value)
 
 
-def check_label(label: Any, name: str = "label") -> int:
+def check_label(label: Any, name: str = "--label") -> int:
     """Return a label; OptionError if no integer of 64 bits, signed or not, can be it."""
     is_whole = isinstance(label, Real) and not isinstance(label, bool) and isfinite(label)
     if not (is_whole and int(label) == label and -(2**63) <= int(label) < 2**64):
@@ -146,7 +145,7 @@ def check_label(label: Any, name: str = "label") -> int:
     return int(label)
 
 
-def check_labels(labels: Any, name: str = "labels") -> str | tuple[int | str, ...]:
+def check_labels(labels: Any, name: str = "--labels") -> str | tuple[int | str, ...]:
     """Return "all" or some labels, numbers or names; OptionError if it is neither."""
     if isinstance(labels, str) and labels == ALL:
         return ALL
@@ -200,9 +199,17 @@ class Option(NamedTuple):
 
     def check(self, value: Any, name: str = "") -> Any:
         """Return a value as the program takes it; OptionError, by another name, if it is wrong."""
-        if value is None and self.default is None:
-            return None
-        return self.kind.check(value, name or self.name)
+        is_left_out = value is None and self.default is None
+        return None if is_left_out else self.kind.check(value, name or flag(self.name))
+
+    def parse(self, text: str) -> Any:
+        """Return the value that a text on the command line stands for."""
+        try:
+            return self.check(self.kind.parse(text))
+        except ValueError as error:
+            if isinstance(error, OptionError):
+                raise
+            raise OptionError(f"{flag(self.name)} is {text!r}: {error}") from error
 
 
 def _option(default: Any, group: str, shows: str, kind: Kind, text: str, **more: Any) -> Any:
@@ -300,7 +307,7 @@ class Options:
     precision: Precision = _option(AUTO, WORK, "labels", one_of(PRECISIONS),
         "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "
         "it, else float32.")
-    device: Device = _option(AUTO, WORK, "labels", one_of(DEVICES),
+    device: Device = _option(AUTO, WORK, "labels", one_of(get_args(Device)),
         "Where the network runs; auto uses CUDA if it works here, else the CPU.")
     threads: int = _option(0, WORK, "labels", THREADS,
         "CPU threads; 0 means one per core.", metavar="N")
@@ -313,10 +320,9 @@ class Options:
         """Check the values; OptionError names the first that is wrong, or contradicts another."""
         for name, row in OPTIONS.items():
             object.__setattr__(self, name, row.check(getattr(self, name)))
-        for names in EXCLUSIVE:
-            check_one({name: getattr(self, name) for name in names})
+        check_alone(vars(self))
         if self.label is not None and self.field not in (AUTO, MASK):
-            said = f"label {self.label} and field {self.field}"
+            said = f"--label {self.label} and --field {self.field}"
             raise OptionError(f"{said}: the samples of a label are a mask")
 
     def reading(self) -> dict[str, Any]:
@@ -327,10 +333,6 @@ class Options:
         """Return the mesher; by itself ``sharp`` if samples are exact: else it finds no edges."""
         automatic: MesherName = SHARP if exact else MARCHING
         return automatic if self.mesher == AUTO else self.mesher
-
-    def values(self) -> Values:
-        """Return what the values are: keywords of ``make_grid``."""
-        return cast(Values, {name: getattr(self, name) for name in Values.__annotations__})
 
     def goals(self) -> dict[str, Any]:
         """Return what says how far the mesh is to be simplified, by its name: at most one."""
@@ -362,11 +364,12 @@ READ, BATCH_LISTS, LABELS = (
 )
 
 
-def check_one(given: Mapping[str, Any]) -> None:
-    """Raise OptionError if more than one is given; the others are None."""
-    some = [f"{name} {seen(value)}" for name, value in given.items() if value is not None]
-    if len(some) > 1:
-        raise OptionError(f"{some[0]} and {some[1]}: give only one of them")
+def check_alone(given: Mapping[str, Any]) -> None:
+    """Raise OptionError if two options are given that exclude each other; others are None."""
+    for names in EXCLUSIVE:
+        some = [f"{flag(n)} {seen(given[n])}" for n in names if given.get(n) is not None]
+        if len(some) > 1:
+            raise OptionError(f"{some[0]} and {some[1]}: give only one of them")
 
 
 def check_path(path: Any, name: str) -> Path:
@@ -376,14 +379,10 @@ def check_path(path: Any, name: str) -> Path:
     return Path(path)
 
 
-def check_network(network: Any) -> None:
-    """Raise OptionTypeError if it cannot be called."""
+def check_called(network: Any, progress: Any) -> None:
+    """Raise OptionTypeError if a network, or a progress that is not None, cannot be called."""
     if not callable(network):
         raise OptionTypeError(f"network is {seen(network)}: give one from load_network()")
-
-
-def check_progress(progress: Any) -> None:
-    """Raise OptionTypeError if it is neither None nor callable."""
     if progress is not None and not callable(progress):
         give = "give a function of (done, total), in thousandths"
         raise OptionTypeError(f"progress is {seen(progress)}: {give}")
@@ -393,5 +392,7 @@ def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:
     """Return to what a mesh is simplified, an error or a number; OptionError unless it is one."""
     if error is None and triangles is None:
         raise OptionError("give error or triangles")
-    check_one({"error": error, "triangles": triangles})
+    if error is not None and triangles is not None:
+        given = f"error {seen(error)} and triangles {seen(triangles)}"
+        raise OptionError(f"{given}: give only one of them")
     return OPTIONS["simplify"].check(error, "error"), OPTIONS["triangles"].check(triangles)

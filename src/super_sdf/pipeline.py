@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +25,6 @@ from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.decoder import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
 from .options import MesherName, Options
-from .progress import STEPS, Progress, StepCounter
 from .refine import nodes
 from .refine.band import neighbour_table
 from .refine.bounds import keep_within_bounds
@@ -36,7 +35,7 @@ from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, sum
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
-from .threads import in_words, useful_threads
+from .threads import STEPS, Progress, StepCounter, in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
 
 if TYPE_CHECKING:
@@ -122,7 +121,7 @@ def upsample(
         (Sec. 5.3). Positive is outwards, whichever sign the input had inside, since ``grid.values``
         are always negative inside. The distances must reach 1.5 spacings beyond the offset.
     progress : callable, optional
-        Called with (done, total), see ``progress.Progress``; an exception in it ends the work.
+        Called with (done, total), see ``threads.Progress``; an exception in it ends the work.
 
     Returns
     -------
@@ -141,8 +140,7 @@ def upsample(
         which shows only at the end: a thin part may lie between samples that are all outside.
     """
     check_grid(grid)
-    options.check_network(network)
-    options.check_progress(progress)
+    options.check_called(network, progress)
     asked = Options(factor, offset=offset)  # checks them
     factor, offset = asked.factor, asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
@@ -295,7 +293,6 @@ class Result:
     open_edges: int
     counts: dict[str, int]  # see ``FineField``; in tiles, a pinned node may count twice
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
-    is_cut: bool  # whether the surface leaves the grid, or may end at unknown samples
     seconds: dict[str, float]  # by step
     tiles: int
 
@@ -307,10 +304,10 @@ class Task:
     tile: Tile
     grid: SdfGrid  # the samples of the tile
     shape: tuple[int, int, int]  # samples of the whole grid
-    whole: BandSummary | None  # None of a tile that is the whole grid
     options: Options
     mesher: MesherName
     threads: int
+    whole: BandSummary | None = None  # of a tile that is not the whole grid
 
 
 MapTiles = Callable[[Callable[[Task], Part], Iterator[Task]], Iterable[Part]]
@@ -333,44 +330,43 @@ def mesh_grid(
     made elsewhere, ``least_tiles`` or more, each within the memory bound.
     """
     check_grid(grid)
-    options.check_network(network)
-    options.check_progress(progress)
+    options.check_called(network, progress)
     check_can_close(grid, cap=chosen.cap)
     steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
-    mesher = chosen.mesher_for(exact=lattice.field.has_exact)
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
-    threads, shape = useful_threads(decoder.threads), lattice.shape
-    room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
-    tiles, whole = [Tile((0, 0, 0), shape, (0, 0, 0), shape)], None
+    mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
+    everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
+    task = Task(everything, lattice, shape, chosen, mesher, threads)
+    room, whole = Room.of(chosen.max_memory, factor, decoder.memory_bytes), None
+    most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
     try:
-        is_one = map_tiles is None and least_tiles == 1
-        band = survey(lattice, offset, threads=threads, most=room.voxels() if is_one else -1)
+        bands = [survey(lattice, offset, threads=threads, most=most)]
     except BandTooLargeError:
-        band, whole = None, summarise(lattice, offset, threads)
-        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
-        tiles = plan(shape, whole, margin, room, least_tiles)
-    steps.finish("band")
-    if whole and save_field:
+        whole = summarise(lattice, offset, threads)
+    if not whole:
+        steps.finish("band")
+        parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
+    elif save_field:
         raise OutOfMemoryError(
             f"the refined field does not fit in the {in_words(room.bound)} that may be used: use a "
             "smaller factor, allow more (--max-memory), or leave --save-field out"
         )
-
-    def task_of(tile: Tile) -> Task:
-        part = crop(lattice, tile.low, tile.high) if whole else lattice
-        return Task(tile, part, shape, whole, chosen, mesher, threads)
-
-    if band:
-        bands, band = [band], None  # so that it is freed when it has been used
-        parts = [make_tile(task_of(tiles[0]), decoder, bands.pop(), steps, save_field)]
     else:
+        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
+        tiles = plan(shape, whole, margin, room, least_tiles)
+        steps.finish("band")
+        tasks = (
+            replace(task, tile=tile, grid=crop(lattice, tile.low, tile.high), whole=whole)
+            for tile in tiles
+        )
         parts = []
-        for part in (map_tiles or map)(partial(make_tile, network=decoder), map(task_of, tiles)):
+        for part in (map_tiles or map)(partial(make_tile, network=decoder), tasks):
             parts.append(part)
-            steps.show(len(parts) / len(tiles))
+            steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
-    leaves, is_cut = (any(getattr(part, name) for part in parts) for name in ("leaves", "is_cut"))
+    count = len(parts)
+    leaves, is_cut = any(part.leaves for part in parts), any(part.is_cut for part in parts)
     counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
     if whole:
         counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
@@ -378,9 +374,9 @@ def mesh_grid(
     if not len(mesh.faces):
         raise no_surface(grid, offset)
     ends = lattice.field.unseen is not None
-    count = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
+    edges = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
     steps.finish("isosurface")
-    return Result(mesh, count, counts, leaves, is_cut, steps.seconds, len(tiles))
+    return Result(mesh, edges, counts, leaves, steps.seconds, count)
 
 
 def make_tile(
@@ -401,15 +397,8 @@ def make_tile(
         save_field(field)
     border = np.array([(0, 0, 0), task.shape]) - np.array(tile.low)
     is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
-    mesh, keys = extract(
-        field,
-        task.grid,
-        mesher=task.mesher,
-        cap=chosen.cap,
-        threads=task.threads,
-        first=tile.low,
-        shape=task.shape,
-    )
+    how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": task.threads}
+    mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
     counts = dict(field.counts)
     if task.whole:
         own = tile.owns(field.voxel_ijk + np.array(tile.low))

@@ -1,4 +1,4 @@
-"""The threads and the memory of a run, and work cut into chunks for threads.
+"""What a run may take, and how far it is: threads, memory, work in chunks, progress.
 
 Threads and memory are decided once at the start, and passed down. Pieces of work are independent of
 each other and may run at the same time; results come in order.
@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from math import ceil, inf
 from pathlib import Path
+from threading import Thread
 from typing import TypeVar
 
 from .errors import OptionError, OutOfMemoryError
@@ -41,6 +42,11 @@ def check_count(count: int, what: str) -> int:
 def cores_of_system() -> int:
     """Return the number of cores that the system lets this process run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def count_cores() -> int:
+    """Return the number of cores this process may use; in a container its quota, rounded up."""
+    return max(ceil(min([cores_of_system(), *map(_cores_of, _groups("cpu"))])), 1)
 
 
 def useful_threads(requested: int) -> int:
@@ -73,6 +79,8 @@ def over_threads(
     if threads < 2:
         yield from map(work, pieces)
         return
+    from concurrent.futures import ThreadPoolExecutor  # imported here, as small grids need none
+
     with ThreadPoolExecutor(threads) as pool:
         yield from pool.map(work, pieces)
 
@@ -91,9 +99,26 @@ def map_chunks(
     return map_threads(work, chunks_of(count, width), worthwhile_threads(count * width, threads))
 
 
-def count_cores() -> int:
-    """Return the number of cores this process may use; in a container its quota, rounded up."""
-    return max(ceil(min([cores_of_system(), *map(_cores_of, _groups("cpu"))])), 1)
+def call_beside(work: Callable[[], object], stop: Callable[[], object]) -> None:
+    """Do some work in another thread, and ``stop`` it at an interrupt; errors are passed on."""
+    failures: list[Exception] = []
+
+    def run() -> None:
+        try:
+            work()
+        except Exception as error:
+            failures.append(error)
+
+    thread = Thread(target=run)
+    thread.start()
+    try:
+        thread.join()
+    except BaseException:
+        stop()
+        thread.join()
+        raise
+    if failures:
+        raise failures[0]
 
 
 def free_memory() -> int | None:
@@ -101,19 +126,25 @@ def free_memory() -> int | None:
 
     In a container with a memory limit, at most what is left of the limit.
     """
-    try:
-        free = _read_sizes(SYSTEM).get("MemAvailable")
-    except OSError:
-        return _by_psutil("free")
-    return None if free is None else int(min([free, *map(_left_in, _groups("memory"))]))
+    with suppress(OSError, KeyError):
+        free = _sizes_in(SYSTEM)["MemAvailable"]
+        return int(min([free, *map(_left_in, _groups("memory"))]))
+    with suppress(ImportError):  # not Linux
+        import psutil
+
+        return int(psutil.virtual_memory().available)
+    return None
 
 
-def held_memory(peak: bool = False, pid: int | str = "self") -> int | None:
-    """Return the bytes of memory that a process holds, or its ``peak``; None if nothing tells."""
-    try:
-        return _read_sizes(Path(f"/proc/{pid}/status")).get("VmHWM" if peak else "VmRSS")
-    except OSError:
-        return None if peak else _by_psutil("rss", pid)
+def held_memory() -> int | None:
+    """Return the bytes of memory that this process holds; None if nothing tells."""
+    with suppress(OSError, KeyError):
+        return _sizes_in(Path("/proc/self/status"))["VmRSS"]
+    with suppress(ImportError):  # not Linux
+        import psutil
+
+        return int(psutil.Process().memory_info().rss)
+    return None
 
 
 def memory_bound(max_memory: int | None = None) -> int | None:
@@ -125,14 +156,6 @@ def memory_bound(max_memory: int | None = None) -> int | None:
     if max_memory is not None or free is None:
         return max_memory
     return (held_memory() or 0) + int(SHARE * free)
-
-
-def allot_each(count: int, threads: int, max_memory: int | None) -> tuple[int, int | None]:
-    """Return the threads and the memory bound of each of ``count`` processes of this machine."""
-    bound = memory_bound(max_memory)
-    if bound is not None:
-        bound = max(1, bound - (held_memory() or 0)) // count
-    return threads or max(1, count_cores() // count), bound
 
 
 def check_fits(need: int, what: str, way_out: str) -> None:
@@ -165,22 +188,10 @@ def give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _read_sizes(path: Path) -> dict[str, int]:
+def _sizes_in(path: Path) -> dict[str, int]:
     """Return the sizes in a file of /proc, in bytes, by name."""
     fields = (line.split(":", 1) for line in path.read_text().splitlines())
     return {name: int(text.split()[0]) * 1024 for name, text in fields if text.endswith(" kB")}
-
-
-def _by_psutil(what: str, pid: int | str = "self") -> int | None:
-    """Return the bytes that are "free", or that a process holds ("rss"); None if psutil cannot."""
-    with suppress(ImportError, AttributeError):
-        import psutil
-
-        with suppress(psutil.Error):  # the process has ended
-            if what == "free":
-                return int(psutil.virtual_memory().available)
-            return int(psutil.Process(*[pid] if pid != "self" else []).memory_info().rss)
-    return None
 
 
 def _groups(controller: str) -> Iterator[Path]:
@@ -213,11 +224,69 @@ def _left_in(group: Path) -> float:
 
 def _cores_of(group: Path) -> float:
     """Return the cores' worth of time that a control group may use, infinity without a limit."""
-    with suppress(OSError, ValueError):  # as above
-        quota, period = map(int, (group / "cpu.max").read_text().split())
-        return quota / period
-    with suppress(OSError, ValueError):
-        names = "cpu.cfs_quota_us", "cpu.cfs_period_us"
-        quota, period = (int((group / name).read_text()) for name in names)
-        return quota / period if quota > 0 else inf
+    for names in (["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"]):
+        with suppress(OSError, ValueError):  # as above
+            quota, period = " ".join((group / name).read_text() for name in names).split()
+            return int(quota) / int(period) if int(quota) > 0 else inf
     return inf
+
+
+Progress = Callable[[int, int], None]
+"""Called with (done, total), in thousandths of the work; ``done`` never falls and ends at total.
+
+If it raises an exception, the work stops with that exception.
+"""
+TOTAL = 1000
+# Share of the time that each step takes with a network on a CPU.
+STEPS = {"band": 0.03, "network": 0.45, "nodes": 0.15, "isosurface": 0.37}
+
+
+def part_of(progress: Progress | None, begin: float, end: float) -> Progress | None:
+    """Return a callback for a part of the work, between two shares of it; None without one."""
+    if progress is None:
+        return None
+    return lambda n, total: progress(round(TOTAL * (begin + (end - begin) * n / total)), TOTAL)
+
+
+class Stopwatch:
+    """Adds up the seconds spent in each stage, by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self.clock = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """Add the time since the last lap to a stage."""
+        self.take({stage: time.perf_counter() - self.clock})
+
+    def take(self, seconds: Mapping[str, float]) -> None:
+        """Add times that were measured elsewhere, and restart the clock."""
+        for stage, more in seconds.items():
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + more
+        self.clock = time.perf_counter()
+
+
+class StepCounter(Stopwatch):
+    """Reports progress and measures time, step by step; ``finish`` ends each step."""
+
+    def __init__(self, progress: Progress | None = None, names: Iterable[str] = STEPS) -> None:
+        super().__init__()
+        whole = sum(STEPS[name] for name in names)
+        self.lengths = {name: STEPS[name] / whole for name in names}
+        self.progress, self.done = progress, 0.0
+
+    def show(self, share: float) -> None:
+        """Report the share of all work that is done."""
+        if self.progress:
+            self.progress(round(TOTAL * share), TOTAL)
+
+    def finish(self, name: str) -> None:
+        """Report that a step is done, and record its time."""
+        self.lap(name)
+        self.done += self.lengths[name]
+        self.show(1.0 if name == "isosurface" else self.done)
+
+    def within(self, name: str) -> Callable[[float], None] | None:
+        """Return a callback for the share of a step that starts now; None without ``progress``."""
+        begin, length = self.done, self.lengths[name]
+        return (lambda share: self.show(begin + share * length)) if self.progress else None

@@ -32,7 +32,6 @@ from .record import Row
 from .work import Death, Settings, convert_job
 
 Task = TypeVar("Task")
-LOCAL = "local"
 CONNECT_SECONDS = 5  # that a scheduler has to answer
 FIRST_WORKER_SECONDS = 10  # that a cluster has to show a worker
 LOOK_SECONDS = 1.0  # between two looks at whether there are workers
@@ -61,10 +60,10 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
     with ExitStack() as stack:
         logging.disable(logging.CRITICAL)  # what Dask has to say comes as one line
         stack.callback(logging.disable, logging.NOTSET)
-        is_file = address != LOCAL and Path(address).is_file()
+        is_file = address != "local" and Path(address).is_file()
         server: Any = {"scheduler_file" if is_file else "address": address}
         try:
-            if address == LOCAL:
+            if address == "local":
                 os.environ.setdefault("PYTHONSAFEPATH", "1")  # import nothing from this folder
                 stack.enter_context(dask.config.set(CONFIG))
                 count = workers or count_cores()

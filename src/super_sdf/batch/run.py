@@ -25,8 +25,7 @@ from .. import __version__
 from ..files.output import naming
 from ..network.network import find_model
 from ..network.onnx import available_devices
-from ..progress import Progress
-from ..threads import allot_each, count_cores, free_memory
+from ..threads import Progress, count_cores, free_memory, held_memory, memory_bound
 from .inputs import Job
 from .record import STAGE_NAME, Record, Row, file_state, fingerprint, is_unchanged, outputs_of
 from .work import Death, Settings, convert_job, work_in_processes
@@ -47,18 +46,27 @@ class Batch:
         self.changed: dict[str, list[str]] = {}  # options of meshes that are made again
         self.written: dict[str, str] = {}  # in this run: the output of each file
         self.inputs = {os.path.realpath(job.source) for job in jobs}
-        self.has_failed, self.seconds = False, 0.0  # of the run, for those who measure it
+        self.has_failed, self.seconds = False, 0.0  # of the run
         chosen = settings.options.network()
         path, turns = find_model(chosen["model"], chosen["precision"])
-        self.network = {"version": __version__, "turns": turns}  # over which it is averaged
+        self.network = {"version": __version__, "turns": turns, "model": chosen["model"]}
         self.network["network"] = (fingerprint(path) or {}).get("sha256")
-        self.network |= {name: chosen[name] for name in ("model", "precision")}
         for job in jobs:
             self._plan(job)
 
     def of(self, *states: str) -> list[Job]:
         """Return the jobs in some states."""
         return [job for job in self.jobs if job.state in states]
+
+    def plan(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the files that are to be done, or were done or failed in earlier runs."""
+
+        def known(job: Job) -> dict[str, Any]:
+            reason = {"reason": job.row["reason"]} if job.row.get("reason") else {}
+            return {"in": os.path.abspath(job.source), "out": job.target, **reason}
+
+        states = "to_do", "done_before", "failed_before", "refused"
+        return {state: [known(job) for job in self.of(state)] for state in states}
 
     def made_again(self) -> dict[str, Any]:
         """Return how many outputs are made again since options changed, and which options."""
@@ -103,7 +111,9 @@ class Batch:
         count = count_workers(settings.workers, options.device, count, options.max_memory)
         threads, memory = options.threads, options.max_memory
         if count > 1:  # before the workers fill the memory
-            threads, memory = allot_each(count, threads, memory)
+            threads = threads or max(1, count_cores() // count)
+            if (bound := memory_bound(memory)) is not None:
+                memory = max(1, bound - (held_memory() or 0)) // count
 
         def take() -> Job | None:
             is_over = not left or (settings.fail_fast and self.has_failed)
@@ -166,7 +176,7 @@ class Batch:
         is_ok, changed = bool(row and row["status"] == "ok"), set[str]()
         if row:
             now, old = ({**{k: each.get(k) for k in how}, **each["asked"]} for each in (how, row))
-            keys = (now | old).keys() - {"asked", "precision"}
+            keys = (now | old).keys() - {"asked"}
             changed = {key for key in keys if now.get(key) != old.get(key)}
             again = settings.check and "check" not in row if is_ok else settings.retry
             same_path = row["in"] == os.path.abspath(job.source)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..convert import Conversion, convert
-from ..errors import FileError, GridError, OptionError, SuperSdfError, WriteError
+from ..errors import FileError, GridError, OptionError, SuperSdfError, WriteError, in_a_line
 from ..files.output import naming
 from ..labels.files import Names, convert_labels
 from ..network.network import load_network
@@ -79,8 +79,8 @@ def convert_job(
     except Exception as error:  # a bug that one file shows must not cost the others
         by_input = isinstance(error, (GridError, OptionError, FileError))
         retry = not by_input or isinstance(error, WriteError)
-        row = job.failed(_reason(error), content) | {"retry": retry}
-    row["seconds"] = round(time.perf_counter() - start, 4)
+        row = job.failed(in_a_line(error), content) | {"retry": retry}
+    row |= {"precision": network.precision, "seconds": round(time.perf_counter() - start, 4)}
     # sentences may name files, which will be in the output folder
     staged, final = (json.dumps(str(path))[1:-1] for path in (stage, settings.folder))
     return dict(json.loads(json.dumps(row).replace(staged, final)))
@@ -99,16 +99,7 @@ def _check(job: Job, settings: Settings, mesh: Path, made: Conversion, sha256: s
         keep_item(item, settings.items, job.target, sha256)
         return item.certificate or {}
     except Exception as error:  # the mesh is good all the same
-        return {"error": _reason(error)}
-
-
-def _reason(error: Exception) -> str:
-    """Return what went wrong; the package's own messages are for users as they are."""
-    if isinstance(error, SuperSdfError):
-        return str(error)
-    if isinstance(error, MemoryError):
-        return "out of memory: use a smaller --factor or grid"
-    return f"{type(error).__name__}: {error}"
+        return {"error": in_a_line(error)}
 
 
 class Death(str):

@@ -11,14 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ..errors import OptionError, SuperSdfError, WriteError, check_modules
+from ..errors import SuperSdfError, WriteError, check_modules
 from ..files.formats import NAMED, list_formats
 from ..options import MESH_FORMATS, OPTIONS, WORK
 from . import main
 from .main import SHARED, option, table_option
 
 if TYPE_CHECKING:
+    from ..batch.inputs import Job
     from ..batch.run import Batch
+    from ..batch.work import Settings
 
 HELP = f"""Convert many grids to meshes in the folder DIR, each as upsample would.
 
@@ -64,35 +66,11 @@ TAKES = (
 @main.make_command("Convert many grids; can be stopped and resumed.", HELP, *TAKES)
 def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     """Find the inputs, convert what is not done yet, print a summary."""
-    start, page, quiet, items = time.perf_counter(), given["report"], given["quiet"], None
-    options = main.chosen_options(given)
-    from ..batch.inputs import find_jobs
+    start, page, quiet = time.perf_counter(), given["report"], given["quiet"]
+    jobs, settings = planned(sources, folder, given)
     from ..batch.record import folder_lock
     from ..batch.run import Batch
-    from ..batch.work import Settings
-    from ..files.regular import files_of
-    from ..labels.files import check_options, read_names
 
-    names = read_names(given["names"]) if given["names"] else None
-    jobs = find_jobs(sources, f".{given['kind']}", options, names)
-    of_labels = [job.options for job in jobs if job.options.labels is not None]
-    if names and not of_labels:
-        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
-    for each in of_labels:
-        check_options(each, [name for name in ("check", "report") if given[name]])
-    if any(job.options.goals() for job in jobs):  # a list may say so
-        check_modules("simplify", "simplify")
-    if page:
-        from ..pages.html import is_page
-        from ..pages.items import items_folder
-
-        files = (path for job in jobs for path in (*files_of(job.source), folder / job.target))
-        main.check_page("--report", page, files, force=given["force"] or is_page(page))
-        items = items_folder(page)
-        if items.exists() and not items.is_dir():
-            raise WriteError(f"{items}, for the meshes of the page, is no folder: move it")
-    some = {name: given[name] for name in ("cluster", "force", "retry", "fail_fast", "check")}
-    settings = Settings(folder, options, given["jobs"], items=items, names=names, **some)
     if given["dry_run"]:
         print_plan(Batch(jobs, settings), given["as_json"])
         return
@@ -118,40 +96,57 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     lines = [f"Failed: {job.failure()}" for job in batch.of("failed_before", "refused", "failed")]
     more, failed = len(lines) - MOST_FAILURES, bool(lines)
     lines[MOST_FAILURES:] = [f"and {more} more, see {report}"] * (more > 0)
-    if not quiet:
-        lines += [*remarks(batch), sentence(batch)]
-    main.print_stderr(*lines)
+    main.print_stderr(*lines, *[] if quiet else [*remarks(batch), sentence(batch)])
     if failed:
         sys.exit(1)
 
 
-def plan(batch: Batch) -> dict[str, list[dict[str, Any]]]:
-    """Return the files that are to be done, or were done or failed in earlier runs."""
-    said: dict[str, list[dict[str, Any]]] = {}
-    for state in ("to_do", "done_before", "failed_before", "refused"):
-        said[state] = []
-        for job in batch.of(state):
-            reason = {"reason": job.row["reason"]} if job.row.get("reason") else {}
-            said[state].append({"in": os.path.abspath(job.source), "out": job.target, **reason})
-    return said
+def planned(
+    sources: tuple[str, ...], folder: Path, given: dict[str, Any]
+) -> tuple[list[Job], Settings]:
+    """Check what is given; return the jobs, and how they are to be run."""
+    options, page, items = main.chosen_options(given), given["report"], None
+    from ..batch.inputs import find_jobs
+    from ..batch.work import Settings
+    from ..files.regular import files_of
+    from ..labels.files import check_options, read_names
+
+    names = read_names(given["names"]) if given["names"] else None
+    jobs = find_jobs(sources, f".{given['kind']}", options, names)
+    of_labels = [job.options for job in jobs if job.options.labels is not None]
+    main.check_names(given, bool(of_labels))
+    for each in of_labels:
+        check_options(each, [name for name in ("check", "report") if given[name]])
+    if any(job.options.goals() for job in jobs):  # a list may say so
+        check_modules("simplify", "simplify")
+    if page:
+        from ..pages.html import is_page
+        from ..pages.items import items_folder
+
+        files = (path for job in jobs for path in (*files_of(job.source), folder / job.target))
+        main.check_page("--report", page, files, force=given["force"] or is_page(page))
+        items = items_folder(page)
+        if items.exists() and not items.is_dir():
+            raise WriteError(f"{items}, for the meshes of the page, is no folder: move it")
+    some = {name: given[name] for name in ("cluster", "force", "retry", "fail_fast", "check")}
+    return jobs, Settings(folder, options, given["jobs"], items=items, names=names, **some)
 
 
 def summary(batch: Batch) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
-    rows, known = [job.row for job in batch.of("done", "done_before")], plan(batch)
+    plan, rows = batch.plan(), [job.row for job in batch.of("done", "done_before")]
     failed = [{k: job.row[k] for k in ("in", "out", "reason")} for job in batch.of("failed")]
-    failures = [*known["failed_before"], *known["refused"], *failed]
-    counts = [(len(row.get("labels", [row])), bool(row["closed"])) for row in rows]
-    closed = sum(count for count, is_closed in counts if is_closed)
+    failures = [*plan["failed_before"], *plan["refused"], *failed]
+    meshes = [(len(row.get("labels", [row])), bool(row["closed"])) for row in rows]
     return {
         "done": len(batch.of("done")),
         "failed": len(failures),
-        "done_before": len(known["done_before"]),
-        "not_begun": len(known["to_do"]),
-        "failed_before": len(known["failed_before"]),
-        "refused": len(known["refused"]),
-        "closed": closed,
-        "open": sum(count for count, _ in counts) - closed,
+        "done_before": len(plan["done_before"]),
+        "not_begun": len(plan["to_do"]),
+        "failed_before": len(plan["failed_before"]),
+        "refused": len(plan["refused"]),
+        "closed": sum(count for count, is_closed in meshes if is_closed),
+        "open": sum(count for count, is_closed in meshes if not is_closed),
         "seconds": round(batch.seconds, 3),
         "made_again": batch.made_again(),
         "failures": failures,
@@ -197,13 +192,13 @@ def made_again(batch: Batch) -> list[str]:
 
 def print_plan(batch: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
-    known = plan(batch)
+    plan = batch.plan()
     if as_json:
-        main.print_stdout({**known, "made_again": batch.made_again()})
-    counts = [f"{len(rows)} {kind.replace('_', ' ')}" for kind, rows in known.items() if rows]
-    for kind, rows in known.items() if not as_json else ():
+        main.print_stdout({**plan, "made_again": batch.made_again()})
+    for state, rows in plan.items() if not as_json else ():
         for row in rows:
             end = row.get("reason") or f"-> {batch.settings.folder / row['out']}"
-            line = f"{kind.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}"
+            line = f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}"
             main.print_stdout("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
+    counts = [f"{len(rows)} {kind.replace('_', ' ')}" for kind, rows in plan.items() if rows]
     main.print_stderr(*made_again(batch), ", ".join(counts) or "nothing to do")

@@ -61,33 +61,32 @@ TAKES = (
 
 
 @main.make_command("Check a mesh against the grid that it was made from.", HELP, *TAKES)
-def command(mesh: Path, grid: Path, **given: Any) -> None:
+def command(mesh: Path, grid: Path, out: Path | None, **given: Any) -> None:
     """Check the mesh, print the certificate, and fail where it exceeds a limit."""
     check_modules("check", "report", ("igl",))
     from ..check import check
     from ..files.output import check_apart
     from ..files.regular import files_of
 
-    out, force, quiet = given["out"], given["force"], given["quiet"]
     limits = {name: given[name] for name in check.LIMITS}
     check.check_limits(limits)
     if out:
-        check.check_coloured(out, force=force)
+        check.check_coloured(out, force=given["force"])
         check_apart(out, [mesh, *files_of(grid)])
     options = Options(**{name: given[name] for name in (*READ, "offset", "max_memory", "unit")})
     both, crossing = check.read_for_check(mesh, grid, options), not given["skip_intersections"]
     found = check.check_mesh(*both, options, intersections=crossing)
     if out:
-        check.write_coloured(found, out, force=force)
+        check.write_coloured(found, out, force=given["force"])
     faults = found.faults() if given["no_faults"] else []
     failed = check.exceeded(found, limits) + [f"the mesh has {fault}" for fault in faults]
     kept = f"{out} is written" if out else "nothing was written"
     if given["as_json"]:
         said = {"mesh": str(mesh), "grid": str(grid), **found.report(), "limits_exceeded": failed}
         main.print_stdout(said, kept)
-    elif not quiet:
+    elif not given["quiet"]:
         main.print_stdout("\n".join(found.lines()), kept)
-    main.print_stderr(*(f"Note: {note}" for note in found.grid.notes if not quiet))
+    main.print_stderr(*(f"Note: {note}" for note in found.grid.notes if not given["quiet"]))
     main.print_stderr(*(f"Limit exceeded: {sentence}" for sentence in failed))
     if failed:
         sys.exit(1)

@@ -51,19 +51,20 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
             if not as_json:
                 main.print_stdout(f"{state:<8} {what}: {says}")
         failed = sum(finding["state"] == FAILED for finding in findings)
-        said = f"{failed} of {len(findings)} checks failed" * bool(failed)
-        said = said or "What is installed works."
+        said = (
+            f"{failed} of {len(findings)} checks failed" if failed else "What is installed works."
+        )
         facts = {"works": not failed, "findings": findings}
     elif source is not None:
         from ..files.grids import describe_grid_file
 
-        facts, failed = describe_grid_file(source), False
+        facts, failed = describe_grid_file(source), 0
         said = "\n".join(in_words(facts))
     else:
         facts = gather_facts()
         cards = facts["models"]
         faults = {f"network {n}": cards[n]["fault"] for n in cards if "fault" in cards[n]}
-        failed = bool(faults) or "fault" in facts
+        failed = len(faults) + ("fault" in facts)
         said = "\n".join(in_words({**facts, "models": list(cards), **faults}))
     main.print_stdout(facts if as_json else said)
     if failed:
@@ -74,10 +75,12 @@ def in_words(facts: dict[str, Any]) -> Iterator[str]:
     """Yield facts as lines: a line each, and one for each note and each grid of an OpenVDB file."""
     for key, value in facts.items():
         values = value if isinstance(value, (list, tuple)) else [value]
-        if key == "notes" or (values and isinstance(values[0], dict)):
-            for each in values:
-                said = each.values() if isinstance(each, dict) else [each]
-                yield f"{key.removesuffix('s')}: {', '.join(in_word(x) for x in said if x)}"
+        if key == "notes":
+            yield from (f"note: {note}" for note in values)
+        elif key == "grids":
+            for name, kind, class_, count in map(dict.values, values):
+                active = f", {count:,} active voxels" if count is not None else ""
+                yield f"grid: {name}, {kind}, {class_}{active}"
         elif values:
             yield f"{key.replace('_', ' ')}: {', '.join(map(in_word, values))}"
 
@@ -99,7 +102,7 @@ def gather_facts() -> dict[str, Any]:
         try:
             models[name] = dict(load_network(name, device="cpu", precision=FLOAT32).card)
         except errors.SuperSdfError as error:
-            models[name] = {"fault": str(error)}
+            models[name] = {"fault": error.flagged}
     return {
         "super-sdf": __version__,
         "python": platform.python_version(),
@@ -117,26 +120,27 @@ def run_checks(device: Device) -> Iterator[tuple[str, str, str]]:
     from ..network.onnx import VERSION, available_devices, check_cuda
 
     versions = f"super-sdf {__version__}, Python {platform.python_version()}"
-    yield (OK, "versions", f"{versions}, {VERSION}")
+    yield OK, "versions", f"{versions}, {VERSION}"
     devices: list[Device] = ["cpu"]
     if device != "cpu":
         try:
             check_cuda()
             devices.append("cuda")
-            yield (OK, "cuda", "its libraries are there")
+            yield OK, "cuda", "its libraries are there"
         except errors.DeviceError as error:
             needed = device == "cuda" or "cuda" in available_devices()
-            yield (FAILED if needed else MISSING, "cuda", str(error))
+            yield FAILED if needed else MISSING, "cuda", error.flagged
     if not shipped_models():
-        yield (FAILED, "networks", NO_NETWORKS)
+        yield FAILED, "networks", NO_NETWORKS
     for name in shipped_models():
         for each in devices[:1] if name.endswith("-int8") else devices:
             yield check_network(name, each)
     for name, modules in errors.EXTRAS.items():
-        lacking = ", ".join(errors.missing_modules(modules))
-        missing = f"no {lacking}: {errors.how_to_install(name)}"
-        state, says = (MISSING, missing) if lacking else (OK, ", ".join(modules))
-        yield (state, f"extra {name}", says)
+        if lacking := errors.missing_modules(modules):
+            way_out = errors.how_to_install(name)
+            yield MISSING, f"extra {name}", f"no {', '.join(lacking)}: {way_out}"
+        else:
+            yield OK, f"extra {name}", ", ".join(modules)
 
 
 def check_network(name: str, device: Device) -> tuple[str, str, str]:
@@ -151,8 +155,7 @@ def check_network(name: str, device: Device) -> tuple[str, str, str]:
         network = load_network(name, device=device, precision=FLOAT32)  # its own file
         found = reconstruct(grid, network, mesher="marching").vertices
     except errors.SuperSdfError as error:
-        return (FAILED, what, str(error))
+        return FAILED, what, error.flagged
     off = float(np.abs(np.linalg.norm(found - CENTRE, axis=1) - RADIUS).max())
-    works = off <= most  # False for NaN
-    says = f"off by {off:.3f} voxels at most on a ball" + f"; allowed are {most}" * (not works)
-    return (OK if works else FAILED, what, says)
+    says = f"off by {off:.3f} voxels at most on a ball"
+    return (OK, what, says) if off <= most else (FAILED, what, f"{says}; allowed are {most}")

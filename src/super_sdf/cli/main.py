@@ -5,7 +5,6 @@ Options come from the table in ``options``; an error is one line on stderr and a
 
 from __future__ import annotations
 
-import difflib
 import io
 import json
 import os
@@ -21,8 +20,8 @@ from typing import Any
 import click
 
 from .. import __version__
-from ..errors import OptionError, SuperSdfError, check_modules
-from ..options import EXCLUSIVE, GRID, MESH, OPTIONS, VALUES, WORK, Options, check_one
+from ..errors import OptionError, SuperSdfError, check_modules, flag, in_a_line
+from ..options import GRID, MESH, OPTIONS, VALUES, WORK, Options
 
 COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
@@ -47,7 +46,9 @@ class Commands(click.Group):
         if cmd_name in COMMANDS:
             found: click.Command = import_module(f"..{cmd_name}", __name__).command
             return found
-        near = difflib.get_close_matches(cmd_name, COMMANDS, 1)
+        from difflib import get_close_matches  # imported here, as few need it
+
+        near = get_close_matches(cmd_name, COMMANDS, 1)
         way_out = f"did you mean {near[0]}?" if near else f"give one of {', '.join(COMMANDS)}"
         ctx.fail(f"there is no command {cmd_name!r}: {way_out}")
 
@@ -104,23 +105,18 @@ def option(*names: str, **more: Any) -> Decorator:
 
 def table_option(name: str, text: str = "") -> Decorator:
     """Return what adds an option of the table to a command, maybe with another help text."""
-    row, word = OPTIONS[name], f"--{name.replace('_', '-')}"
+    row, word = OPTIONS[name], flag(name)
+    more: dict[str, Any] = {"help": text or row.help, "group": row.group, "default": row.default}
+    if isinstance(row.default, bool):
+        return option(f"{word}/--{row.off}" if row.off else word, is_flag=True, **more)
+    more |= {"show_default": row.default is not None, "metavar": row.metavar}
+    if row.kind.choices:
+        return option(word, type=click.Choice(row.kind.choices), **more)
 
     def parse(context: click.Context, param: click.Parameter, value: Any) -> Any:
-        try:
-            parsed = row.kind.parse(value) if isinstance(value, str) else value
-        except ValueError as error:
-            raise OptionError(f"{word} is {value!r}: {error}") from error
-        return row.check(parsed, word)
+        return row.parse(value) if isinstance(value, str) else value
 
-    more: dict[str, Any] = {"is_flag": True}
-    if row.kind.choices:
-        more = {"type": click.Choice(row.kind.choices)}
-    elif not isinstance(row.default, bool):
-        more = {"type": click.UNPROCESSED, "callback": parse, "metavar": row.metavar}
-    shown = row.default is not None and not isinstance(row.default, bool)
-    more |= {"default": row.default, "show_default": shown, "group": row.group}
-    return option(f"{word}/--{row.off}" if row.off else word, help=text or row.help, **more)
+    return option(word, type=click.UNPROCESSED, callback=parse, **more)
 
 
 # fmt: off
@@ -149,11 +145,9 @@ SHARED = {
 
 def chosen_options(given: dict[str, Any]) -> Options:
     """Return the options of a conversion, from all options of a command that may go with them."""
-    for names in EXCLUSIVE:
-        check_one({f"--{name}": given.get(name) for name in names})
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
-        check_modules(f"--{name}", "simplify")
+        check_modules(flag(name), "simplify")
     if given.get("check"):
         check_modules("--check", "report", ("igl",))
     if (address := given.get("cluster")) is not None:
@@ -167,6 +161,12 @@ def chosen_options(given: dict[str, Any]) -> Options:
     return chosen
 
 
+def check_names(given: dict[str, Any], labels: Any) -> None:
+    """Raise OptionError if there are names, and no labels are meshed."""
+    if given["names"] and not labels:
+        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
+
+
 def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
     """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
     from ..files.output import check_apart, check_free
@@ -178,13 +178,20 @@ def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bo
 
 
 @contextmanager
-def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Draw a progress bar with the remaining time on stderr; None if stderr is no terminal."""
+def progress_bar(
+    label: str, quiet: bool, before: str = ""
+) -> Iterator[Callable[[int, int], None] | None]:
+    """Draw a progress bar on a terminal's stderr, labelled ``before`` until there is progress."""
     if quiet or not sys.stderr.isatty():
         yield None
         return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
-        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
+    with click.progressbar(length=1000, label=before or label, file=sys.stderr) as shown:
+
+        def show(done: int, total: int) -> None:
+            shown.label = label
+            shown.update(1000 * done // total - shown.pos)
+
+        yield show
 
 
 def print_stderr(*lines: str) -> None:
@@ -218,17 +225,13 @@ def _discard(number: int) -> None:
 
 
 def main() -> None:
-    """Run the command line and exit with its exit code; every error is one line on stderr."""
-    if code := run():
-        sys.exit(code)
-
-
-def run() -> int:
-    """Run a command; return the exit code: 2 for usage errors, 128 + n after signal n.
+    """Run the command line and exit with its exit code, 128 + n after signal n.
 
     A signal raises KeyboardInterrupt, so that files that were begun are removed; one that the
-    parent process ignores, as ``nohup`` does, stays ignored.
+    parent process ignores, as ``nohup`` does, stays ignored. Every error is one line on stderr.
     """
+    # NumPy's BLAS has only small matrices to multiply, and its idle threads would keep cores busy.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     heard: list[int] = []
 
     def hear(number: int, frame: FrameType | None) -> None:
@@ -247,33 +250,32 @@ def run() -> int:
     sys.stdout, sys.stderr = sys.stdout or io.StringIO(), sys.stderr or io.StringIO()
     try:
         code = cli.main(standalone_mode=False)  # a number if a command ended early
-        return code if isinstance(code, int) else 0
     except (Exception, KeyboardInterrupt) as error:
-        if heard:  # also what a library has made of the interrupt
-            name = signal.Signals(heard[0]).name
-            said = "interrupted" if name == "SIGINT" else f"ended by {name}"
-            cause = error.__cause__ or error  # a command may say what it has kept
-            kept = cause.args if isinstance(cause, KeyboardInterrupt) else ()
-            return end(f"{said}: {kept[0]}" if kept else said, 128 + heard[0])
-        if isinstance(error, click.ClickException):
-            return end(error.format_message(), error.exit_code)
-        if isinstance(error, SuperSdfError):
-            return end(" ".join(str(error).splitlines()), 1 + isinstance(error, OptionError))
-        if isinstance(error, MemoryError):
-            return end("out of memory: use a smaller --factor or grid", 1)
-        if isinstance(error, OSError):  # the system refused something, such as a file handle
-            named = f"{error.filename}: " if error.filename else ""
-            return end(f"{named}{error.strerror or error}", 1)
-        raise
+        line, code = _fault(error, heard)
+        if "--json" in sys.argv[1:]:
+            with suppress(click.ClickException, click.exceptions.Exit):
+                print_stdout({"error": line})
+        print_stderr(f"Error: {line}")
     finally:
         for number in SIGNALS:
             signal.signal(number, before[number])
+    if isinstance(code, int) and code:
+        sys.exit(code)
 
 
-def end(line: str, code: int) -> int:
-    """Print an error, with ``--json`` also as JSON to stdout; return the exit code."""
-    if "--json" in sys.argv[1:]:
-        with suppress(click.ClickException, click.exceptions.Exit):
-            print_stdout({"error": line})
-    print_stderr(f"Error: {line}")
-    return code
+def _fault(error: BaseException, heard: list[int]) -> tuple[str, int]:
+    """Return the line and the exit code for an error, 2 for wrong usage; raise a bug again."""
+    if heard:  # also what a library has made of the interrupt
+        name = signal.Signals(heard[0]).name
+        said = "interrupted" if name == "SIGINT" else f"ended by {name}"
+        cause = error.__cause__ or error  # a command may say what it has kept
+        kept = cause.args if isinstance(cause, KeyboardInterrupt) else ()
+        return f"{said}: {kept[0]}" if kept else said, 128 + heard[0]
+    if isinstance(error, click.ClickException):
+        return error.format_message(), error.exit_code
+    if isinstance(error, (SuperSdfError, MemoryError)):
+        return in_a_line(error), 1 + isinstance(error, OptionError)
+    if isinstance(error, OSError):  # the system refused something, such as a file handle
+        named = f"{error.filename}: " if error.filename else ""
+        return f"{named}{error.strerror or error}", 1
+    raise error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import time
 from contextlib import ExitStack
 from typing import Any
@@ -10,9 +9,9 @@ from typing import Any
 import click
 
 from .. import __version__
-from ..errors import OptionError, SuperSdfError
+from ..errors import SuperSdfError
 from ..files.formats import NAMED, list_formats
-from ..options import MESH_FORMATS, OPTIONS
+from ..options import MESH_FORMATS, OPTIONS, Options
 from . import main
 from .main import SHARED, option, table_option
 
@@ -52,73 +51,60 @@ TAKES = (
 @main.make_command("Refine a grid and write its surface as a mesh.", HELP, *TAKES)
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
-    options, start = main.chosen_options(given), time.perf_counter()
-    if given["names"] and options.labels is None:
-        raise OptionError(f"--names {given['names']} is for --labels: give that, too")
-    if given["report"]:
+    options, page, seconds = main.chosen_options(given), given["report"], dict[str, float]()
+    main.check_names(given, options.labels)
+    clock = time.perf_counter()
+
+    def lap(stage: str) -> None:
+        nonlocal clock
+        clock, start = time.perf_counter(), clock
+        seconds[stage] = clock - start
+
+    if page:
         from ..files.regular import files_of
 
         others = [*files_of(source), target, *[given["save_field"]] * bool(given["save_field"])]
-        main.check_page("--report", given["report"], others, force=given["force"])
+        main.check_page("--report", page, others, force=given["force"])
     from ..network.network import load_network
 
     network = load_network(**options.network())
-    done: Any
-    seconds: dict[str, float] = {"load network": time.perf_counter() - start}
-    force, how = given["force"], dict[str, Any]()
-    with ExitStack() as stack:
-        how["progress"] = stack.enter_context(main.progress_bar("upsampling", given["quiet"]))
-        if options.labels is None:
-            from ..convert import convert
-
-            if given["cluster"] is not None:
-                from ..batch.cluster import connect, tiles_on
-
-                to = connect(given["cluster"], given["jobs"], options.max_memory)
-                client: Any = stack.enter_context(to)
-                least = TILES_PER_THREAD * sum(client.nthreads().values())
-                how |= {"map_tiles": tiles_on(client), "least_tiles": least}
-            how["save_field"] = given["save_field"]
-            done = convert(source, target, network, options, force=force, **how)
-        else:
-            from ..labels.files import check_options, convert_labels, read_names
-
-            check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
-            how["names"] = read_names(given["names"]) if given["names"] else None
-            done = convert_labels(source, target, network, options, force=force, **how)
+    lap("load network")
+    done = converted(source, target, network, options, given)
     seconds |= done.seconds
-    model, notes = options.network()["model"], [*done.remarks(), *network.notes]
+    clock, certificate = time.perf_counter(), None
     report = {
         "input": source,
         "output": target,
         "version": __version__,
         "asked": options.digest(),
-        "model": model,
-        "network": hashlib.sha256(network.path.read_bytes()).hexdigest(),
+        "model": options.network()["model"],
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),
         **done.report(),
     }
-    certificate = None
+    if given["as_json"] or page:
+        from hashlib import sha256  # imported here, as it loads OpenSSL
+
+        report["network"] = sha256(network.path.read_bytes()).hexdigest()
     if given["check"]:
         from ..check.check import check_mesh, read_for_check
 
-        start = time.perf_counter()
         try:
             certificate = check_mesh(*read_for_check(target, source, options, done), options)
         except SuperSdfError as error:
-            raise type(error)(f"{error}; {target} is written, but not checked") from error
+            said = f"{error.flagged}; {target} is written, but not checked"
+            raise type(error)(said) from error
         report["check"] = certificate.report()
-        seconds["check"] = time.perf_counter() - start
-    if given["report"]:
+        lap("check")
+    notes = [*done.remarks(), *network.notes]
+    if page:
         from ..pages.html import page_of_conversion, write_page
 
-        start = time.perf_counter()
-        said = {**report, "seconds": seconds, "notes": notes}
-        text = page_of_conversion(said, options, done, certificate)
-        write_page(text, given["report"], force=force)
-        seconds["page"] = time.perf_counter() - start
+        facts = {**report, "seconds": seconds, "notes": notes}
+        text = page_of_conversion(facts, options, done, certificate)
+        write_page(text, page, force=given["force"])
+        lap("page")
     report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
     if given["as_json"]:
         main.print_stdout(report, f"{target} is written")
@@ -133,7 +119,33 @@ def command(source: str, target: str, **given: Any) -> None:
     describe = describe_mesh if options.labels is None else describe_labels
     lines += describe(report, f"{sum(seconds.values()):.1f} s")
     lines += [f"Check: {certificate.summary()}"] if certificate else []
-    main.print_stderr(*lines, *[f"Report: {given['report']}"] * bool(given["report"]))
+    main.print_stderr(*lines, *[f"Report: {page}"] * bool(page))
+
+
+def converted(
+    source: str, target: str, network: Any, options: Options, given: dict[str, Any]
+) -> Any:
+    """Return the conversion of a grid, here or on a cluster, or that of the labels of an image."""
+    with ExitStack() as stack:
+        bar = main.progress_bar("upsampling", given["quiet"], "reading")
+        both: Any = {"progress": stack.enter_context(bar), "force": given["force"]}
+        if options.labels is not None:
+            from ..labels.files import check_options, convert_labels, read_names
+
+            check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
+            how: Any = {"names": given["names"] and read_names(given["names"])}
+            return convert_labels(source, target, network, options, **how, **both)
+        from ..convert import convert
+
+        how = {"save_field": given["save_field"]}
+        if given["cluster"] is not None:
+            from ..batch.cluster import connect, tiles_on
+
+            to = connect(given["cluster"], given["jobs"], options.max_memory)
+            client: Any = stack.enter_context(to)
+            least = TILES_PER_THREAD * sum(client.nthreads().values())
+            how |= {"map_tiles": tiles_on(client), "least_tiles": least}
+        return convert(source, target, network, options, **how, **both)
 
 
 def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:

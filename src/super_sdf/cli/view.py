@@ -37,22 +37,19 @@ TAKES = (
 
 
 @main.make_command("Look at meshes and grids in the browser.", HELP, *TAKES)
-def command(
-    sources: tuple[str, ...], out: Path | None, force: bool, no_browser: bool, **given: Any
-) -> None:
+def command(sources: tuple[str, ...], out: Path | None, **given: Any) -> None:
     """Write the page, print its address and open it."""
-    from .. import load_network
     from ..pages.html import viewed_page, write_page
 
     if out:
-        main.check_page("--out", out, sources, force=force)
-    options = main.chosen_options(given)
-    text = viewed_page(sources, lambda: load_network(**options.network()), options)
+        main.check_page("--out", out, sources, force=given["force"])
+    text = viewed_page(sources, main.chosen_options(given))
     page = out or Path(mkdtemp(prefix="super-sdf-"), "view.html")  # only this user can read it
-    write_page(text, page, force=force)
-    main.print_stderr(page.absolute().as_uri())
-    if not no_browser:
+    write_page(text, page, force=given["force"])
+    address = page.absolute().as_uri()
+    main.print_stderr(address)
+    if not given["no_browser"]:
         import webbrowser
 
-        if not webbrowser.open(page.absolute().as_uri()):
+        if not webbrowser.open(address):
             main.print_stderr("Note: no browser can be started here: open that address in yours")

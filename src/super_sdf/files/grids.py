@@ -121,9 +121,9 @@ def open_volume(
             request = Request(file, member, axes, files, left, describes)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
-        if str(file) in str(error):
+        if str(file) in error.flagged:
             raise
-        raise type(error)(f"{path}: {error}") from None
+        raise type(error)(f"{path}: {error.flagged}") from None
     except MemoryError:
         raise OutOfMemoryError(f"{path} does not fit in memory: save it as .npy") from None
     except Exception as error:  # the libraries raise all kinds of errors

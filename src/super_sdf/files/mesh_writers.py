@@ -6,7 +6,6 @@ file says of them, a ``World``. Text has enough digits to read back the same num
 
 from __future__ import annotations
 
-import html
 import json
 import struct
 from collections.abc import Iterator, Mapping
@@ -254,6 +253,8 @@ def write_3mf(parts: Parts, path: Path, world: World) -> None:
 
     Members opened by name have no date, so the same mesh always gives the same file.
     """
+    from html import escape  # imported here, as few need it
+
     with ZipFile(path, "w", ZIP_DEFLATED, compresslevel=COMPRESSION) as archive:
         for member, text in (("[Content_Types].xml", TYPES), ("_rels/.rels", RELATIONS)):
             with archive.open(member, "w") as file:
@@ -261,7 +262,7 @@ def write_3mf(parts: Parts, path: Path, world: World) -> None:
         with archive.open("3D/3dmodel.model", "w", force_zip64=True) as file:
             file.write((HEAD + MODEL.format(UNITS[world.unit or "mm"])).encode("ascii"))
             for number, (name, mesh) in enumerate(parts.items(), 1):
-                quoted, shown = f'"{html.escape(name)}"', ""
+                quoted, shown = f'"{escape(name)}"', ""
                 named = f" name={quoted}" if name else ""
                 if name in world.colours:
                     colour = "#{:02X}{:02X}{:02X}".format(*world.colours[name])

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
     from ..network.decoder import Decoder
-    from ..progress import Progress
+    from ..threads import Progress
 
 if not hasattr(pyvista, "register_dataset_accessor"):
     raise FileError(

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..errors import FileError, MeshError, OptionError, seen
+from ..errors import FileError, MeshError, OptionError, flag, seen
 from ..files.mesh_writers import World
 from ..files.meshes import check_mesh_suffix, check_target, format_of, write_meshes
 from ..files.output import check_apart
@@ -28,8 +28,8 @@ from ..files.volume import PLACE
 from ..grid.sdf_grid import SdfGrid, describe_place, mean_spacing
 from ..network.decoder import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
-from ..progress import Progress, Stopwatch
 from ..surface.mesh import Mesh
+from ..threads import Progress, Stopwatch
 from .reconstruct import find_image, in_order, label_meshes
 from .volumes import keep_volumes, volume_notes
 
@@ -140,7 +140,7 @@ def check_options(options: Options, more: Sequence[str] = ()) -> None:
     usual = {name: (OPTIONS[name].default, MARCHING) for name in others}
     given = {name: f" {seen(x)}" for name, x in others.items() if x not in usual[name]}
     for name in (*given, *more):
-        text = "open" if name == "cap" else name.replace("_", "-") + given.get(name, "")
+        text = flag("open" if name == "cap" else name) + given.get(name, "") * (name != "cap")
         raise OptionError(
             f"{text} does not go with labels, which share their walls: "
             "leave it out, or mesh one label (--label)"
@@ -158,7 +158,9 @@ def with_numbers(options: Options, names: Names | None) -> Options:
     for label in options.labels:
         if isinstance(label, str) and label not in numbers:
             some = ", ".join(list(numbers)[:10]) or "none without --names"
-            raise OptionError(f"labels has {label!r}: give numbers, or names of the table ({some})")
+            raise OptionError(
+                f"--labels has {label!r}: give numbers, or names of the table ({some})"
+            )
     chosen = in_order([numbers.get(label, label) for label in options.labels])
     return replace(options, labels=tuple(chosen or ()))
 

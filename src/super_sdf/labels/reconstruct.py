@@ -27,12 +27,20 @@ from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import load_network, network_for
 from ..pipeline import refine_band
-from ..progress import Progress, StepCounter, part_of
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
 from ..refine.survey import survey
 from ..surface.marching import strides
 from ..surface.mesh import Mesh, vertex_type
-from ..threads import check_count, held_memory, in_words, memory_bound, useful_threads
+from ..threads import (
+    Progress,
+    StepCounter,
+    check_count,
+    held_memory,
+    in_words,
+    memory_bound,
+    part_of,
+    useful_threads,
+)
 from .volumes import keep_volumes
 from .walls import Labelled, extract_walls
 
@@ -128,7 +136,7 @@ def find_image(
         place = read_array(values, place, axes, space, max_memory)
         values, notes = place["values"], list(place["notes"])
     elif axes is not None:
-        raise OptionError(f"axes is {seen(axes)}: that is for files; transpose the array")
+        raise OptionError(f"--axes is {seen(axes)}: that is for files; transpose the array")
     given = placed(values, place["spacing"], place["origin"])
     samples, origin = as_samples(given.values), given.origin
     check_kind(samples.dtype, samples.shape)
@@ -156,9 +164,9 @@ def in_order(labels: Any) -> list[int] | None:
     given = options.check_labels(labels)
     if isinstance(given, str):
         return None
-    chosen = sorted({options.check_label(label, "labels") for label in given})
+    chosen = sorted({options.check_label(label, "--labels") for label in given})
     if not 0 < len(chosen) <= MOST_LABELS:
-        raise OptionError(f"labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
+        raise OptionError(f"--labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
     return chosen
 
 
@@ -203,8 +211,7 @@ def label_meshes(
     image: LabelImage, network: Decoder, factor: int, bound: int | None, progress: Progress | None
 ) -> list[Mesh]:
     """Return the meshes of an image's labels; OutOfMemoryError if they do not fit in memory."""
-    options.check_network(network)
-    options.check_progress(progress)
+    options.check_called(network, progress)
     factor, grid = options.OPTIONS["factor"].check(factor), image.grid
     bound = memory_bound(options.OPTIONS["max_memory"].check(bound))
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
@@ -270,9 +277,8 @@ def label_fields(
         none = ~np.stack([around[tuple((own_ijk + 1 + step).T)] for step in NEIGHBOURHOOD])
         absent = np.array([none[sharing].any(0) for sharing in SHARING])  # (27, n), by part
         some_ijk = own_ijk if label else own_ijk[times[rows] > 1]
-        steps = StepCounter(
-            part_of(progress, turn / count, (turn + 1) / count), ["network", "nodes"]
-        )
+        shown = part_of(progress, turn / count, (turn + 1) / count)
+        steps = StepCounter(shown, ["network", "nodes"])
         blocks = np.full((nodes, len(own_ijk)), np.nan, np.float32)
         distances, extremes = mask_distances(mask), extremes_of_masks(1.0)
         lattice = SdfGrid.trusted(distances, 1.0, extremes=extremes, field=grid.field)

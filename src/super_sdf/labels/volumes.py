@@ -31,14 +31,14 @@ Rows = NDArray[np.intp]
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
     if offset:
-        said = f"is for the surface of the samples, offset is {offset:g}: give one only"
+        said = f"is for the surface of the samples, --offset is {offset:g}: give one only"
     elif grid.field.kind != MASK:
         said = f"is for masks and labels, the values are {grid.field.kind}: leave it out"
     elif cap:
         return
     else:
         said = "needs a closed mesh: leave out --open"
-    raise OptionError(f"keep-volume {said}")
+    raise OptionError(f"--keep-volume {said}")
 
 
 def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:

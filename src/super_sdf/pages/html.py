@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from .. import __version__
+from .. import __version__, load_network
 from ..check import check
 from ..convert import convert
 from ..errors import SuperSdfError
@@ -29,7 +29,6 @@ from . import items
 from .items import Entry, Item, entry_of_report, item_of_files
 
 if TYPE_CHECKING:
-    from ..network.decoder import Decoder
     from ..options import Options
 
 HOME = Path(__file__).parent
@@ -108,9 +107,9 @@ def page_of_conversion(
     return _whole_page(name, [(entry, item)], summary)
 
 
-def viewed_page(sources: Sequence[str], load: Callable[[], Decoder], options: Options) -> str:
-    """Return the page of mesh files, and of grid files, for which ``load`` loads a network."""
-    network = load() if any(map(is_grid, sources)) else None
+def viewed_page(sources: Sequence[str], options: Options) -> str:
+    """Return the page of mesh files, and of the meshes that grid files become."""
+    network = load_network(**options.network()) if any(map(is_grid, sources)) else None
     shown = []
     for source in sources:
         name = Path(source).name

@@ -65,7 +65,7 @@ class Item:
         try:
             self.meshes.append(packed_mesh(title, mesh, certificate))
         except SuperSdfError as error:
-            self.remarks.append(f"not shown: {error}")
+            self.remarks.append(f"not shown: {error.flagged}")
 
 
 def item_of_files(
@@ -79,14 +79,14 @@ def item_of_files(
     try:
         shown, samples = read_for_check(mesh, grid, options, made)
     except SuperSdfError as error:
-        return Item(certificate={"error": str(error)}, remarks=[f"not shown: {error}"])
+        return Item(certificate={"error": error.flagged}, remarks=[f"not shown: {error.flagged}"])
     item = Item()
     try:
         check_modules("a check of the mesh, with residuals,", "report", ("igl",))
         certificate = certificate or check_mesh(shown, samples, options)
         item.certificate = certificate.report()
     except SuperSdfError as error:
-        item.certificate = {"error": str(error)}
+        item.certificate = {"error": error.flagged}
     item.show(RESULT, shown, certificate)
     lattice = cubic_grid(samples, options.offset)
     known = lattice.field.unseen is None  # beside what is unknown, a coarse surface is made up
