@@ -21,7 +21,6 @@ from pyfqmr import Simplify
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid
 from .measuring import Original, mean_side
-from .slivers import without_slivers
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
@@ -30,14 +29,14 @@ ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 PLANE_DISTANCES = (1.0, 1.4, 1.4, 1.4), (1.7, 1.7)
 ROUNDS = 30, 3.0  # of the threshold, and its rise; from more rounds, meshes get no smaller
 FEW_ROUNDS, LARGE = (8, 5.0), 1 << 12  # nearly as well, from this many triangles on
-SLIVER = 0.3  # of the error: how far a surface moves where slivers are removed
+THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
 MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
 # A number of triangles is sought by the error that leaves as many.
 MOST_ERRORS = 12  # that are tried
 FIRST_ERROR = 0.006  # in sides of a triangle, over the share of the triangles that is wanted
 STRIDE, CLOSE = 4.0, 1.02  # largest ratio of an error to the next, and smallest of two in the end
-FARTHEST, NEAR_END = 0.05, 1.2  # over the diagonal: larger errors leave no fewer; near it, to stop
-MARGIN = 1.06  # fewer triangles by about this factor if simplified again within the same error
+FARTHEST = 0.05  # error over the diagonal: larger ones leave no fewer
+MARGIN = 1.03  # over the triangles that are left: near enough
 
 Pass = Sequence[dict[str, float]]
 """What ``collapse_edges`` is told, step by step."""
@@ -68,13 +67,14 @@ def collapsed(
             corners = result.faces[solids[number].nearest_face(places[since <= number])]
             chosen: NDArray[np.bool_] = np.zeros(len(result.vertices), bool)
             chosen[corners] = True
-            kept.append(chosen[result.faces].any(1))
-            held, count = kept[number], np.count_nonzero(kept[number])
+            held: NDArray[np.bool_] = np.any(chosen[result.faces], axis=1)
+            kept.append(held)
+            count = np.count_nonzero(held)
             for step in steps:
                 result = collapse_edges(result, held, **step)
                 held = np.arange(len(result.faces)) >= len(result.faces) - count
             if number == len(passes) - 1 and error < np.inf:
-                result = without_slivers(result, held, SLIVER * error)
+                result = turn_edges(result, held, LOW * error)
             meshes.append(result)
             solids.append(Solid(result))
         if not len(result.faces):
@@ -146,49 +146,41 @@ def down_to(
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning.
 
-    The error is sought that leaves somewhat more. Each error that is tried is a whole
+    The error is sought that leaves hardly fewer. Each error that is tried is a whole
     simplification, so that the mesh is as good as that of the error.
     """
-    everything, wanted = len(mesh.faces), MARGIN * triangles
-    if everything <= triangles:
+    if len(mesh.faces) <= triangles:
         return mesh, ()
     farthest = FARTHEST * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    error = min(FIRST_ERROR * mean_side(mesh) * everything / triangles, farthest)
-    # an error and the triangles that it leaves at first: too many, and few enough
-    (low, more), (high, fewer) = (0.0, everything), (np.inf, 0)
-    reached, least, is_near = None, mesh, False
+    error = min(FIRST_ERROR * original.side * len(mesh.faces) / triangles, farthest)
+    # an error and the triangles that it leaves: too many, and few enough
+    low, more, high, fewer = 0.0, len(mesh.faces), np.inf, 0
+    reached, least = None, mesh
     for _ in range(MOST_ERRORS):
         result = within(mesh, original, error, count_round)[0]
-        once = len(result.faces)
-        if triangles < once < MARGIN * wanted:
-            result = within(result, original, error, count_round)[0]
         left = len(result.faces)
-        all_alike = not low and once == fewer  # as on planes
-        found = triangles < MARGIN * left and left <= triangles < once
-        if left <= triangles:  # ``is_near`` if it leaves hardly fewer
-            reached, high, fewer, is_near = result, error, once, triangles < MARGIN * left
-        elif once == everything > more and not fewer:  # the error is too large
+        if left == len(mesh.faces) > more and not fewer:  # the error is too large
             farthest = min(farthest, error)
+        elif left <= triangles:
+            reached, high, fewer = result, error, left
         else:
-            low, more, least = error, once, min(least, result, key=lambda one: len(one.faces))
-        if found or all_alike or (not fewer and farthest < NEAR_END * low):
+            low, more, least = error, left, min(least, result, key=lambda one: len(one.faces))
+        if triangles < MARGIN * left <= MARGIN * triangles or high < CLOSE * low:
             break
-        if high < CLOSE * low:
-            if is_near:
-                break
-            low = 0.0  # smaller errors may leave few enough, too
+        if not fewer and farthest < CLOSE * low:
+            break
         # what is left falls about as a power of the error
-        if high == np.inf:
-            rise = float(np.clip(more / wanted, 1.1, STRIDE))
-            error = low * min(rise, max(1.1, float(np.sqrt(farthest / low))))
+        if not fewer:
+            error = min(low * float(np.clip(more / triangles, 1.1, STRIDE)), farthest)
+            error = error if error > low else (low + farthest) / 2
         elif not low:
-            error = high * float(np.clip(fewer / wanted, 1 / STRIDE, 0.9))
+            error = high * float(np.clip(fewer / triangles, 1 / STRIDE, 0.9))
         else:
-            share = np.log(more / wanted) / np.log(more / fewer)
+            share = np.log(more / triangles) / np.log(more / fewer)
             error = float(low * (high / low) ** np.clip(share, 0.15, 0.85))
     if reached:
         return reached, ()
-    steps = [{"triangles": triangles}] * 5
+    steps = [{"triangles": float(triangles)}] * 5
     exact = collapsed(least, [steps], original, np.inf, count_round)  # whatever the distance
     if exact and len(exact.faces) <= triangles:
         return exact, ()
@@ -213,7 +205,7 @@ def same_topology(one: Mesh, other: Mesh) -> bool:
 
 
 def collapse_edges(
-    mesh: Mesh, kept: NDArray[np.bool_], *, distance: float = 0.0, triangles: int = 0
+    mesh: Mesh, kept: NDArray[np.bool_], *, distance: float = 0.0, triangles: float = 0
 ) -> Mesh:
     """Collapse the edges whose new vertex is within a distance of the planes around it.
 
@@ -223,7 +215,7 @@ def collapse_edges(
     The others are a mesh of its own, whose open edges pyfqmr keeps: there it is joined to the kept
     triangles again.
     """
-    target = max(triangles - int(np.count_nonzero(kept)), 0)
+    target = max(int(triangles) - int(np.count_nonzero(kept)), 0)
     options: dict[str, Any] = {"target_count": target, "update_rate": 1}
     if distance:
         rounds, rise = FEW_ROUNDS if len(mesh.faces) > LARGE else ROUNDS
@@ -248,6 +240,51 @@ def collapse_edges(
     number[held[at]], number[extra] = found, len(moved) + np.arange(len(extra))
     faces = np.concatenate([faces.astype(np.int32), number[mesh.faces[kept]]])
     return Mesh(np.concatenate([vertices, mesh.vertices[extra]]), faces)
+
+
+def turn_edges(mesh: Mesh, held: NDArray[np.bool_], distance: float) -> Mesh:
+    """Turn the longest edges of slivers that are lower than a distance, where that makes none.
+
+    So the surface moves by less than the distance. The triangles ``held``, (m,), stay.
+    """
+    points, faces, count = mesh.vertices.astype(np.float64), mesh.faces.copy(), len(mesh.vertices)
+    for _ in range(4):  # not all edges can be turned at once
+        solid, flat = Solid(Mesh(points, faces)), faces.ravel()
+        corners, normals, opposite = points[faces], solid.normals(), solid.mesh.pair_edges()[0]
+        sides = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+        angle, low = smallest_angles(corners), distance * sides.max(1)
+        one = np.flatnonzero((angle < THIN) & (np.linalg.norm(normals, axis=1) < low) & ~held)
+        half = 3 * one + sides[one].argmax(1)
+        half = half[(opposite[half] >= 0) & ~held[opposite[half] // 3]]
+        one, other = half // 3, opposite[half] // 3
+        a, b, c = (flat[3 * one + (half + turn) % 3] for turn in range(3))
+        d = flat[3 * other + (opposite[half] + 2) % 3]
+        new = np.stack([c, a, d, d, b, c], axis=1).reshape(-1, 2, 3)
+        better = smallest_angles(points[new.reshape(-1, 3)]).reshape(-1, 2).min(1) > 2 * angle[one]
+        after = Solid(Mesh(points, new.reshape(-1, 3))).normals().reshape(-1, 2, 3)
+        lengths = np.linalg.norm(after, axis=2) * np.linalg.norm(normals[other], axis=1)[:, None]
+        steady = (np.einsum("nij,nj->ni", after, normals[other]) > STEADY * lengths).all(1)
+        edges = flat.astype(np.int64) * count + np.roll(faces, -1, axis=1).ravel()
+        free = ~np.isin(c * np.int64(count) + d, edges) & ~np.isin(d * np.int64(count) + c, edges)
+        taken: set[int] = set()
+        for row in np.flatnonzero(better & steady & free):
+            quad = {int(corner) for corner in new[row].ravel()}
+            if not quad & taken:
+                taken |= quad
+                faces[[one[row], other[row]]] = new[row]
+        if not taken:
+            break
+    return Mesh(mesh.vertices, faces)
+
+
+def smallest_angles(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the smallest angle of each triangle, (m,), in degrees; corners are (m, 3, 3)."""
+    found = []
+    for turn in range(3):
+        at, one, other = np.roll(corners, turn, axis=1).transpose(1, 0, 2)
+        sine = np.linalg.norm(np.cross(one - at, other - at), axis=1)
+        found.append(np.arctan2(sine, ((one - at) * (other - at)).sum(1)))
+    return np.degrees(np.min(found, axis=0))
 
 
 def irregular_places(mesh: Mesh) -> NDArray[np.float64]:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Distances, Points, Solid
 
-ALONG_EDGE = np.array([1, 2, 4, 5]) / 6  # points on an edge of the original mesh, as shares of it
-SUSPECT = 0.35  # of the limit, from which on in its middle an edge gets more points, too
-NEAR = 0.6  # of the limit, from which on an edge gets more points
 BETWEEN = 0.97  # of the error, which no measured point exceeds: others may be a little farther away
+SHARES = np.array([[[1]], [[2]], [[4]], [[5]]]) / 6  # where an edge is measured beside its middle,
+SUSPECT = 0.35  # if that is as far away as this share of the limit
+NEAR = 0.6  # of the limit, from which on edges of the simplified mesh get four times the points
 
 
 class Deviation(NamedTuple):
@@ -44,7 +44,7 @@ class Original:
         self.near = np.zeros(len(mesh.vertices), np.uint64)  # key of a triangle; 0: not measured
         start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
         self.edges = np.stack([start, end])[:, start < end]
-        self.keys, self.back = np.zeros(1, np.uint64), np.full((2, 1), np.inf)
+        self.keys, self.back = np.zeros(1, np.uint64), np.full((2, 1), np.inf)  # largest, mean
 
     def compare(self, other: Solid, error: float = np.inf) -> tuple[Points, Deviation]:
         """Return points near this mesh, (n, 3), where the two are farther apart than an error."""
@@ -57,7 +57,7 @@ class Original:
         on_edges, off = self._bent_edges(other, keys, min(limit, float(self.distance.max())))
         feet, largest_back, mean_back = self._back(other, keys, limit)
         wrong = [vertices[self.distance > limit], on_edges[off > limit], feet]
-        area = areas(self.solid.mesh)
+        area = np.linalg.norm(self.solid.normals(), axis=1)
         mean = float(self.distance[self.mesh.faces].mean(1) @ area / area.sum())
         largest = float(max(self.distance.max(), off.max(initial=0)))
         return np.concatenate(wrong), Deviation(largest, mean, largest_back, mean_back)
@@ -65,79 +65,67 @@ class Original:
     def _bent_edges(
         self, other: Solid, keys: NDArray[np.uint64], limit: float
     ) -> tuple[Points, Distances]:
-        """Return points on the edges that may be farther away than their ends, and distances.
+        """Return points on edges that may be farther away than their ends, and the distances.
 
-        Between two planes that meet at an angle, an edge of length L with both ends on them is at
-        most L / 4 times the angle away.
+        Between two triangles that meet at an angle, an edge of length L with both ends on them is
+        at most L / 4 times the angle away. Of triangles that share no edge, nothing is known.
         """
         order = np.argsort(keys)
         face = order[np.searchsorted(keys[order], self.near)]
-        a, b, c = other.mesh.vertices[other.mesh.faces.T]
-        normals = np.cross(b - a, c - a)
+        normals = other.normals()
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        some = np.flatnonzero(face[self.edges[0]] != face[self.edges[1]])
-        start, end = self.edges[:, some]
+        start, end = self.edges[:, face[self.edges[0]] != face[self.edges[1]]]
         low, high = self.solid.mesh.vertices[start], self.solid.mesh.vertices[end]
         angle = np.linalg.norm(normals[face[start]] - normals[face[end]], axis=1)
         rise = np.linalg.norm(high - low, axis=1) * angle / 4
-        ends = np.maximum(self.distance[start], self.distance[end])
-        bent = ends + rise > limit
-        some, low, high = some[bent], low[bent], high[bent]
+        bent = np.maximum(self.distance[start], self.distance[end]) + rise > limit
+        beside = np.arange(3 * len(keys)) // 3 * len(keys) + other.mesh.pair_edges()[0] // 3
+        bent |= ~np.isin(face[start] * len(keys) + face[end], beside)
+        low, high = low[bent], high[bent]
         middles = (low + high) / 2
         off = other.distance(middles)
         more = (off > SUSPECT * limit) & (off <= limit)
-        share = ALONG_EDGE[:, None, None]
-        points = (low[more] + share * (high[more] - low[more])).reshape(-1, 3)
-        return np.concatenate([middles, points]), np.concatenate([off, other.distance(points)])
+        points = (low[more] + SHARES * (high[more] - low[more])).reshape(-1, 3)
+        return np.concatenate([middles, points]), np.append(off, other.distance(points))
 
     def _back(
         self, other: Solid, keys: NDArray[np.uint64], limit: float
     ) -> tuple[Points, float, float]:
         """Return the feet on this mesh of points of the other that are too far, and distances."""
         vertices, faces = other.mesh.vertices, other.mesh.faces
-        start, end = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)]), axis=0).reshape(2, -1)
-        _, first, edge = np.unique(
-            start.astype(np.int64) * len(vertices) + end, return_index=True, return_inverse=True
-        )
-        ends = vertices[np.stack([start[first], end[first]], 1)]
+        sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), 1)
+        number = sides[:, 0].astype(np.int64) * len(vertices) + sides[:, 1]
+        _, first, edge = np.unique(number, return_index=True, return_inverse=True)
+        ends = vertices[sides[first]]
         places = np.concatenate([keys, row_keys(ends.reshape(-1, 6))])  # triangles, then edges
         order = np.argsort(self.keys)
         at = order[np.searchsorted(self.keys[order], places).clip(max=len(order) - 1)]
-        known = np.zeros((2, len(places)))
         is_known = (self.keys[at] == places) & (self.back[0, at] <= limit)
-        known[:, is_known] = self.back[:, at[is_known]]
-        new = np.flatnonzero(~is_known)
-        edges, middle = new[new >= len(keys)], new[new < len(keys)]
+        known = np.where(is_known, self.back[:, at], 0)
+        middle, edges = (np.flatnonzero(~some) for some in (is_known[: len(keys)], is_known))
+        edges = edges[len(middle) :]
         points, owner = vertices[faces[middle]].mean(1), middle
-        # Both ends, and points between them about as far apart as half a side of the original mesh;
-        # more of them on edges that are not much nearer than the limit.
         step, wrong, sums = self.side / 2, [np.zeros((0, 3))], np.zeros((2, len(places)))
-        for _ in range(2):
+        for _ in range(2):  # both ends, and points between them no farther apart than a step
             low, high = ends[edges - len(keys)].transpose(1, 0, 2)
             length = np.linalg.norm(high - low, axis=1)
-            count = np.maximum(np.ceil(length / step).astype(np.int64), 3) + 1
-            row = np.repeat(np.arange(len(edges)), count)
-            place = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
-            share = place / (count[row] - 1)
-            on_edges = low[row] + share[:, None] * (high - low)[row]
+            parts = np.maximum(np.ceil(length / step).astype(np.int64), 3)
+            row = np.repeat(np.arange(len(edges)), parts + 1)
+            place = np.arange(len(row)) - np.repeat(np.cumsum(parts + 1) - parts - 1, parts + 1)
+            on_edges = low[row] + (place / parts[row])[:, None] * (high - low)[row]
             points, owner = np.concatenate([points, on_edges]), np.append(owner, edges[row])
             found, _, feet = self.solid.nearest(points)
-            np.maximum.at(known[0], owner, found)
             wrong.append(feet[found > limit])
-            sums += np.bincount(owner, found, len(places)), np.bincount(owner, None, len(places))
+            np.maximum.at(known[0], owner, found)
+            sums += [np.bincount(owner, some, len(places)) for some in (found, None)]
             edges = edges[(known[0, edges] > NEAR * limit) & (known[0, edges] <= limit)]
-            points, owner, step = np.zeros((0, 3)), np.zeros(0, np.intp), step / 4
-        known[1, new] = sums[0, new] / sums[1, new]
+            points, owner, step = points[:0], owner[:0], step / 4
+        measured = sums[1] > 0
+        known[1, measured] = sums[0, measured] / sums[1, measured]
         self.keys, self.back = places, known
-        mean = known[1, : len(keys)] * 0.5 + known[1, len(keys) + edge.reshape(-1, 3)].mean(1) * 0.5
-        area = areas(other.mesh)
+        mean = known[1, : len(keys)] / 2 + known[1, len(keys) + edge.reshape(-1, 3)].mean(1) / 2
+        area = np.linalg.norm(other.normals(), axis=1)
         return np.concatenate(wrong), float(known[0].max()), float(mean @ area / area.sum())
-
-
-def areas(mesh: Mesh) -> Distances:
-    """Return the areas of triangles, (m,)."""
-    a, b, c = mesh.vertices[mesh.faces.T]
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
 
 def mean_side(mesh: Mesh) -> float:

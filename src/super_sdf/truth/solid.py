@@ -177,6 +177,11 @@ class Solid:
         found = self.distance(points)
         return np.where(self.is_inside(points), -found, found)
 
+    def normals(self) -> Points:
+        """Return normals of the triangles, (m, 3), as long as twice their areas."""
+        a, b, c = self.mesh.vertices[self.mesh.faces.T]
+        return np.cross(b - a, c - a)
+
     def intersecting(self) -> NDArray[np.int64]:
         """Return the pairs of triangles, (k, 2), that meet off a common vertex or edge.
 
@@ -190,8 +195,7 @@ class Solid:
 
     def count_overlapping(self) -> int:
         """Count the faces with a winding number of 2 or more, or below 0, on one side."""
-        a, b, c = self.mesh.vertices[self.mesh.faces.T]
-        normals, centres = np.cross(b - a, c - a), (a + b + c) / 3
+        normals, centres = self.normals(), self.mesh.vertices[self.mesh.faces].mean(1)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         size = np.linalg.norm(np.ptp(self.mesh.vertices, axis=0))
         step = SIDE_STEP * size * normals / np.where(lengths > 0, lengths, 1)
