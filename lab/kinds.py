@@ -19,7 +19,7 @@ from super_sdf.arrays import FloatArray
 from super_sdf.errors import GridError
 from super_sdf.grid.sdf_grid import make_grid
 from super_sdf.network.decoder import Decoder
-from super_sdf.options import AUTO, SCALED
+from super_sdf.options import AUTO, SMOOTH
 from super_sdf.pipeline import reconstruct
 
 from .shapes import FIELD_NOISE, Case
@@ -187,7 +187,7 @@ def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
     values, spacing, origin = samples_of(kind, case)
     placed = {"spacing": spacing, "origin": origin} if kind.unit is None else {}
     refusals = []
-    for told in (AUTO, SCALED) if kind.group == "scaled" else (AUTO,):
+    for told in (AUTO, SMOOTH) if kind.group == "scaled" else (AUTO,):
         try:
             grid = make_grid(values, field=told, **kind.options, **placed)
             mesh = reconstruct(grid, network, factor=case.factor)

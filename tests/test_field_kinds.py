@@ -1,4 +1,6 @@
-"""What the values of a grid are, and what becomes of masks, truncated and scaled fields."""
+"""What the values of a grid are, and what becomes of masks, densities and smooth fields."""
+
+import re
 
 import numpy as np
 import pytest
@@ -50,6 +52,13 @@ def noisy(values: np.ndarray, amplitude: float = 0.25) -> np.ndarray:
     return values + np.random.default_rng(0).uniform(-amplitude, amplitude, values.shape)
 
 
+def cube(at: float, n: int = 32) -> np.ndarray:
+    """Return distances to a cube whose middle is at a place along x, in voxels."""
+    x, y, z = lattice(n)
+    off = np.abs(np.stack([x - at, y, z])) - 0.2
+    return n * (np.sqrt((np.maximum(off, 0) ** 2).sum(0)) + np.minimum(off.max(0), 0))
+
+
 def thin_frame() -> np.ndarray:
     """Return distances to walls, 1.4 voxels thick: few samples are smooth as far as the next."""
     return np.abs(box()) - 0.7
@@ -60,27 +69,30 @@ OUT, INTO = (ndimage.distance_transform_edt(side) for side in (~MASK, MASK))
 TRANSFORMS = {"both sides": OUT - INTO, "inside only": INTO, "in other units": 0.37 * (OUT - INTO)}
 WAVES = 1 + 0.5 * np.sin(4 * np.pi * sum(lattice(32)))
 KINDS = {
-    "a torus": (torus(), "exact"),
-    "a torus of 16^3": (torus(16), "exact"),
-    "a box": (box(), "exact"),
+    "a torus": (torus(), "distance"),
+    "a torus of 16^3": (torus(16), "distance"),
+    "a box": (box(), "distance"),
     "a box along the axes, half-way between samples": (
         np.abs(np.indices((24, 24, 24)) - 11.5).max(0) - 6,
-        "exact",
+        "distance",
     ),
-    "a plane half-way between samples": (np.indices((12, 12, 12))[0] - 5.5, "exact"),
-    "two balls": (np.minimum(torus(), box()), "exact"),
-    "cut off far away": (np.clip(box(), -3.5, 4), "exact"),
-    "cut off at 1": (np.clip(box(), -1, 1), "truncated"),
-    "cut off unevenly": (np.clip(box(), -1, 2.5), "truncated"),
-    "cut off at 0.5": (np.clip(box(), -0.5, 0.5), "truncated"),
-    "cut off at 1, in units of that": (np.clip(box() / 2.5, -1, 1), "truncated"),
+    "a plane half-way between samples": (np.indices((12, 12, 12))[0] - 5.5, "distance"),
+    "two balls": (np.minimum(torus(), box()), "distance"),
+    "a wall": (thin_frame(), "distance"),
+    "cut off far away": (np.clip(box(), -3.5, 4), "distance"),
+    "cut off at 1": (np.clip(box(), -1, 1), "distance"),
+    "cut off unevenly": (np.clip(box(), -1, 2.5), "distance"),
+    "cut off at 0.5": (np.clip(box(), -0.5, 0.5), "distance"),
+    "rounded to tenths": (np.rint(10 * box()) / 10, "distance"),
     "noise": (noisy(box()), "noisy"),
-    "little noise": (noisy(box(), 0.02), "exact"),
-    "an ellipsoid's polynomial": (ellipsoid() * 32 / 14, "scaled"),
-    "a smooth union": (smooth_union(), "scaled"),
-    "half as steep": (torus(48) / 2, "exact"),
-    "steeper from place to place": (box() * WAVES, "scaled"),
-    "thin, and steeper from place to place": (thin_frame() * WAVES, "scaled"),
+    "little noise": (noisy(box(), 0.05), "noisy"),
+    "an ellipsoid's polynomial": (ellipsoid() * 32 / 14, "smooth"),
+    "a smooth union": (smooth_union(), "smooth"),
+    "tanh": (2 * np.tanh(box() / 2), "smooth"),
+    "steeper from place to place": (box() * WAVES, "smooth"),
+    "thin, and steeper from place to place": (thin_frame() * WAVES, "smooth"),
+    "touching cubes": (np.minimum(cube(0.2), cube(-0.2)), "smooth"),
+    "touching cubes, aside": (np.minimum(cube(0.21), cube(-0.19)), "smooth"),
     "truth": (MASK, "mask"),
     "bytes": (MASK.astype(np.uint8), "mask"),
     "255": (MASK * np.float32(255), "mask"),
@@ -95,25 +107,31 @@ def test_the_samples_show_what_they_are(name):
     inside = "negative" if "plane" in name else "auto"
     grid = make_grid(values, **PLACE, inside=inside)
     assert grid.field.kind == kind and not grid.field.given
-    assert (kind == "exact") == (not any("values taken as" in note for note in grid.notes))
+    assert (kind == "distance") == (not any("values taken as" in note for note in grid.notes))
 
 
 def test_exact_distances_are_passed_on_as_they_are():
     values = torus().astype(np.float32)
     grid = make_grid(values, **PLACE)
     assert grid.samples is values and grid.notes == ()
-    assert grid.field.report()["slope"] == pytest.approx(1, abs=0.01)
-    assert grid.field.exact == (-np.inf, np.inf)
+    assert grid.field.report()["unit"] == pytest.approx(1, abs=0.01)
+    assert grid.field.exact == (-np.inf, np.inf) and grid.field.network == "distance"
 
 
-@pytest.mark.parametrize("unit", [0.01, 0.91, 1.04])
-def test_distances_in_another_unit_are_exact_in_that_of_the_spacing(unit):
-    values = (unit * box()).astype(np.float32)
-    grid = make_grid(values, **PLACE)
-    assert np.allclose(grid.values, box(), rtol=3e-3, atol=1e-6)
-    assert grid.notes[-1].startswith("the values are distances in another unit: multiplied by ")
-    told = make_grid(values, **PLACE, scale=1 / unit)
-    assert told.notes == () and np.allclose(told.values, box(), atol=1e-5)
+@pytest.mark.parametrize("unit", [0.01, 0.87, 1.04, 1e-200])
+def test_another_unit_than_that_of_the_spacing_is_an_error(unit):
+    values = unit * box()
+    said = refusal(GridError, make_grid, values, **PLACE)
+    scale = float(re.search(r"scale=(\S+) \(or", said).group(1))
+    assert scale * unit == pytest.approx(1, rel=0.005)
+    told = make_grid(values, **PLACE, scale=scale)
+    assert told.notes == () and np.allclose(told.values, box(), rtol=5e-3)
+    shown = float(re.search(r"spacing=(\S+),", said).group(1))
+    assert shown == pytest.approx(unit, rel=0.005)
+    if unit < 0.1:
+        return
+    assert make_grid(values, spacing=shown, origin=0).field.kind == "distance"
+    assert make_grid(values, **PLACE, field="distance").spacing == (1, 1, 1)
 
 
 @pytest.mark.parametrize("field", FIELDS[1:])
@@ -121,6 +139,12 @@ def test_the_user_may_overrule_the_evidence(field):
     grid = make_grid(torus(), **PLACE, field=field)
     assert (grid.field.kind, grid.field.given) == (field, True)
     assert reconstruct(grid, trilinear).is_closed()
+
+
+@pytest.mark.parametrize(("old", "new"), [("exact", "distance"), ("scaled", "smooth")])
+def test_another_word_for_a_kind_is_answered_by_its_name(old, new):
+    said = refusal(OptionError, make_grid, torus(), field=old)
+    assert said == f"field is '{old}': give {new}"
 
 
 def test_all_forms_of_a_mask_give_the_same_mesh():
@@ -132,15 +156,45 @@ def test_all_forms_of_a_mask_give_the_same_mesh():
         np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
 
 
+def test_of_0_and_another_value_the_other_is_inside_even_if_it_fills_the_border():
+    rock = ~MASK * np.uint8(1)
+    np.testing.assert_array_equal(make_grid(rock, **PLACE).values < 0, ~MASK)
+
+
+def lesions() -> np.ndarray:
+    """Return three small labels in a large image."""
+    image = np.zeros((48, 48, 48), np.uint8)
+    for label, middle in ((1, (20, 12, 22)), (2, (40, 38, 33)), (3, (30, 41, 21))):
+        off = np.indices(image.shape) - np.reshape(middle, (3, 1, 1, 1))
+        image[np.linalg.norm(off, axis=0) < 1.9] = label
+    return image
+
+
+def stack() -> np.ndarray:
+    """Return two labels in three slices."""
+    image = np.zeros((40, 36, 3), np.int16)
+    image[10:30, 10:20], image[32:38, 20:30] = 1, 2
+    return image
+
+
+ORGANS = MASK * 2 + (box() < 0)
+LABELS = {
+    "bytes": ORGANS.astype(np.uint8),
+    "long": ORGANS.astype(np.int64),
+    "nearly whole": ORGANS * 0.9999999998,
+    "resampled": ORGANS * 0.988,
+    "with gaps": np.array([0, 7, 100, 117])[ORGANS],
+    "small": lesions(),
+    "of few slices": stack(),
+}
+
+
 @pytest.mark.parametrize("spacing", [(1, 1, 1), (0.5, 1, 1)])
-@pytest.mark.parametrize("dtype", [np.uint8, np.int64])
-def test_labels_without_a_choice_are_refused(dtype, spacing):
-    labels = (MASK * 2 + (box() < 0)).astype(dtype)
-    for field in ("auto", "exact", "scaled"):
-        place = {"spacing": spacing, "origin": 0, "field": field}
-        assert refusal(GridError, make_grid, labels, **place) == (
-            "no solid is chosen: they look like labels (0, 1, 2, 3): choose one with label=1"
-        )
+@pytest.mark.parametrize("name", LABELS)
+def test_labels_without_a_choice_are_refused(name, spacing):
+    said = refusal(GridError, make_grid, LABELS[name], spacing=spacing, origin=0)
+    assert said.startswith("no solid is chosen: they look like labels (0, ")
+    assert re.search(r"choose one with label=\d+, or mesh all with labels='all'$", said)
 
 
 LARGEST = 2**64 - 1
@@ -188,24 +242,56 @@ def test_densities_have_their_surface_at_a_level():
     np.testing.assert_allclose(below.values, torus(48), atol=1e-4)
 
 
-def test_densities_without_a_ramp_are_a_mask():
-    steep = MASK * 1000.0 + np.random.default_rng(0).uniform(0, 30, MASK.shape)
-    for densities in (steep, np.where(MASK, 900, 100)):
-        grid = make_grid(densities, **PLACE, level=500)
-        assert grid.field.kind == "mask"
-        np.testing.assert_array_equal(grid.values, make_grid(MASK, **PLACE).values)
-
-
-def test_densities_with_a_ramp_have_the_surface_of_their_spline():
+def test_densities_have_the_surface_of_their_spline():
     blurred = ndimage.gaussian_filter(MASK.astype(np.float32), 1.5) * 1000
-    grid = make_grid(blurred, level=500)
-    assert grid.field.kind == "scaled"
-    assert grid.notes[1].startswith("spacing not given: taken as 1, since densities show none")
+    for densities in (blurred, np.minimum(blurred, 255).astype(np.uint8)):
+        grid = make_grid(densities, level=125)
+        assert (grid.field.kind, grid.field.network) == ("density", None)
+        assert grid.notes[1:] == (
+            "spacing not given: taken as 1, since densities show none (give --spacing)",
+            "origin not given: sample (0, 0, 0) is at 0, 0, 0",
+        )
+    two = make_grid(np.where(MASK, 900, 100), **PLACE, level=500)
+    np.testing.assert_array_equal(two.values, make_grid(MASK, **PLACE).values)
+
+
+def test_shares_of_voxels_are_no_steps():
+    """Of a block with faces .4 voxels from the samples, each share beside a face is .9 or 0."""
+    share = np.clip(15.6 - np.arange(24) + 0.5, 0, 1) - np.clip(6.4 - np.arange(24) + 0.5, 0, 1)
+    values = share[:, None, None] * share[:, None] * share
+    mesh = reconstruct(make_grid(values, **PLACE, level=0.5), trilinear)
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(9.2, abs=0.08)
+
+
+def noise_map() -> np.ndarray:
+    """Return a density of both signs: three blobs in noise."""
+    ijk = np.moveaxis(np.indices((36,) * 3), 0, -1)
+    blobs = (((16, 18, 18), 4), ((22, 21, 16), 3), ((15, 13, 22), 3))
+    total = sum(np.exp(-((ijk - at) ** 2).sum(-1) / (2 * s * s)) for at, s in blobs)
+    noise = ndimage.gaussian_filter(np.random.default_rng(0).normal(size=total.shape), 1.2)
+    return (total + 0.06 * noise / noise.std() - 0.02).astype(np.float32)
+
+
+def overshoot() -> np.ndarray:
+    """Return an image with some values below 0."""
+    head = ndimage.zoom(2000.0 * (np.linalg.norm(np.indices((17,) * 3) - 8, axis=0) < 6), 2)
+    return (head + np.random.default_rng(1).normal(size=head.shape) * 20).astype(np.int16)
+
+
+@pytest.mark.parametrize(
+    ("values", "low", "high"),
+    [(noise_map(), 0.2, 0.9), (overshoot(), 500, 1600), (255 * noise_map().clip(0, 1), 50, 230)],
+)
+def test_densities_are_refused_with_a_level_between_both(values, low, high):
+    said = refusal(GridError, make_grid, values, spacing=1.5)
+    level = float(re.search(r"level=(\S+), inside='positive'", said).group(1))
+    assert low < level < high and not (values == level).any()
+    assert make_grid(values, spacing=1.5, level=level).field.network is None
 
 
 BAD = {
     "inside is 'out': give one of auto, negative, positive": {"inside": "out"},
-    "field is 'wrong': give one of auto, exact, truncated, mask, scaled, noisy": {"field": "wrong"},
+    "field is 'wrong': give one of auto, distance, noisy, mask, smooth": {"field": "wrong"},
     "label is 'a': give a whole number, -2^63 to 2^64 - 1": {"label": "a"},
     "label is 1.5: give a whole number, -2^63 to 2^64 - 1": {"label": 1.5},
     "label is True: give a whole number, -2^63 to 2^64 - 1": {"label": True},
@@ -213,7 +299,7 @@ BAD = {
     f"label={2**53 + 1} and level=2.5: give only one of them": {"label": 2**53 + 1, "level": 2.5},
     "level is nan: give a finite number": {"level": float("nan")},
     "scale is -1: give a number greater than 0": {"scale": -1},
-    "label=1 and field='exact': the samples of a label are a mask": {"label": 1, "field": "exact"},
+    "label=1 and field='noisy': the samples of a label are a mask": {"label": 1, "field": "noisy"},
 }
 
 
@@ -245,7 +331,7 @@ def opposite(patches, table, voxels, offsets):
 
 
 def test_a_smooth_field_of_another_slope_is_that_of_its_spline():
-    mesh = reconstruct(make_grid(ellipsoid(), **PLACE, field="scaled"), opposite)
+    mesh = reconstruct(make_grid(ellipsoid(), **PLACE, field="smooth"), opposite)
     x, y, z = (mesh.vertices.T + 0.5) / 32 - 0.5
     value = (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.15) ** 2 - 1
     assert np.abs(value).max() < 0.02  # a twentieth of a change from sample to sample
@@ -258,12 +344,7 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         np.testing.assert_array_equal(grid.values < 0, depth < 0)
     grid = make_grid(depth, **PLACE, field="mask", inside="negative")
     np.testing.assert_array_equal(grid.values < 0, depth < 0)
-    for values, side, level in (
-        (depth - 1, "below", "-2.39, inside='negative'"),
-        (1 - depth, "above", "2.39, inside='positive'"),
-    ):
-        assert refusal(GridError, make_grid, values, **PLACE, field="mask") == (
-            f"every value is {side} 0 (they go from {values.min():.6g} to {values.max():.6g}), so "
-            "their signs make no mask: they look like densities: give the level of their surface, "
-            f"such as level={level}"
-        )
+    for values, side in ((depth - 1, "below"), (1 - depth, "above")):
+        said = refusal(GridError, make_grid, values, **PLACE, field="mask")
+        ends = f"{values.min():.6g} to {values.max():.6g}"
+        assert said.startswith(f"every value is {side} 0 (they go from {ends}), so their signs")

@@ -17,6 +17,7 @@ from super_sdf.errors import GridError, OptionError, OptionTypeError
 ROOT = Path(__file__).parent.parent
 SIZES = 20, 22, 24
 RADIUS = 4.2
+UNIT = "they are distances in another unit than the spacing: multiply the values, scale=0.4 (or "
 TURNED = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 DIRECTIONS = {
     "straight": np.eye(3),
@@ -101,7 +102,7 @@ def test_other_mistakes_are_one_line():
     ):
         assert refusal(kind, call).startswith(said)
     image.spacing = (0.2, 0.2, 0.2)
-    assert refusal(GridError, contour).endswith("multiply the values, scale=0.40123")
+    assert refusal(GridError, contour).startswith(UNIT)
 
 
 def test_pyvista_finds_the_accessor_and_super_sdf_does_not_load_pyvista(tmp_path):

@@ -326,10 +326,10 @@ def test_a_volume_that_stays_off_is_noted(tmp_path, command):
 
 def test_what_has_no_volume_to_keep_is_refused(tmp_path, command):
     exact = 6 - np.linalg.norm(np.indices((18, 18, 18)) - 8.6, axis=0)
-    np.save(tmp_path / "exact.npy", -exact)
+    np.save(tmp_path / "distance.npy", -exact)
     np.save(tmp_path / "mask.npy", MASK)
     for name, option, message in (
-        ("exact", (), " is for masks and labels, the values are exact: leave it out"),
+        ("distance", (), " is for masks and labels, the values are distance: leave it out"),
         ("mask", ("--offset", "0.1"), " is for the surface of the samples, --offset is 0.1: "),
         ("mask", ("--open",), " needs a closed mesh: leave out --open"),
     ):  # fmt: skip

@@ -64,7 +64,7 @@ def test_edges_of_a_box_are_kept_and_most_corners():
     assert np.mean(apart) < 0.02
 
 
-@pytest.mark.parametrize("kind", ["mask", "noisy", "truncated"])
+@pytest.mark.parametrize("kind", ["mask", "noisy", "distance"])
 def test_by_itself_it_is_sharp_where_samples_are_exact(kind):
     values = turned_box().values
     values = values < 0 if kind == "mask" else np.clip(values, -3, 3)
@@ -73,8 +73,8 @@ def test_by_itself_it_is_sharp_where_samples_are_exact(kind):
     plain, sharp, auto = (
         reconstruct(grid, network, 2, mesher=name) for name in ("marching", "sharp", "auto")
     )
-    assert len(auto.vertices) == len((sharp if kind == "truncated" else plain).vertices)
-    assert (len(sharp.vertices) > len(plain.vertices)) == (kind == "truncated")
+    assert len(auto.vertices) == len((sharp if kind == "distance" else plain).vertices)
+    assert (len(sharp.vertices) > len(plain.vertices)) == (kind == "distance")
 
 
 def test_the_command_takes_a_mesher_and_says_which(folder, command):

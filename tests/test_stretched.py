@@ -60,7 +60,7 @@ KINDS = {
                         {"level": 450}, 0.6),
     "ramp": (100 / (1 + np.exp(two_parts() / 1.5)), {"level": 50}, 0.12),
     "shares of voxels": (np.clip(0.5 - two_parts() / 1.5, 0, 1), {"level": 0.5}, 0.3),
-    "scaled": (two_parts() * (two_parts() + 60) * 7, {"field": "scaled"}, 0.12),
+    "scaled": (two_parts() * (two_parts() + 60) * 7, {"field": "smooth"}, 0.12),
     "truncated at .5": (np.clip(two_parts(), -1.25, 1.25), {}, 0.3),
     "truncated at 1": (np.clip(two_parts(), -2.5, 2.5), {}, 0.2),
     "truncated at 1, unknown beyond": (
@@ -70,8 +70,8 @@ KINDS = {
     ),
     "truncated at 2": (np.clip(two_parts(), -5, 5), {}, 0.08),
 }  # fmt: skip
-TAKEN = {"label": "mask", "transform": "mask", "steep densities": "mask", "ramp": "scaled"}
-TAKEN["shares of voxels"] = "truncated"
+TAKEN = {"label": "mask", "transform": "mask", "scaled": "smooth", "truncated": "distance"}
+TAKEN |= dict.fromkeys(("steep densities", "ramp", "shares of voxels"), "density")
 TURN = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # also mirrored
 
 
@@ -82,7 +82,7 @@ def test_the_mesh_is_at_its_place_with_any_kind(name, direction):
     values, options, limit = KINDS[name]
     place = {"spacing": SPACING, "origin": ORIGIN, "direction": direction}
     grid = make_grid(values, **place, inside="auto", **options)
-    assert grid.field.kind == TAKEN.get(name, name.split(" at")[0])
+    assert grid.field.kind == TAKEN.get(name.split(" at")[0], name)
     mesh = reconstruct(grid, trilinear)
     found = np.abs(off(mesh, direction))
     assert mesh.is_closed() and found.mean() < limit and found.max() < 5 * limit
@@ -103,9 +103,9 @@ def test_an_offset_needs_distances_in_the_world(name):
     values, options, _ = KINDS[name]
     grid = make_grid(values, spacing=SPACING, **options)
     assert refusal(GridError, reconstruct, grid, trilinear, offset=0.5) == (
-        f"offset 0.5: the values are taken as {name}, and with the spacing 1, 1, 2.5 they are no "
-        "distances by which an offset surface could be found; mesh the solid itself (offset=0), "
-        "sample the mesh (super-sdf sample), and mesh that grid with the offset"
+        f"offset 0.5: the values are taken as {grid.field.kind}, and with the spacing 1, 1, 2.5 "
+        "they are no distances by which an offset surface could be found; mesh the solid itself "
+        "(offset=0), sample the mesh (super-sdf sample), and mesh that grid with the offset"
     )
 
 
@@ -116,9 +116,6 @@ def test_a_truncated_box_along_the_axes_keeps_its_unit(cut):
     away = at - np.array([15, 12, 11.3])[:, None, None, None]
     values = np.sqrt((np.maximum(away, 0) ** 2).sum(0)) + np.minimum(away.max(0), 0)
     grid = make_grid(np.clip(values, -cut * 2.5, cut * 2.5), spacing=SPACING, origin=0)
-    assert grid.notes[-1] == (
-        f"values taken as truncated (--field truncated): cut off {cut:.3g} voxels from the surface"
-    )
-    assert not any("slope" in note for note in grid.notes)
+    assert grid.field.kind == "distance"
     mesh = reconstruct(grid, trilinear)
     assert mesh.is_closed() and mesh.volume() == pytest.approx(30 * 24 * 22.6, rel=0.03)

@@ -8,9 +8,10 @@ import trimesh
 from conftest import ball, refusal
 
 from super_sdf.errors import GridError
-from super_sdf.grid.interpret import BEYOND, FAR
 from super_sdf.grid.sdf_grid import make_grid
 
+BEYOND = "no surface lies in it"
+FAR = "every wall is nearer to some sample than that, so there is no surface"
 N = 32
 X, Y, Z = np.indices((N, N, N)) - 15.5
 R = np.sqrt(X**2 + Y**2 + Z**2)

@@ -88,7 +88,7 @@ def mask():
 
 
 def smooth():
-    return make_grid(np.tanh(balls().values / 3), spacing=1.0, origin=0.0, field="scaled")
+    return make_grid(np.tanh(balls().values / 3), spacing=1.0, origin=0.0, field="smooth")
 
 
 def stretched():

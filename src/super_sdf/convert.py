@@ -182,11 +182,8 @@ def find_warnings(
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if grid.field.kind in (
-        "mask",
-        "scaled",
-    ):  # only distances can be noisy, or contradict each other
-        return warnings
+    if grid.field.sides_only or grid.field.network is None:
+        return warnings  # only distances can be noisy, or contradict each other
     if counts["noisy_voxels"]:
         share = 100 * counts["noisy_voxels"] / counts["band_voxels"]
         percent = f"{share:.2g}" if share < 9.95 else f"{share:.0f}"

@@ -19,7 +19,7 @@ from typing import Any, Final, Literal, NamedTuple, TypedDict, get_args
 
 from .errors import OptionError, OptionTypeError, flag, seen
 
-FieldKind = Literal["auto", "exact", "truncated", "mask", "scaled", "noisy"]
+FieldKind = Literal["auto", "distance", "noisy", "mask", "smooth"]
 Inside = Literal["auto", "negative", "positive"]
 AxisOrder = Literal["xyz", "zyx"]
 Space = Literal["RAS", "LPS"]
@@ -31,11 +31,10 @@ Precision = Literal["auto", "float32", "int8"]
 
 ALL: Final = "all"
 AUTO: Final = "auto"
-EXACT: Final = "exact"
-TRUNCATED: Final = "truncated"
-MASK: Final = "mask"
-SCALED: Final = "scaled"
+DISTANCE: Final = "distance"
 NOISY: Final = "noisy"
+MASK: Final = "mask"
+SMOOTH: Final = "smooth"
 RAS: Final = "RAS"  # right, anterior, superior
 LPS: Final = "LPS"  # left, posterior, superior
 MARCHING: Final = "marching"
@@ -44,6 +43,7 @@ FLOAT32: Final = "float32"
 INT8: Final = "int8"
 DEFAULT_QUALITY: Final = "base"
 FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
+OTHER_FIELDS = {"exact": DISTANCE, "truncated": DISTANCE, "scaled": SMOOTH}  # and their names
 MESHERS: tuple[MesherName, ...] = get_args(MesherName)
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
@@ -118,14 +118,16 @@ def numbers(counts: tuple[int, ...], give: str) -> Kind:
     return Kind(check, parse)
 
 
-def one_of(names: Iterable[str]) -> Kind:
-    """Return the kind of some names."""
+def one_of(names: Iterable[str], others: Mapping[str, str] | None = None) -> Kind:
+    """Return the kind of some names; messages name those for ``others``."""
     choices = tuple(names)
 
     def check(value: Any, name: str) -> str:
         if isinstance(value, str) and value in choices:
             return value
         wrong = OptionError if isinstance(value, str) else OptionTypeError
+        if isinstance(value, str) and value in (others or {}):
+            raise wrong(f"{name} is {seen(value)}: give {(others or {})[value]}")
         raise wrong(f"{name} is {seen(value)}: give one of {', '.join(choices)}")
 
     return Kind(check, choices=choices)
@@ -229,6 +231,7 @@ class Values(TypedDict, total=False):
     label: int | None
     level: float | None
     scale: float | None
+    unknown: float | None
 
 
 @dataclass(frozen=True)
@@ -259,9 +262,9 @@ class Options:
         "Anatomical space of the mesh, for files that state theirs. Default: that of the file.")
     inside: Inside = _option(AUTO, VALUES, "read list", one_of(get_args(Inside)),
         "Sign of the values inside the solid; auto takes the border of the grid as outside.")
-    field: FieldKind = _option(AUTO, VALUES, "read list", one_of(FIELDS),
-        "What the values are: distances (exact, truncated, noisy), a mask or its distance "
-        "transform, or a scaled field (of another slope than 1); auto goes by the samples.")
+    field: FieldKind = _option(AUTO, VALUES, "read list", one_of(FIELDS, OTHER_FIELDS),
+        "What the values are: distances, distances with noise, a mask or its transform, or a "
+        "smooth field, which has the surface of its own cubic spline; auto goes by the samples.")
     label: int | None = _option(None, VALUES, "read list", Kind(check_label, _parse_label),
         "Mesh the samples with the value N of a label image.", metavar="N")
     labels: str | tuple[int | str, ...] | None = _option(None, VALUES, "list labels",
@@ -274,6 +277,8 @@ class Options:
     scale: float | None = _option(None, VALUES, "read list", number(ABOVE_0, ABOVE_0, above=0),
         "World units per unit of the values, if they have another unit than the spacing.",
         metavar="S")
+    unknown: float | None = _option(None, VALUES, "read list", number(),
+        "Samples with the value V are unknown, as those that are NaN.", metavar="V")
     offset: float = _option(0.0, MESH, "list",
         number("a number, in world units", "a finite number, in world units"),
         "Mesh the offset surface at distance D, in world units; a positive D grows the solid.",

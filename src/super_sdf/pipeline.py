@@ -55,10 +55,10 @@ def refine_band(
     table = neighbour_table(band.voxel_ijk, grid.shape)
     voxels = np.flatnonzero(band.decoded).astype(np.int32)
     own_ijk = band.voxel_ijk[voxels]
-    if grid.field.smooth is None:
+    if grid.field.network is not None:
         blocks = predict(band, table, voxels, network, factor, threads, steps.within("network"))
     else:
-        blocks = interpolate(band, table, voxels, network, factor, threads)
+        blocks = interpolate(band, voxels, factor)
     steps.finish("network")
 
     row_of = np.full(len(table) + 1, -1, np.int32)  # of each voxel of the band, if it is decoded
@@ -69,7 +69,7 @@ def refine_band(
     index = nodes.VoxelIndex(own_ijk, grid.shape)
     fit_to_spheres(blocks, parts, factor, spheres_of_band(band, threads), index, threads)
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
-    if grid.field.kind == options.MASK:
+    if grid.field.sides_only:
         nodes.hold_sides(blocks, factor, patches, voxels)
     pinned = nodes.pin_to_skipped(
         blocks[:, :-1], parts, factor, own_ijk, patches, voxels, grid.shape
@@ -144,7 +144,7 @@ def upsample(
     asked = Options(factor, offset=offset)  # checks them
     factor, offset = asked.factor, asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
-    lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
+    lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     threads = useful_threads(chosen.threads)
     band = survey(lattice, offset, threads=threads)  # Eqs. 2 and 4
@@ -333,7 +333,7 @@ def mesh_grid(
     options.check_called(network, progress)
     check_can_close(grid, cap=chosen.cap)
     steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
-    lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.kind))
+    lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)

@@ -128,7 +128,7 @@ def margin_of(grid: SdfGrid, receptive_field: int | None, mesher: MesherName, fa
             "that does not fit: allow more memory (--max-memory), or use another network"
         )
     seen = max(receptive_field, bounds.REACH_OF_SAMPLES)
-    if grid.field.smooth is not None:
+    if grid.field.network is None:
         seen = max(seen, prediction.BEYOND)
     fitted = spheres.REACH_IN_VOXELS + bounds.REACH_IN_VOXELS
     return seen + fitted + reach_in_voxels(mesher, factor) + 1

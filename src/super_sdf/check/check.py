@@ -24,7 +24,7 @@ from ..files.grids import read_grid
 from ..files.mesh_writers import write_coloured_ply
 from ..files.output import check_free
 from ..grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
-from ..options import LENGTHS, MASK, Options
+from ..options import LENGTHS, Options
 from ..refine.band import plane_blocks, rescale
 from ..refine.nodes import VoxelIndex
 from ..refine.survey import Band, no_surface, survey
@@ -288,7 +288,7 @@ def check_mesh(
     surface = examine_surface(mesh, self_intersections(mesh) if intersections else None)
     found = touch(mesh, band, lattice, surface)
     give_back()
-    is_mask, strays = lattice.field.kind == MASK, None
+    is_mask, strays = lattice.field.sides_only, None
     if is_mask or found.has_evidence:
         strays = find_strays(mesh.vertices, lattice, offset, OFF_OF_MASKS * is_mask)
     volume = volume_of_samples(grid, offset) if is_mask else None

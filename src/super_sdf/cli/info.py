@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from .. import __version__, errors
-from ..options import FLOAT32, MASK, MESHERS, Device
+from ..options import DISTANCE, FLOAT32, MASK, MESHERS, Device
 from . import main
 from .main import SHARED, option, table_option
 
@@ -150,7 +150,7 @@ def check_network(name: str, device: Device) -> tuple[str, str, str]:
     values: Any = np.linalg.norm(np.indices((SAMPLES,) * 3) - CENTRE, axis=0) - RADIUS
     is_mask, what = name.startswith(MASK), f"network {name} on {device}"
     values, most = (values < 0, MOST_OFF_OF_MASK) if is_mask else (values, MOST_OFF)
-    grid = make_grid(values, spacing=1.0, origin=0.0, field=MASK if is_mask else "exact")
+    grid = make_grid(values, spacing=1.0, origin=0.0, field=MASK if is_mask else DISTANCE)
     try:
         network = load_network(name, device=device, precision=FLOAT32)  # its own file
         found = reconstruct(grid, network, mesher="marching").vertices

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray
 from ..errors import FileError, OptionError, OptionTypeError, SuperSdfError, seen
-from ..grid.field import Field
+from ..grid.interpret import Field
 from ..grid.samples import SamplePlanes, in_blocks
 from ..grid.sdf_grid import SdfGrid
 from ..options import OPTIONS, check_path
@@ -286,7 +286,7 @@ def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
         *(arrays["spacing"], arrays["origin"]),
         direction=arrays["direction"],
         extremes=(-math.inf, math.inf),
-        field=Field(on_lattice=True),  # it is on the lattice of the field already
+        field=Field(own_lattice=True),  # it is on the lattice of the field already
     )
     for key in ("voxels", "sample_voxels", "border_inside"):
         number = arrays[key].astype(np.int64) @ (shape[1] * shape[2], shape[2], 1)

@@ -69,7 +69,9 @@ def put_on_zero(
     margin = REACH / factor  # from the border of the grid, in spacings
     free: BoolArray = np.all((index > margin - 0.5) & (index < last - margin), axis=1)
     with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
-        points = put_on_surface(value, start, mesh.faces, free, exact=grid.field.kind == "exact")
+        points = put_on_surface(
+            value, start, mesh.faces, free, exact=grid.field.exact == (-np.inf, np.inf)
+        )
         points = put_on_edges(value, points, mesh.faces, free)
     points = without_folds(points, start, mesh.faces, rounded)
     return Mesh((middle + fine * points).astype(kind), mesh.faces)

@@ -1,4 +1,4 @@
-"""Samples made of others (masks, truncated, scaled and resampled fields), and of functions.
+"""Samples made of others (masks, truncated and resampled distances), and of functions.
 
 A mask only says which samples are inside. Its surface passes half-way between a sample inside and
 one outside, for want of better knowledge. So the distance of a sample is that to the nearest sample
@@ -7,8 +7,7 @@ of the other side, less half a voxel: the Euclidean distance transform of both s
 
 Of a truncated field, a sample x with distance d and gradient n touches the surface at the foot
 point x - d n. The distance of a sample that was cut off is that to the nearest foot point of the
-others, and no less than where it was cut off. A scaled field over its local slope is a distance to
-first order.
+others, and no less than where it was cut off.
 
 Between two samples of an axis that is resampled the values are those of a cubic polynomial
 (Hermite), which obeys the two laws of distances. The gradient has length 1, so the differences
@@ -33,7 +32,7 @@ from numpy.typing import NDArray
 
 from ..arrays import CORNERS, BoolArray, FloatArray, IntArray, Triple
 from ..threads import chunks_of
-from .census import Extremes, Floats, Ints
+from .look import Extremes, Floats
 from .samples import DerivedPlanes, SampleArray, SamplePlanes, in_spacings
 
 REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
@@ -43,20 +42,9 @@ FAR = 2.6  # voxels: the distance of a sample without a foot point near it
 LEAST_SLOPE = 0.3  # of a sample whose foot point is used
 DISC = np.float32(0.2)  # voxels
 ROUNDS = 2
-RINGS = 2  # of samples amid a plateau that are raised, so that they lie beyond the band
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
 CHUNK = 1 << 14  # samples that are worked on at a time, so that they stay in the cache
 CUBES: Triple = (1.0, 1.0, 1.0)  # steps: spacings over the finest; the longest is a voxel
-
-AROUND = 2  # samples to either side over which local slopes are averaged
-TYPICAL_ERROR = 0.1  # of a slope, relative: half the weight
-LEAST_WEIGHT = 1e-3
-FLAT, STEEP = 0.25, 4.0  # local slopes over the typical one
-NEARLY = 0.2  # from 1: slopes nearer to it count as 1, since dividing by them overshoots
-
-STRIDE = 8  # spacings along the largest cells of a function; a power of two
-AT_ONCE = 1 << 18  # samples
-STEEPER = 1.25  # than seen between samples may the function be
 
 NEAR = 3.5  # new spacings from the surface, up to which values are kept within their bounds
 ACROSS = 4  # samples across the line, from which on they do not bound a value
@@ -67,9 +55,14 @@ EXTRA = 2  # samples beyond a cell, on either side, that its slopes depend on
 ON_SAMPLE = 1e-3  # spacings from a sample, up to which a new sample takes its value
 MOST = 1e12  # spacings: larger values are cut off, so that squares do not overflow
 
+STRIDE = 8  # spacings along the largest cells of a function; a power of two
+AT_ONCE = 1 << 18  # samples
+STEEPER = 1.25  # than seen between samples may the function be
+
+Ints: TypeAlias = NDArray[np.int64]
+Places: TypeAlias = tuple[NDArray[np.intp], ...]
 At: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
 Cells: TypeAlias = NDArray[np.int32]  # (n, 3) the lowest sample of each
-Places: TypeAlias = tuple[NDArray[np.intp], ...]
 
 
 def mask_distances(inside: BoolArray) -> FloatArray:
@@ -126,29 +119,6 @@ def _times(values: FloatArray, h: float) -> Floats:
 
 def _reach(steps: Triple) -> list[int]:
     return [int(FEET_REACH * max(steps) / step) for step in steps]
-
-
-def without_plateaus(values: SampleArray, limits: Extremes, h: float) -> DerivedPlanes:
-    """Return truncated distances, raised by h where all samples round one were cut off alike.
-
-    Those are too far from the surface to matter, however near it they were cut off.
-    """
-
-    def make(planes: NDArray[Any]) -> Floats:
-        raised = planes.astype(np.float64)
-        for limit in limits:
-            amid = planes == limit
-            for _ in range(RINGS):
-                for axis in range(3):
-                    lines = np.moveaxis(amid, axis, 0)
-                    all_along = lines.copy()
-                    all_along[1:] &= lines[:-1]
-                    all_along[:-1] &= lines[1:]
-                    amid = np.moveaxis(all_along, 0, axis)
-                raised[amid] += np.sign(limit) * h
-        return raised
-
-    return DerivedPlanes(values, make, RINGS)
 
 
 def fill_in(values: FloatArray, low: float, high: float, steps: Triple = CUBES) -> FloatArray:
@@ -234,55 +204,6 @@ def _gradient(
         along = np.where(~no_ahead & ~no_back, (ahead + back) / 2, one)
         gradient[:, axis] = along / np.float32(step)
     return gradient
-
-
-def normalised_planes(values: SampleArray, h: float, change: float) -> DerivedPlanes:
-    """Return values over their local slope: distances on the lattice, of which a step is h."""
-
-    def make(planes: NDArray[Any]) -> Floats:
-        scaled = in_spacings(planes, change)
-        off = local_slopes(scaled) - 1
-        far: FloatArray = np.sign(off) * np.maximum(np.abs(off) - NEARLY, 0)
-        return _times(np.divide(scaled, 1 + far), h)
-
-    return DerivedPlanes(values, make, AROUND + 2)
-
-
-def local_slopes(values: FloatArray) -> FloatArray:
-    """Return the mean length of the gradient round each sample, (nx, ny, nz).
-
-    It is weighted by how well it is known: at a kink the central difference is too short.
-    ``values`` are in spacings of their typical slope, so that results are about 1.
-    """
-    if min(values.shape) < 3:
-        return np.ones_like(values)
-    padded = np.pad(values, 2, mode="reflect", reflect_type="odd")
-    square, bend = np.zeros_like(values), np.zeros_like(values)
-    for axis in range(3):
-        inner = padded[tuple(slice(None) if n == axis else slice(2, -2) for n in range(3))]
-        lines = np.moveaxis(inner, axis, 0)
-        a, b, c, d, e = (
-            np.moveaxis(lines[step : len(lines) - 4 + step], 0, axis) for step in range(5)
-        )
-        square += ((d - b) / 2) ** 2
-        bend += np.abs(e - 4 * d + 6 * c - 4 * b + a)
-    length = np.clip(np.sqrt(square), FLAT, STEEP)
-    weight = 1 / (1 + (bend / (TYPICAL_ERROR * length)) ** 2) + LEAST_WEIGHT
-    trust: FloatArray = np.asarray(weight, np.float32)
-    total: FloatArray = np.asarray(trust * length, np.float32)
-    return np.divide(_box_sum(total), _box_sum(trust))
-
-
-def _box_sum(values: FloatArray) -> FloatArray:
-    """Return the sum over the samples up to ``AROUND`` away along each axis."""
-    for axis in range(3):
-        lines = np.moveaxis(values, axis, 0)
-        total = lines.copy()
-        for step in range(1, AROUND + 1):
-            total[step:] += lines[:-step]
-            total[:-step] += lines[step:]
-        values = np.moveaxis(total, 0, axis)
-    return values
 
 
 class Resampled(SamplePlanes):

@@ -12,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
 from ..options import AUTO, FieldKind, Inside, Options
-from .census import Census, Extremes, not_finite
 from .derived import Resampled
-from .field import Field
-from .interpret import check_negative_inside, choose_spacing, interpret
+from .interpret import Field, interpret
+from .look import Extremes, Look, border_share, look_at, typical_slope
 from .samples import (
     EQUAL_SPACING,
     STRAIGHT,
@@ -34,6 +33,7 @@ from .samples import (
     placed,
 )
 
+MOST_RISE = 1.25  # spacings by which distances change from sample to sample; at most 1
 MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
 
@@ -103,15 +103,26 @@ class SdfGrid:
     ) -> None:
         given = placed(values, spacing, origin)
         samples = as_samples(given.values)
-        census = _checked(samples)
-        low, high = census.extremes
+        look = _checked(samples)
+        low, high = look.low, look.high
         if low == high:
             raise GridError(f"every value is {low:.6g}: a constant field has no surface")
-        if census.has_two_values:
+        if len(look.few) == 2:
             raise GridError(f"the only values are {low:.6g} and {high:.6g}: {MASK_HINT}")
-        check_negative_inside(census)
-        chosen, notes = choose_spacing(census, check_spacing(spacing))
-        place, extremes = (chosen, given.origin, tuple(notes)), census.extremes
+        below, steps = border_share(look, lambda x: x < 0), check_spacing(spacing)
+        if below > 0.5:
+            raise GridError(
+                f"{below:.0%} of the grid's border is negative, which is inside: make the grid "
+                "with make_grid(values, spacing=..., inside='positive'), or inside='negative' if "
+                "the solid does run out of the grid there"
+            )
+        rise, h = typical_slope(look, np.ones(3)), max(steps)
+        if rise > MOST_RISE * h:
+            raise GridError(
+                f"the values change by {rise:.6g} from sample to sample, but spacing is {h:.6g}: "
+                "give distances in the unit of the spacing, or make the grid with make_grid"
+            )
+        place, extremes = (steps, given.origin, ()), (low, high)
         grid = self.trusted(samples, *place, direction=direction, extremes=extremes)
         vars(self).update(vars(grid))
 
@@ -136,7 +147,10 @@ class SdfGrid:
         """
         given = placed(values, spacing, origin)
         samples = as_samples(given.values)
-        low, high = extremes or _checked(samples).extremes
+        if extremes is None:
+            look = _checked(samples)
+            extremes = look.low, look.high
+        low, high = extremes
         grid = object.__new__(cls)
         vars(grid).update(
             samples=samples,
@@ -239,6 +253,8 @@ def make_grid(
     label: int | None = None,
     level: float | None = None,
     scale: float | None = None,
+    unknown: float | None = None,
+    hint: str = "",
 ) -> SdfGrid:
     """Make a grid from an array of signed distances, or of other values with a surface.
 
@@ -261,9 +277,9 @@ def make_grid(
         The columns are the world directions of the array's axes; see ``SdfGrid``.
     inside : {"auto", "negative", "positive"}
         Sign of the values inside the solid; "auto" takes the border of the grid as outside.
-    field : {"auto", "exact", "truncated", "mask", "scaled", "noisy"}
-        What the values are; "auto" goes by what the samples show. A mask is known to half a voxel,
-        and scaled is a field of another slope than 1.
+    field : {"auto", "distance", "noisy", "mask", "smooth"}
+        What the values are; "auto" goes by what the samples show. Of a mask only the sides of the
+        samples are known; a smooth field has the surface of its cubic spline, without a network.
     label : int, optional
         The samples with this value are the solid; from -2^63 to 2^64 - 1.
     level : number, optional
@@ -271,6 +287,10 @@ def make_grid(
         inside, unless ``inside`` is "negative".
     scale : number, optional
         World units per unit of the values, if they have another unit than the spacing.
+    unknown : number, optional
+        Samples with this value are unknown, as those that are NaN.
+    hint : {"", "labels", "density", "distance"}
+        What a file says that the values are; "field", "label" and "level" win over it.
 
     Returns
     -------
@@ -285,18 +305,18 @@ def make_grid(
     OptionError
         If ``inside`` or ``field`` is not one of these, or another option is no number.
     """
-    wanted = Options(inside=inside, field=field, label=label, level=level, scale=scale)
+    told: dict[str, Any] = {"label": label, "level": level, "scale": scale, "unknown": unknown}
+    wanted = Options(inside=inside, field=field, **told)
     given = placed(values, spacing, origin)
-    taken, notes = interpret(as_samples(given.values), wanted, given.spacing)
-    origin = given.origin
+    taken, origin = interpret(as_samples(given.values), wanted, given.spacing, hint), given.origin
     if origin is None:
-        notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+        taken.notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
         origin = 0.0
     return SdfGrid.trusted(
         taken.samples,
         taken.spacing,
         origin,
-        tuple(notes),
+        tuple(taken.notes),
         direction=direction,
         positive_inside=taken.positive_inside,
         extremes=taken.extremes,
@@ -314,15 +334,20 @@ def check_grid(grid: Any) -> SdfGrid:
     return grid
 
 
-def _checked(samples: SampleArray) -> Census:
-    """Return what samples show; GridError unless they are finite numbers along three axes."""
+def _checked(samples: SampleArray) -> Look:
+    """Look at samples; GridError unless they are finite numbers along three axes."""
     check_kind(samples.dtype, samples.shape)
     if samples.dtype == np.bool_:
         raise GridError(f"values are true or false: {MASK_HINT}")
-    census = Census(samples)
-    if not census.is_finite:
-        raise not_finite(samples)
-    return census
+    look = look_at(samples)
+    if look.is_finite:
+        return look
+    bad = (np.argwhere(~np.isfinite(plane)) for plane in samples)
+    i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
+    raise GridError(
+        f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}: every sample must be finite; "
+        "replace unknown far samples by a large distance of the right sign"
+    )
 
 
 def with_fields(grid: SdfGrid, **fields: Any) -> SdfGrid:
@@ -337,17 +362,14 @@ def crop(grid: SdfGrid, low: Index, high: Index) -> SdfGrid:
 
     What the values are stays decided, and so do their extremes.
     """
-    field = grid.field
-    smooth, unseen = (
-        None if array is None else cropped(array, low, high)
-        for array in (field.smooth, field.unseen)
-    )
+    unseen = grid.field.unseen
+    unseen = None if unseen is None else cropped(unseen, low, high)
     known = grid.on_sample
     return with_fields(
         grid,
         samples=cropped(grid.samples, low, high),
         origin=as_triple(grid.to_world(low), "origin"),
-        field=replace(field, smooth=smooth, unseen=unseen),
+        field=replace(grid.field, unseen=unseen),
         on_sample=known and tuple(axis[a:b] for axis, a, b in zip(known, low, high)),
     )
 
@@ -383,7 +405,7 @@ def mean_spacing(grid: SdfGrid) -> float:
 
 
 def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
-    """Return a grid on the lattice that is refined: the same if it is cubic or ``on_lattice``.
+    """Return a grid on the lattice that is refined: itself if cubic or on its ``own_lattice``.
 
     A grid with the same spacing on all axes is refined as it is. Of others, the coarser axes are
     resampled to the finest spacing, the coarsest last: the finer the others are, the better they
@@ -393,7 +415,7 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     Other samples are made when they are read. Only values near the offset of the surface are as
     accurate as they can be. GridError if there is an offset, and the values are no distances.
     """
-    if grid.is_cubic or grid.field.on_lattice:
+    if grid.is_cubic or grid.field.own_lattice:
         if not offset or grid.is_cubic:
             return grid
         each = ", ".join(f"{h:g}" for h in grid.spacing)
@@ -406,7 +428,7 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     if grid.field.unseen is not None:
         raise GridError(
             "samples beside the surface are unknown, and the spacing differs between axes: mesh "
-            "the spline of the values (--field scaled)"
+            "the spline of the values (--field smooth)"
         )
     samples, h = grid.samples, grid.voxel_size
     steps, known = list(grid.spacing), [np.ones(count, bool) for count in grid.shape]

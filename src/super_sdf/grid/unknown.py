@@ -1,73 +1,81 @@
-"""Unknown samples far from the surface, NaN or infinite, as programs that fuse depth images leave.
+"""Unknown samples, NaN or infinite or a value that stands for them: their side, and distances.
 
-An infinite sample is on the side of its sign. One that is NaN is on the side of the known samples
-round the connected region of such samples that it lies in. All get the cut-off of their side: the
-largest known distance there. Where a region has both sides beside it, the surface ends.
-
-Many programs write 0, 1, -1000 or 1e10 instead. That is told by what no distance does: whole
-regions of samples have exactly this value, and beside them the values jump; or they are 0.
+An infinite sample is on the side of its sign. Others are on the side of the known samples round the
+connected region of unknown ones that they lie in. All get the cut-off of their side: the largest
+known distance there. A region with both sides beside it is filled in by what is round it if it is
+small; else the surface ends there.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..errors import GridError
-from .census import ENOUGH, Census, Extremes, Floats, Ints, Regions, as_float64, not_finite
-from .samples import DerivedPlanes, SampleArray
+from .look import Extremes, Look, border_share
+from .samples import DerivedPlanes, SampleArray, changed
+
+Ints: TypeAlias = NDArray[np.int64]
+IsMarked: TypeAlias = Callable[[NDArray[Any]], BoolArray]
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
+SMALL = 8  # samples of a region between both sides that is filled in
+MOST_KNOWN = 1e-3  # of all samples: more in small regions are a pattern, and stay unknown
 WAY_OUT = "replace each by a distance of the right sign (the cut-off value of its side)"
-FREQUENT, LEAST_VALUES = 8, 6  # values that are tried, and different ones that tell steepness
-# From sample to sample values change by at most ``JUMP`` times the steepest typical change, but
-# beside unseen ones: nearly all changes there are larger.
-STEEPEST, JUMP, UNSEEN = 0.95, 1.5, 0.9
-# Share of the changes of sign that are jumps from where values are cut off: .00 where all was seen,
-# .15 and more where the unseen has that value, too; also at the edges of what few views saw, but
-# there the unseen was filled in, and the sign changes as often from one extreme to the other.
-MIXED, FILLED_IN = 0.1, 0.03
-FEW_SPANS = 3.0  # times what few values span is more than they change by
-MANY = 4096  # samples among which different values are counted
-A_SIDE = 0.75  # share of the changes of sign beside one value from which it is one side
-LEAST_JUMPS = 6  # beside one value
-ALIKE = 0.4  # share of equal pairs among those with a value that fills regions; of lines: a third
 
 
-class Filled(NamedTuple):
-    """Samples whose unknown ones are replaced by the cut-off of their side, when they are read.
+class Known(NamedTuple):
+    """Samples whose unknown ones are replaced, when they are read, and their extremes.
 
-    Where both sides are near, they are ``continued`` linearly over ``LAYERS`` unknown ones, which
-    says nothing of the field; farther away they are outside, as in all of ``plain``. ``unseen`` is
-    which of them are unknown and have both sides, or none, beside their region; None if none.
+    Where both sides are near, they are continued linearly over ``LAYERS`` unknown ones; farther
+    away they are outside. ``unseen`` is which of them are unknown and in large regions with both
+    sides, or none, beside them; None if none are.
     """
 
-    continued: SampleArray
-    plain: SampleArray
+    samples: SampleArray
+    extremes: Extremes
+    unknown: int  # how many samples were
     unseen: SampleArray | None
     why_open: str
 
 
-def filled(census: Census, notes: list[str]) -> Filled:
-    """Return samples of which the unknown ones are replaced, and say so in the notes."""
-    samples, numbers, (low, high) = census.samples, census.numbers, finite_extremes(census)
+def with_known(samples: SampleArray, look: Look, value: float | None, notes: list[str]) -> Known:
+    """Return samples without unknown ones; a ``value`` stands for these, too."""
+    which = ""
+    if value is not None:
+        known = changed(samples, lambda planes: np.where(planes == value, np.nan, planes))
+        low, high = _extremes_of(known)
+        which = f" (those that are exactly {value:g} are taken as such)"
+        samples = known
+    else:
+        low, high = look.low, look.high
+    if look.infinite:
+        _check_infinite(samples)
     regions = Regions(samples, np.isnan)
     count = int(regions.size.sum())
+    if value is not None:
+        notes.append(
+            f"{count:,} samples are exactly {value:g}, where no distance is: they are taken as "
+            "unknown (write NaN where nothing was seen)"
+        )
     outer = int(regions.size[regions.positive & ~regions.unsure].sum())
     notes.append(
-        f"{count + numbers.infinite:,} samples are unknown ({count:,} NaN, of which {outer:,} lie "
-        f"on the positive side, and {numbers.infinite:,} infinite): they are taken as cut off at "
+        f"{count + look.infinite:,} samples are unknown ({count:,} NaN, of which {outer:,} lie "
+        f"on the positive side, and {look.infinite:,} infinite): they are taken as cut off at "
         f"{low:.6g} and {high:.6g}"
     )
-    below, above, _ = numbers.border
-    outside = low if below > above else high
+    whole = np.bincount(regions.root, regions.size, len(regions.root))[regions.root]
+    small = regions.unsure & (whole <= SMALL)
+    if regions.size[small].sum() > MOST_KNOWN * np.prod(samples.shape, dtype=float):
+        small[:] = False
+    unsure = regions.unsure & ~small
+    outside = low if border_share(look, lambda x: (x < 0) & (x != value)) > 0.5 else high
 
-    def known(planes: NDArray[Any], first: int, is_continued: bool = False) -> NDArray[Any]:
+    def known_of(planes: NDArray[Any], first: int) -> NDArray[Any]:
         planes = np.array(planes)
         for i, plane in enumerate(planes, first):
             unknown, infinite = np.isnan(plane), np.isinf(plane)
@@ -75,39 +83,39 @@ def filled(census: Census, notes: list[str]) -> Filled:
             of_side = np.where(regions.positive[runs], high, low)
             plane[unknown] = np.where(regions.unsure[runs], np.nan, of_side)
             plane[infinite] = np.where(plane[infinite] > 0, high, low)
-        planes = _continued(planes, (low, high)) if is_continued else planes
+        planes = _continued(planes, (low, high))
         planes[np.isnan(planes)] = outside
         return planes
 
-    def unseen(planes: NDArray[Any], first: int) -> BoolArray:
+    def unseen_of(planes: NDArray[Any], first: int) -> BoolArray:
         marked: BoolArray = np.isnan(planes)
         for i, unknown in enumerate(marked, first):
-            unknown[unknown] = regions.unsure[regions.runs_of(i, unknown)[unknown]]
+            unknown[unknown] = unsure[regions.runs_of(i, unknown)[unknown]]
         return marked
 
-    plain = DerivedPlanes(samples, known, dtype=samples.dtype, numbered=True)
-    if not regions.unsure.any():
-        return Filled(plain, plain, None, "")
-    count = int(regions.size[regions.unsure].sum())
+    filled = DerivedPlanes(samples, known_of, 2 * LAYERS, samples.dtype, numbered=True)
+    total = count + look.infinite
+    if not unsure.any():
+        return Known(filled, (low, high), total, None, "")
+    count = int(regions.size[unsure].sum())
     notes.append(
         f"{count:,} of the unknown samples are in regions that touch both sides of the surface: "
         "it is open there"
     )
-    at = np.unravel_index(int(regions.start[regions.unsure][0]), census.shape)
-    value = getattr(samples, "value", None)
-    which = "" if value is None else f" (those that are exactly {value:g} are taken as such)"
+    at = np.unravel_index(int(regions.start[unsure][0]), samples.shape)
     why = (
         f"{count:,} samples are unknown{which}, values[{', '.join(map(str, map(int, at)))}] the "
         "first, in regions that touch samples on both sides of the surface, so whether they are "
         "inside is unknown"
     )
-    continued = partial(known, is_continued=True)
-    return Filled(
-        DerivedPlanes(samples, continued, 2 * LAYERS, samples.dtype, numbered=True),
-        plain,
-        DerivedPlanes(samples, unseen, dtype=bool, numbered=True),
-        why,
-    )
+    unseen = DerivedPlanes(samples, unseen_of, dtype=bool, numbered=True)
+    return Known(filled, (low, high), total, unseen, why)
+
+
+def _extremes_of(samples: SampleArray) -> Extremes:
+    finite = [plane[np.isfinite(plane)] for plane in samples]
+    ends = [(x.min(), x.max()) for x in finite if x.size]
+    return float(min(low for low, _ in ends)), float(max(high for _, high in ends))
 
 
 def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
@@ -123,34 +131,6 @@ def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:
         new = np.isnan(planes) & (count > 0)
         planes[new] = np.clip(total[new] / count[new], *limits)
     return planes
-
-
-class Seen(DerivedPlanes):
-    """Samples that are NaN in some regions of a value, when they are read."""
-
-    def __init__(
-        self, source: SampleArray, regions: Regions, unseen: BoolArray, value: float
-    ) -> None:
-        def hide(planes: NDArray[Any], first: int) -> Floats:
-            planes = as_float64(planes)
-            for i, plane in enumerate(planes, first):
-                marked = regions.is_marked(plane)
-                hidden = unseen[regions.runs_of(i, marked)[marked]]
-                plane[marked] = np.where(hidden, np.nan, plane[marked])
-            return planes
-
-        super().__init__(source, hide, numbered=True)
-        self.value = value
-
-
-def finite_extremes(census: Census) -> Extremes:
-    """Return the lowest and the highest finite sample; GridError as above."""
-    low, high = census.extremes
-    if low > high:
-        raise not_finite(census.samples)
-    if census.numbers.infinite:
-        _check_infinite(census.samples)
-    return low, high
 
 
 def _check_infinite(samples: SampleArray) -> None:
@@ -177,139 +157,78 @@ def _check_infinite(samples: SampleArray) -> None:
         )
 
 
-def without_unseen(census: Census, notes: list[str]) -> Census:
-    """Return what samples show that are NaN where they have a value that stands for unseen ones.
+class Regions:
+    """Connected regions of marked samples, made of their runs along z; planes are read in order.
 
-    Of samples that are not all known by their user, those with an extreme value may be beside any
-    others: few views leave such edges. GridError if a value may stand for them, but not everywhere.
+    Only the runs are kept in memory. Of each run are ``start``, its first sample in C order,
+    ``size``, and ``root``, the first run of its region; and whether this has ``positive`` samples
+    beside it, ``negative`` ones or 0, and both or none (``unsure``). ``before`` (nx + 1,) counts
+    the runs of the planes before each.
     """
-    extremes = census.extremes if census.is_finite else finite_extremes(census)
-    if not extremes[0] < 0 < extremes[1]:
-        return census
-    samples, all_known = census.samples, census.is_finite
-    for value, steepest in _suspects(census.pairs, extremes):
-        regions = Regions(samples, partial(np.equal, value))
-        unseen = _unseen_runs(samples, regions, value, JUMP * steepest, extremes)
-        if unseen.any():
-            notes.append(
-                f"{int(regions.size[unseen].sum()):,} samples are exactly {value:g}, where no "
-                "distance is: they are taken as unknown (write NaN where nothing was seen)"
-            )
-            samples, all_known = Seen(samples, regions, unseen, value), False
-        elif all_known and value in extremes:
-            _check_jumps(census, value, int(regions.size.sum()), JUMP * steepest)
-    return census if samples is census.samples else Census(samples)
+
+    def __init__(self, samples: SampleArray, is_marked: IsMarked) -> None:
+        self.is_marked, size = is_marked, samples.shape[1] * samples.shape[2]
+        self.before = np.zeros(samples.shape[0] + 1, np.int64)
+        none = np.empty(0, np.int64)
+        parts: list[tuple[Ints, ...]] = [(none, none, none.reshape(2, 0), none, none)]
+        former: tuple[Ints, NDArray[Any]] | None = None
+        for i, plane in enumerate(samples):
+            marked = is_marked(plane)
+            runs, begins = self.runs_of(i, marked), np.flatnonzero(_begins(marked))
+            first, self.before[i + 1] = self.before[i], self.before[i] + len(begins)
+            sides = [(runs[:, 1:], runs[:, :-1], plane[:, 1:], plane[:, :-1])]
+            sides += [(runs[1:], runs[:-1], plane[1:], plane[:-1])]
+            sides += [(runs, former[0], plane, former[1])] if former else []
+            if len(begins) or (former and self.before[i] > self.before[i - 1]):
+                pairs, positive, negative = zip(*(_beside(*side) for side in sides))
+                sizes = np.bincount(runs[marked] - first, minlength=len(begins))
+                near = np.concatenate(positive), np.concatenate(negative)
+                parts.append((begins + i * size, sizes, np.concatenate(pairs, axis=1), *near))
+            former = runs, plane
+        self.start, self.size, joined, *beside = (np.concatenate(x, axis=-1) for x in zip(*parts))
+        self.root = components(len(self.start), joined)
+        has = np.zeros((2, len(self.root)), bool)
+        for row, side in zip(has, beside):
+            row[self.root[side]] = True
+        self.positive, self.negative = has[:, self.root]
+        self.unsure: BoolArray = self.positive == self.negative
+
+    def runs_of(self, i: int, marked: BoolArray) -> Ints:
+        """Return the run that each sample of plane ``i`` is in, (ny, nz); -1 for others."""
+        numbers = np.cumsum(_begins(marked)).reshape(marked.shape) + (int(self.before[i]) - 1)
+        return np.where(marked, numbers, -1)
 
 
-def _suspects(pairs: Floats, extremes: Extremes) -> list[tuple[float, float]]:
-    """Return values that may stand for unseen samples, and the steepest change of the others."""
-    has_equal = np.count_nonzero(pairs[0] == pairs[1]) >= ENOUGH
-    values, counts = np.unique(pairs[0] if has_equal else (), return_counts=True)
-    often = values[counts >= ENOUGH][np.argsort(counts[counts >= ENOUGH])[-FREQUENT:]]
-    changes = np.abs(pairs[1] - pairs[0])
-    is_extreme = np.isin(pairs, extremes)
-    changes[is_extreme.all(0)] = 0  # values that are cut off near the surface
-    crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
-    suspects = []
-    for value in sorted({0.0, *extremes, *often.tolist()}):
-        has, is_often = pairs == value, value not in (0, *extremes)
-        alike, beside = int((has[0] & has[1]).sum()), changes[has[0] != has[1]]
-        largest = np.sort(beside)[-LEAST_JUMPS] if len(beside) >= LEAST_JUMPS else 0.0
-        is_plateau = value == 0 and alike >= ENOUGH
-        # Beside thin flat parts the sign changes mostly beside one value.
-        is_a_side = crossing.size and (crossing == value).any(0).mean() > A_SIDE
-        if not (is_plateau or largest) or (value and is_a_side):
-            continue
-        if is_often and alike < ALIKE * (alike + len(beside)):
-            continue
-        steepest = _steepest(pairs, has, is_extreme)
-        if value in extremes and _is_cut_near(pairs, value, steepest, extremes):
-            continue
-        if is_plateau or largest > JUMP * steepest:
-            suspects.append((float(value), steepest))
-    return suspects
+def _begins(marked: BoolArray) -> BoolArray:
+    begins = marked.copy()
+    begins[:, 1:] &= ~marked[:, :-1]
+    return begins
 
 
-def _is_cut_near(pairs: Floats, value: float, steepest: float, extremes: Extremes) -> bool:
-    """Return whether the sign changes between the extremes, and others are near a value."""
-    crossing = pairs[:, (pairs[0] > 0) != (pairs[1] > 0)]
-    others = pairs[~np.isin(pairs, extremes)]
-    near = np.abs(others - value).min(initial=np.inf) < JUMP * steepest
-    has_crossing = near and crossing.size > 0  # few planes of a large grid are looked at
-    return bool(has_crossing and np.isin(crossing, extremes).all(0).mean() > FILLED_IN)
+def _beside(
+    runs: Ints, other_runs: Ints, values: NDArray[Any], other_values: NDArray[Any]
+) -> tuple[Ints, Ints, Ints]:
+    """Return the pairs of runs beside each other, (2, n), and the runs beside known samples.
 
-
-def _steepest(pairs: Floats, has: BoolArray, is_extreme: BoolArray) -> float:
-    """Return the steepest change of samples without a value, or all that they span, if few tell."""
-    is_inner, change = ~(has | is_extreme), np.abs(pairs[1] - pairs[0])
-    inner, changes = pairs[is_inner], change[~has.any(0)]
-    span = np.ptp(inner) if len(inner) else 0.0  # larger changes are those to another such value
-    changes = changes[(changes > 0) & (changes <= span)]
-    if len(changes) < ENOUGH or len(np.unique(inner[:MANY])) < LEAST_VALUES:
-        rest = pairs[~has]
-        low, high = rest.min(initial=0), rest.max(initial=0)
-        return FEW_SPANS * float(high - low) if low < 0 < high else np.inf
-    # A field that levels off, or with far spacings along one axis, is steepest at the surface.
-    across = change[is_inner.all(0) & ((pairs[0] > 0) != (pairs[1] > 0))]
-    groups = [changes, across] if len(across) >= ENOUGH else [changes]
-    return max(float(np.quantile(group, STEEPEST)) for group in groups)
-
-
-def _check_jumps(census: Census, value: float, count: int, limit: float) -> None:
-    pairs = census.pairs[:, (census.pairs[0] > 0) != (census.pairs[1] > 0)]
-    jumps = _are_jumps(pairs, limit, census.extremes) & (pairs == value).any(0)
-    if jumps.sum() >= LEAST_JUMPS and jumps.mean() > MIXED:
-        raise GridError(
-            f"{count:,} samples are exactly {value:g}, and beside some the values jump as no "
-            "distance does: write NaN where nothing was seen"
-        )
-
-
-def _are_jumps(pairs: Floats, limit: float, extremes: Extremes) -> BoolArray:
-    """Return which pairs (2, n) differ by more than a limit, but for those of both extremes.
-
-    Values that are cut off near the surface, or filled in by hand, go from one to the other.
+    First those beside positive ones, then those beside others; each array is that of neighbours.
     """
-    large: BoolArray = np.abs(pairs[1] - pairs[0]) > limit
-    return large & ~np.isin(pairs, extremes).all(0)
+    one, other = runs >= 0, other_runs >= 0
+    base, both = int(max(runs.max(), other_runs.max(), 0)) + 1, one & other
+    pairs = np.stack(np.divmod(np.unique(runs[both] * base + other_runs[both]), base))
+    mine = np.concatenate([runs[one & ~other], other_runs[other & ~one]])
+    theirs = np.concatenate([other_values[one & ~other], values[other & ~one]])
+    return pairs, np.unique(mine[theirs > 0]), np.unique(mine[theirs <= 0])
 
 
-def _unseen_runs(
-    samples: SampleArray, regions: Regions, value: float, limit: float, extremes: Extremes
-) -> BoolArray:
-    """Return which runs of a value were never seen, (n,): beside those values jump by over a limit.
-
-    Counted by region are the pairs of its samples with others, all but those of both extremes;
-    those that jump; those with one above 0; and samples with only others of the region round them.
-    """
-    counts = np.zeros((4, len(regions.root)), np.int64)
-
-    def count(which: int, runs: Ints) -> None:
-        counts[which] += np.bincount(regions.root[runs], minlength=counts.shape[1])
-
-    before: deque[tuple[Ints, NDArray[Any]]] = deque(maxlen=2)
-    for i, plane in enumerate(samples):
-        runs = regions.runs_of(i, regions.is_marked(plane))
-        sides = [(runs[1:], plane[1:], runs[:-1], plane[:-1])]
-        sides += [(runs[:, 1:], plane[:, 1:], runs[:, :-1], plane[:, :-1])]
-        sides += [(runs, plane, *before[-1])] if before else []
-        sides += [(other, others, one, values) for one, values, other, others in sides]
-        for one, values, other, others in sides:
-            at = (one >= 0) & (other < 0) & np.isfinite(others)
-            pairs = np.stack([values[at], others[at]]).astype(np.float64)
-            count(0, one[at][~np.isin(pairs, extremes).all(0)])
-            count(1, one[at][_are_jumps(pairs, limit, extremes)])
-            count(2, one[at][pairs[1] > 0])
-        if len(before) == 2:
-            amid = (before[0][0] >= 0) & (before[1][0] >= 0) & (runs >= 0)
-            amid = amid[2:] & amid[1:-1] & amid[:-2]
-            amid = amid[:, 2:] & amid[:, 1:-1] & amid[:, :-2]
-            count(3, before[1][0][1:-1, 1:-1][amid])
-        before.append((runs, plane))
-    beside, jumps, above, among = counts
-    unseen = (jumps > UNSEEN * beside) & (jumps > 0)
-    unseen |= (beside == 0) & unseen.any()
-    if value == 0:  # no distance is 0 throughout, though on a surface it is at corners of steps
-        unseen |= among > 0
-        unseen |= ((above == 0) | (above == beside)) & unseen.any()
-    return np.asarray(unseen[regions.root])
+def components(count: int, pairs: Ints) -> Ints:
+    """Return the lowest of the numbers from 0 to ``count`` that each is joined to by pairs."""
+    root = np.arange(count)
+    while True:
+        one, other = root[pairs]
+        apart = one != other
+        if not apart.any():
+            return root
+        pairs, low = pairs[:, apart], np.minimum(one, other)[apart]
+        np.minimum.at(root, np.maximum(one, other)[apart], low)
+        while (root != root[root]).any():
+            root = root[root]

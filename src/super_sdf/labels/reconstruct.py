@@ -20,9 +20,9 @@ from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray
 from ..errors import GridError, OptionError, OutOfMemoryError, seen
 from ..files.grids import read_array
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
-from ..grid.field import NONE_EXACT, Field
-from ..grid.interpret import as_sample, labelled, named
-from ..grid.samples import as_samples, check_kind, check_spacing, is_cubic, placed
+from ..grid.interpret import as_sample, labelled, mask_field
+from ..grid.look import named
+from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.decoder import Adapter, Decoder, adapt
 from ..network.network import load_network, network_for
@@ -150,10 +150,11 @@ def find_image(
         said = "solids of labels run out of the grid: closed along the border"
         notes.append(f"{said} ({named(cut)})")
     steps = check_spacing(1.0 if given.spacing is None else given.spacing)
-    field = Field(options.MASK, True, NONE_EXACT, on_lattice=not is_cubic(steps))
     where = (samples, steps, 0.0 if origin is None else origin, tuple(notes))
     more = {"direction": place["direction"], "extremes": extremes_of_masks(min(steps))}
-    grid = with_fields(SdfGrid.trusted(*where, **more, field=field), space=place.get("space"))
+    grid = with_fields(
+        SdfGrid.trusted(*where, **more, field=mask_field(steps)), space=place.get("space")
+    )
     missing = [label for label in wanted or () if label not in labels]
     volumes = [float(np.prod(steps)) * count for count in counts.tolist()]
     return LabelImage(grid, labels, numbers, missing, volumes)

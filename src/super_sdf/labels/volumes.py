@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from ..arrays import CORNERS, Vectors, dot, face_normals, length, sums_at
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
-from ..options import MASK
 from ..surface.mesh import Mesh
 
 CELL = 0.5  # spacings of the samples between nodes
@@ -32,7 +31,7 @@ def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
     if offset:
         said = f"is for the surface of the samples, --offset is {offset:g}: give one only"
-    elif grid.field.kind != MASK:
+    elif not grid.field.sides_only:
         said = f"is for masks and labels, the values are {grid.field.kind}: leave it out"
     elif cap:
         return

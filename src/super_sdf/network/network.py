@@ -211,8 +211,8 @@ def _load_once(
     return replace(loaded, symmetries=symmetries)
 
 
-def network_for(network: Decoder, kind: str) -> Decoder:
-    """Return the network for a kind of field: one for that kind in place of a shipped one.
+def network_for(network: Decoder, kind: str | None) -> Decoder:
+    """Return the network that a field names, in place of a shipped one.
 
     Masks have a network of their own. So have noisy distances, unless the network was itself
     trained on them. A network from another file, or any other function, is used as it is.

@@ -88,6 +88,28 @@ def is_active(rescaled: FloatArray) -> BoolArray:
     return active
 
 
+def is_near(values: FloatArray) -> BoolArray:
+    """Return which voxels a surface at 0 may pass, whatever the slope, (nx, ny, nz).
+
+    Values there are no farther from 0 than they change to neighbours, added up over the axes, or
+    some of the 26 samples round them are on the other side. Where values are constant they are not.
+    """
+    change = np.zeros_like(values)
+    sides: NDArray[np.uint8] = 1 + (values > 0).view(np.uint8)  # of samples, then of ... cells
+    for axis in range(3):
+        lines, cells = np.moveaxis(values, axis, 0), np.moveaxis(sides, axis, 0)
+        sides = np.moveaxis(np.bitwise_or(cells[1:], cells[:-1]), 0, axis)
+        steps = np.abs(lines[1:] - lines[:-1])
+        largest = np.concatenate([steps[:1], np.maximum(steps[1:], steps[:-1]), steps[-1:]])
+        change += np.moveaxis(largest, 0, axis)
+    mixed = sides == 3
+    for axis in range(3):
+        mixed = np.pad(mixed, [(int(n == axis),) * 2 for n in range(3)])
+        both = np.moveaxis(mixed, axis, 0)
+        mixed = np.moveaxis(both[1:] | both[:-1], 0, axis)
+    return np.asarray((np.abs(values) < change) | mixed)
+
+
 def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
     """Return the 27 samples round each voxel (V, 3), in the order of ``NEIGHBOURHOOD``, (V, 27).
 

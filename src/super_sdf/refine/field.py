@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import CENTRE, FloatArray, IntArray
 from ..errors import OptionError
-from ..grid.field import NONE_EXACT, Field
+from ..grid.interpret import NONE_EXACT, Field
 from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..threads import chunks_of
@@ -279,7 +279,7 @@ def fine_grid(field: FineField) -> SdfGrid:
     grid, blocks = field.placed, field.blocks
     ends = np.array([blocks.min(initial=np.inf), blocks.max(initial=-np.inf)], np.float32)
     lowest, highest = field.in_world_units(ends).tolist()
-    kind = Field() if grid.field.kind == "exact" else Field("noisy", True, NONE_EXACT)
+    kind = Field() if grid.field.exact == (-np.inf, np.inf) else Field("noisy", True, NONE_EXACT)
     return SdfGrid.trusted(
         FineLattice(field),
         tuple(along / field.factor for along in grid.spacing),
@@ -287,5 +287,5 @@ def fine_grid(field: FineField) -> SdfGrid:
         grid.notes,
         direction=grid.direction,
         extremes=(min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)),
-        field=replace(kind, on_lattice=grid.field.on_lattice),
+        field=replace(kind, own_lattice=grid.field.own_lattice),
     )

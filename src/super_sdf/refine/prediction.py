@@ -17,8 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
-from ..grid.derived import local_slopes
-from ..grid.field import Field
 from ..grid.samples import cropped, in_spacings
 from ..network.decoder import Adapter, decode
 from ..threads import chunks_of
@@ -31,10 +29,8 @@ TAIL = 12  # samples after which the prefilter has fallen to 1e-7
 BEYOND = TAIL + 2  # samples to either side on which the spline in a voxel depends
 CUBE = 64  # voxels along the edge of a cube that is worked on at a time
 SIDE = 5  # coefficients along an axis on which the spline within half a voxel of a sample depends
-# Sums of fourth differences, in voxels, up to which a field is smooth, and from which it is not.
-SMOOTH, KINKED = 0.6, 1.3
-JUMPING, JUMPED = 5.0, 9.0  # the same for a field of uneven slope, which is linear there
-WRONG_SLOPE = 0.05  # from 1: local slopes so far off are not those of distances
+# Sums of fourth differences, in voxels, from which values jump, and from which they are linear.
+JUMPING, JUMPED = 5.0, 9.0
 
 
 def predict(
@@ -72,58 +68,37 @@ def predict(
     return blocks
 
 
-def interpolate(
-    band: Band, table: IntArray, voxels: IntArray, network: Adapter, factor: int, threads: int = 1
-) -> FloatArray:
-    """Return the blocks of a field that is no distance: its spline, and the network at kinks.
+def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
+    """Return the cubic spline of the samples at the nodes of voxels' blocks (Q, D + 1).
 
-    Of a field that is far from a distance, or was cut off, the network adds nothing.
+    Voxels (D,) are rows of a band. Where values jump, as in fused depth images, a spline would
+    swing, and nodes are interpolated linearly.
     """
-    grid, unit = band.grid, band.grid.voxel_size / 2
-    blocks, share = spline_blocks(grid.field, band.voxel_ijk[voxels], factor, unit)
-    blocks[:, :-1] -= np.float32(band.offset / unit)
-    some = np.flatnonzero(share)
-    if grid.field.has_kinks and len(some):
-        added = predict(band, table, voxels[some], network, factor, threads)[:, :-1]
-        blocks[:, some] += share[some] * (added - blocks[:, some])
-    return blocks
-
-
-def spline_blocks(
-    kind: Field, voxel_ijk: IntArray, factor: int, unit: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return the cubic spline at the nodes of voxels' blocks, and the network's share there.
-
-    The samples ``kind.smooth`` are divided by ``unit``. If their slope is uneven, a spline would
-    swing where they jump, and nodes there are interpolated linearly. The blocks, (Q, D + 1), are
-    those of ``nodes``, of voxels (D, 3); the share, (D,), goes from 0 where the field is smooth, or
-    no distance, to 1.
-    """
-    assert kind.smooth is not None
-    samples, shape = kind.smooth, np.array(kind.smooth.shape)
+    grid, voxel_ijk, unit = band.grid, band.voxel_ijk[voxels], band.grid.voxel_size / 2
+    samples, shape, sign = grid.samples, np.array(grid.shape), -1 if grid.positive_inside else 1
     # the weights of samples -2 to 2 for the nodes along an axis, (K + 1, 5)
     far = np.abs(np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3))
     linear = np.clip(1 - far, 0, None).astype(np.float32)
     tails = np.clip(2 - far, 0, None) ** 3 / 6
     cubic = np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, tails).astype(np.float32)
     blocks = np.zeros(((factor + 1) ** 3, len(voxel_ijk) + 1), np.float32)
-    share = np.empty(len(voxel_ijk), np.float32)
     cube = np.ravel_multi_index(tuple((voxel_ijk // CUBE).T), tuple(shape // CUBE + 1))
     order = np.argsort(cube, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(cube[order])) + 1) if len(order) else []:
         ijk = voxel_ijk[rows]
         low, high = np.maximum(ijk.min(0) - BEYOND, 0), np.minimum(ijk.max(0) + BEYOND + 1, shape)
         ijk = ijk - low
-        values = np.stack([in_spacings(plane, unit) for plane in cropped(samples, low, high)])
-        rough = roughness(values * np.float32(0.5))
-        share[rows] = network_share(values * np.float32(0.5), rough)[tuple(ijk.T)]
+        planes = cropped(samples, low, high)
+        values = np.stack([in_spacings(plane, sign * unit) for plane in planes])
         found = _evaluate(prefilter(values), ijk + 2, cubic)
-        if kind.is_uneven:
-            jumps = np.clip((rough[tuple(ijk.T)] - JUMPING) / (JUMPED - JUMPING), 0, 1)
+        if grid.field.has_jumps:
+            rough = roughness(values * np.float32(0.5))[tuple(ijk.T)]
+            jumps = np.clip((rough - JUMPING) / (JUMPED - JUMPING), 0, 1)
             straight = np.pad(values, 2, mode="reflect", reflect_type="odd")
             found += jumps * (_evaluate(straight, ijk + 2, linear) - found)
         blocks[:, rows] = found
-    return blocks, share
+    blocks[:, :-1] -= np.float32(band.offset / unit)
+    return blocks
 
 
 def prefilter(values: FloatArray) -> FloatArray:
@@ -183,14 +158,3 @@ def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float
             block = np.moveaxis(nodes, 0, axis)
         out[:, rows] = block.reshape(len(out), -1)
     return out
-
-
-def network_share(values: FloatArray, rough: FloatArray) -> FloatArray:
-    """Return the share of the network's values round each sample; ``values`` are in voxels.
-
-    It is 0 where the field is smooth, and where its slope is not 1: a network knows distances only.
-    """
-    kinked = np.clip((rough - SMOOTH) / (KINKED - SMOOTH), 0, 1)
-    off = np.abs(local_slopes(values) - 1)
-    share: FloatArray = (kinked * np.clip(2 - off / WRONG_SLOPE, 0, 1)).astype(np.float32)
-    return share

@@ -28,6 +28,7 @@ from .band import (
     is_active,
     is_filled_in,
     is_lipschitz,
+    is_near,
     plane_blocks,
     rescale,
 )
@@ -195,6 +196,7 @@ def _blocks(
     An offset is checked: the distances must not be cut off near it. At 0 no other one is better.
     """
     unseen, count = grid.field.unseen, grid.shape[0]
+    is_spline = grid.field.network is None
 
     def look(planes: tuple[int, int]) -> _Block:
         first, last = planes
@@ -202,7 +204,7 @@ def _blocks(
         rescaled = rescale(grid, offset, low, high)
         let_go(grid.samples)
         own = slice(first - low, last - low)
-        inner, active = rescaled[own], is_active(rescaled)[own]
+        inner, active = rescaled[own], (is_near if is_spline else is_active)(rescaled)[own]
         if unseen is not None:
             hidden = np.asarray(unseen[first:last])
             inner, active = np.where(hidden, np.float32(FAR), inner), active & ~hidden
@@ -212,7 +214,7 @@ def _blocks(
             start, stop = np.maximum(ijk.min(0) - 1, 0), ijk.max(0) + 2  # the rest is far away
             around = rescaled[tuple(map(slice, start, stop))]
             patches = gather_patches(around, ijk - start)
-            if (filled := is_filled_in(patches)).any():
+            if not is_spline and (filled := is_filled_in(patches)).any():
                 ijk, patches = ijk[~filled], patches[~filled]
         voxel_ijk = ijk + np.array([low, 0, 0], np.int32)
 
@@ -222,9 +224,9 @@ def _blocks(
         lipschitz, sampled = is_lipschitz(patches), on_samples(grid, voxel_ijk)
         if grid.on_sample is not None:
             lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
-        if grid.field.smooth is not None:  # no distances: they say nothing certain of the voxels
+        if is_spline:
             decoded = np.ones(len(patches), bool)
-        elif grid.field.kind == "mask":
+        elif grid.field.sides_only:
             decoded = has_both_sides(patches)
         else:
             # only a patch that can be distances proves, by a sample far from the surface, that

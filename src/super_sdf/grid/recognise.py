@@ -1,0 +1,542 @@
+"""What the numbers of a grid are: questions in order, of which the first that answers ends it.
+
+1. Are there two values? A mask.
+2. Are they whole numbers in regions of equal ones? Labels.
+3. Do they follow from the sides of the samples, as in a distance transform? A mask.
+4. Does a value of many samples stand for unknown ones? It is left out.
+5. Is the commonest slope that of nearly all smooth samples, and contradicts no sample two others?
+   Distances; the slope is the spacing in the unit of the values. Where parts touch inside, the
+   field is smooth.
+6. Is all that contradicts distances explained by noise? Noisy distances.
+7. Is 0 no level of theirs: one side only, few different values, or most of them near 0? Densities.
+8. Everything else is smooth: the surface at 0 is that of its cubic spline.
+
+Lengths are in spacings, values in the slope of a distance. Every threshold stands in a gap that was
+measured; the gap is the comment beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .look import (
+    BOX,
+    Floats,
+    Look,
+    border_share,
+    different_values,
+    equal_neighbours,
+    typical_slope,
+    valleys,
+    which_label,
+    which_level,
+)
+from .samples import SampleArray
+
+# 2. Labels: share of the samples off the background that equal 4 or more of their 6 neighbours; of
+# neighbours that differ, how many by one rank; by how much labels may be off whole numbers, and
+# whole numbers off those that are stored.
+PLATEAUS = 0.45  # whole images and integer distances to .43, labels from .55
+BY_RANK = 0.99  # integer distances 1, labels to .97
+WHOLE, FACTOR = 1e-3, 0.05
+FEW_LABELS = 8  # different values: rounded distances and images from 11, lesions and organs to 8
+# 3. Transforms: share of the samples beside the surface that equal others with the same 27 signs.
+# Values that do not jump over 0 need the steps of a mask: a share of these samples with other sides
+# along two axes, and many patterns of signs, or many of all. Else faces are along the axes.
+FOLLOW = 0.95  # distances to .94 (but where faces are along the axes), transforms from .957
+STAIRS = 0.2  # solids along the axes to .18, masks of others from .26
+PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
+NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
+JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
+# 4. Unknown samples: share of the samples at one value from which it is cut off or stands for
+# unknown ones; steps to it over the steepest ones; how many of them jump.
+CUT = 0.01
+JUMP = 1.5  # cut off 1.0, sentinels from 2
+MIXED = 0.05  # cut off 0, where it is also the cut-off value from .09
+# 5. Distances: share of the smooth samples whose slope is the commonest one; share of the samples
+# beside the surface that differ from two others by more than they are apart.
+SLOPES = 0.95  # exact from .98; smooth unions to .83, saturating to .36, noise of .05 to .66
+CONTRADICTIONS = 0.003  # exact and cut off 0; noise of .05 voxel from .009; other slopes .02
+STRAIGHT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
+EXACT = 0.02  # spacings, and share of a slope: the error of differences of exact distances
+SAME_UNIT = 0.01  # from 1: exact to .002; saturating and smooth unions from .019
+MOST_DIGIT = 0.12  # spacings: the last digit of rounded distances
+MATTERS = 3.0  # spacings: values farther from 0 may be anything
+NARROW = 2.5  # spacings up to which values that are cut off have too few slopes to judge
+SLOPE_OFF = 0.25  # of the slope between these from 1: cut off at half a voxel .05, fused .4
+CROWDED = 0.7  # of the uncut samples, those in the last tenth: cut off to .55, tanh from .85
+SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
+THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
+# 6. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
+# samples of all.
+NOISE = 0.05  # uniform noise of .05 to .5 voxel and Gaussian to .033; logits .087, networks .096
+SPREAD = 0.34  # of fourth differences, lowest quarter over median: noise from .39, fused to .29
+SMOOTH_SHARE = 0.06  # noise of .05 voxel to .03; fields of other slopes from .10
+# 7. Densities: range over the smallest step; median of the sizes over the largest, with more
+# surface at 0 than at the level that parts them best; valleys per sample of a face.
+IMAGE = 1 << 17  # 16 bits have 65,535, floats 1e6 and more
+ALIKE = 0.05  # by which ends differ between which distances were cut off: .004, images .2 to 1
+CENTRED = 0.13  # maps of density and statistics to .11, fields from .15
+AREA = 1.0  # fields to 1.11 and d^3 1.02 with centres from .15, maps from 1.14
+VALLEY = 0.2, 1.5  # unsigned distances .3 to .6; densities .05, noise 3
+ENOUGH = 20  # samples from which a share is evidence
+
+FACES = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
+LENGTHS = BOX.astype(np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """One of six kinds, what decided, what was measured, and why it cannot be meshed, if so."""
+
+    kind: str
+    why: str = ""
+    facts: dict[str, Any] = field(default_factory=dict)
+    refusal: str = ""
+
+
+def recognise(
+    samples: SampleArray, look: Look, given: Floats | None = None, hint: str = ""
+) -> Answer:
+    """Return what samples are; ``given`` is the spacing (3,), ``hint`` what a file says of them."""
+    facts: dict[str, Any] = {"cut": cut_values(look)}
+    if hint == "labels":
+        return Answer("labels", "the file says so", facts, which_label(samples))
+    if len(look.few) == 2:
+        if not _is_plane(look):
+            return Answer("mask", "there are two values", facts)
+        steps = np.full(3, look.high - look.low) if given is None else given
+        return Answer("distance", "", facts | {"spacing": steps})
+    if look.is_finite and not hint and _are_labels(samples, look, facts):
+        why = "whole numbers in regions of equal ones"
+        return Answer("labels", why, facts, which_label(samples))
+    if hint == "density":
+        return Answer("density", "the file says so", facts, which_level(look))
+    if not hint and _follow_from_signs(look, given, facts):
+        why = "a distance transform, so only their sign says something"
+        return Answer("mask", why, facts | _side_of_zeros(look))
+    look = _without_sentinels(look, facts)
+    facts["digit"] = _last_digit(look)
+    inner = np.where(
+        np.isin(look.lines, [x / look.scale for x in facts["cut"]]), np.nan, look.lines
+    )
+    unit = _find_unit(inner, given, facts)
+    enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
+    if unit is not None and enough and facts["slopes"] >= SLOPES:
+        steps = unit * (np.ones(3) if given is None else given)
+        facts["contradictions"] = _contradictions(look, steps, facts["digit"])
+        if facts["contradictions"] <= CONTRADICTIONS:
+            return _distances(look, unit, given, facts)
+    if look.is_one_sided:
+        return _of_one_side(look, facts)
+    if "perhaps_unknown" in facts:
+        value = facts["perhaps_unknown"]
+        said = f"beside some of the samples that are {value:g} the values jump: --unknown {value:g}"
+        return Answer("smooth", "", facts, said)
+    if given is not None and _is_cut_near(look, given, facts):
+        return Answer("distance", "cut off near the surface", facts | {"spacing": given})
+    return _of_both_sides(look, given, facts)
+
+
+def cut_values(look: Look) -> list[float]:
+    """Return the lowest and the highest value, as far as many samples have them."""
+    ends = zip((look.low, look.high), look.at_ends)
+    return [value for value, share in ends if share > CUT]
+
+
+# Questions 1 to 3: masks and labels
+
+
+def _is_plane(look: Look) -> bool:
+    """Return whether two values differ along an axis of two samples only: a plane is between."""
+    if 2 not in look.shape or look.slabs[0].planes.dtype.kind in "iub":
+        return False
+    lines = [np.moveaxis(look.slabs[0].planes, axis, 0) for axis in range(3)]
+    return any(len(x) == 2 and bool((x == x[:, :1, :1]).all()) for x in lines)
+
+
+def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool:
+    if not _are_whole(np.unique(look.all_pairs) * look.scale):
+        return False
+    found = different_values(samples)
+    if found is None or not _are_whole(found[0].astype(np.float64)):
+        return False
+    distinct, counts = found
+    facts["different"] = len(distinct)
+    ranks = [np.searchsorted(distinct, pair * look.scale) for pair in look.pairs]
+    steps = np.concatenate([np.abs(one - other) for one, other in ranks])
+    facts["by_rank"] = by_rank = float((steps == 1).mean()) if len(steps) else 0.0
+    if len(distinct) > 3 and by_rank >= BY_RANK:
+        return False
+    if len(distinct) <= FEW_LABELS:
+        return look.low >= 0 or _plateaus(look, distinct, counts) >= PLATEAUS
+    facts["plateaus"] = _plateaus(look, distinct, counts)
+    return bool(facts["plateaus"] >= PLATEAUS)
+
+
+def _are_whole(values: Floats) -> bool:
+    """Return whether all values but 0 are whole numbers, times one factor near 1."""
+    some = values[np.abs(values) > WHOLE]
+    if not len(some) or np.abs(some).max() < 1 - FACTOR:
+        return False
+    least = some[np.abs(some).argmin()]
+    factor = least / max(np.rint(np.abs(least)), 1) * np.sign(least)
+    some = some / factor
+    off = np.abs(some - np.rint(some)) <= np.maximum(WHOLE, 1e-9 * np.abs(some))
+    return bool(abs(factor - 1) <= FACTOR and off.all())
+
+
+def _plateaus(look: Look, distinct: NDArray[Any], counts: NDArray[np.int64]) -> float:
+    background, equal, total = distinct[counts.argmax()], 0, 0
+    for slab in look.slabs:
+        values, neighbours = equal_neighbours(slab)
+        inner = values != background
+        if len(distinct) > 3:  # images are cut off at their ends
+            inner &= (values != distinct[0]) & (values != distinct[-1])
+        equal += int(np.count_nonzero(neighbours[inner] >= 4))
+        total += int(np.count_nonzero(inner))
+    return equal / total if total else 1.0
+
+
+def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
+    """Return whether samples beside the surface are equal wherever the 27 signs round them are."""
+    boxes = look.boxes[:, 1:4, 1:4, 1:4]
+    most, found, is_stepped, largest = (
+        0,
+        0.0,
+        False,
+        max(abs(look.low), abs(look.high)) / look.scale,
+    )
+    fine = np.repeat(np.ones(3, bool) if given is None else given < 1.01 * given.min(), 2)
+    cut = [x / look.scale for x in facts["cut"] if x]
+    whole = np.isfinite(boxes).all((1, 2, 3))
+    for signs in (boxes > 0, boxes >= 0):  # 0 may be on either side
+        middle, other = boxes[:, 1, 1, 1], signs != signs[:, 1:2, 1:2, 1:2]
+        ring = other[(slice(None), *FACES[fine].T)].any(1) & whole
+        ring &= middle != 0
+        is_cut = np.isin(middle, cut)
+        if is_cut[ring].mean() > 0.5 if ring.any() else True:
+            continue
+        ring &= ~is_cut
+        x = middle[ring]
+        if len(x) < ENOUGH or (typical := np.median(np.abs(x))) < NOTHING * largest:
+            continue
+        bits = np.packbits(signs[ring].reshape(-1, 27), axis=1)
+        key = np.ascontiguousarray(bits).view(np.uint32).ravel()
+        order = np.argsort(key, kind="stable")
+        key, x = key[order], x[order]
+        alike = np.abs(np.abs(x) - typical) <= 0.01 * typical  # as most transforms are
+        shares = [min(alike[side].mean() for side in (x > 0, x < 0) if side.any())]
+        same = key[1:] == key[:-1]
+        if same.sum() >= 5 * ENOUGH:
+            shares.append((np.abs(np.diff(x)[same]) <= 0.01 * typical).mean())
+        if max(shares) > found or (max(shares) >= FOLLOW and len(x) > most):
+            most, found, patterns = len(x), float(max(shares)), int(np.count_nonzero(~same)) + 1
+            along = other[(slice(None), *FACES[fine].T)][ring].reshape(len(x), -1, 2).any(2)
+            facts["stairs"] = float((along.sum(1) > 1).mean())
+            is_many = patterns > PATTERNS or patterns > OF_ALL * len(x)
+            is_stepped = facts["stairs"] > STAIRS and is_many
+            facts["step"] = float(typical) * look.scale
+    facts["follow"] = found
+    return found >= FOLLOW and (_jump_over_0(look) or (is_stepped and len(cut) < 2))
+
+
+def _jump_over_0(look: Look) -> bool:
+    """Return whether along an axis all steps over 0 are larger than all others."""
+    for one, other in look.pairs:
+        size, over = np.abs(one - other), (one > 0) != (other > 0)
+        if over.sum() > ENOUGH and size[over].min() > JUMPS * size[~over].max(initial=0):
+            return True
+    return False
+
+
+def _side_of_zeros(look: Look) -> dict[str, Any]:
+    """Return the side of samples that are 0: that which has none of its own beside some of them.
+
+    All 26 round a sample are beside it or, if that does not tell, the 6 along the axes.
+    """
+    for along_axes in (False, True):
+        lone = [0, 0]
+        for planes, own in look.slabs:
+            for nth, marked in enumerate((planes < 0, planes > 0)):
+                near = marked.copy()
+                for axis in range(3):
+                    source = marked if along_axes else near.copy()
+                    m, n = np.moveaxis(source, axis, 0), np.moveaxis(near, axis, 0)
+                    n[1:] |= m[:-1]
+                    n[:-1] |= m[1:]
+                lone[nth] += int(np.count_nonzero((planes == 0)[own] & ~near[own]))
+        if lone[0] != lone[1]:
+            return {"zeros": int(np.sign(lone[1] - lone[0]))}
+    return {}
+
+
+# Question 4: unknown samples
+
+
+def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
+    """Return a look without the value of many samples to which the others jump, if there is one."""
+    if not look.low < 0 < look.high:
+        return look
+    shares = {look.low: look.at_ends[0], look.high: look.at_ends[1], **look.common}
+    pairs = look.all_pairs * look.scale
+    change = np.abs(pairs[0] - pairs[1])
+    at_ends = np.isin(pairs, (look.low, look.high)).all(0)
+    for value, share in shares.items():
+        at = (pairs == value).any(0)
+        if share < CUT or not (at & ~at_ends).any() or at.all():
+            continue
+        jumps = change[at & ~at_ends] > JUMP * np.quantile(change[~at], 0.99)
+        if jumps.mean() > 0.5:
+            facts["unknown_value"] = value
+            facts["cut"] = [x for x in facts["cut"] if x != value]
+            return look.without(value / look.scale)
+        if jumps.mean() > MIXED and value in facts["cut"]:
+            facts["perhaps_unknown"] = value
+    return look
+
+
+# Question 5: distances
+
+
+def _last_digit(look: Look) -> float:
+    """Return by how much values beside the surface typically differ at least."""
+    values = np.unique(look.boxes[:, 2, 2, 2].astype(np.float32))
+    values = values[np.isfinite(values)]
+    return float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+
+
+def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> Any:
+    """Return how much values change from sample to sample, by axis if they differ; None if unclear.
+
+    It is the commonest slope of the smooth samples; with a spacing it is in this, 1 for distances.
+    """
+    gradients, fourth = _smooth_gradients(inner)
+    facts["smooth"] = len(gradients) / max(len(inner), 1)
+    if len(gradients) < ENOUGH:
+        facts["slopes"] = 0.0
+        return None
+    h = 1.0 if given is None else float(given.max())
+    gradients = gradients if given is None else gradients / given
+    slope = np.sqrt((gradients**2).sum(1))
+    unit = _commonest(slope)
+    facts["error"] = SAME_UNIT if fourth >= ENOUGH else 3 * SAME_UNIT
+    facts["unit"] = unit
+    error = EXACT + min(facts["digit"] / unit / h, MOST_DIGIT) / 2
+    facts["slopes"] = float((np.abs(slope / unit - 1) < error).mean())
+    if facts["slopes"] < SLOPES and len(gradients) > 5 * ENOUGH:
+        axes = _by_axis(gradients)
+        share = 0.0
+        if axes is not None:
+            share = float((np.abs(np.sqrt(((gradients / axes) ** 2).sum(1)) - 1) < EXACT).mean())
+        if axes is not None and share >= SLOPES:
+            facts["slopes"] = share
+            return axes
+    return unit
+
+
+def _smooth_gradients(lines: Floats) -> tuple[Floats, int]:
+    """Return the gradients (n, 3) at samples, of lines (m, 3, 5), where no kink is near.
+
+    They are of fourth order where five samples in a row are known and their fourth differences are
+    small; else of second order where second differences are small. The number is of the first.
+    """
+    a, b, c, d, e = np.moveaxis(lines, -1, 0)
+    second, fourth = (d - b) / 2, (8 * (d - b) - (e - a)) / 12
+    bend = np.abs(d - 2 * c + b).sum(1)
+    rough = np.abs(e - 4 * d + 6 * c - 4 * b + a).sum(1)
+    kink = np.abs(e - 2 * d + 2 * b - a).max(1) / 2 if len(lines) else rough
+    size, other = np.sqrt((fourth**2).sum(1)), np.sqrt((second**2).sum(1))
+    smooth = (rough < STRAIGHT * size) & (kink < 2 * STRAIGHT * size)
+    flat = np.isnan(size) & (bend < STRAIGHT * other)
+    return np.concatenate([fourth[smooth], second[flat]]), int(smooth.sum())
+
+
+def _commonest(x: Floats) -> float:
+    """Return the middle of the narrowest range that holds a third of positive numbers."""
+    x = np.sort(x)
+    n = max(len(x) // 3, 1)
+    i = int(np.argmin(x[n:] / x[:-n]))
+    return float(np.median(x[i : i + n + 1]))
+
+
+def _by_axis(gradients: Floats) -> Floats | None:
+    """Return the steps along the axes with which most gradients have length 1."""
+    keep = np.ones(len(gradients), bool)
+    for _ in range(6):
+        square = np.linalg.lstsq(gradients[keep] ** 2, np.ones(keep.sum()), rcond=None)[0]
+        if (square <= 0).any():
+            return None
+        off = np.abs(np.sqrt(gradients**2 @ square) - 1)
+        keep = off <= max(2 * np.median(off), 1e-6)
+    return np.asarray(1 / np.sqrt(square))
+
+
+def _contradictions(look: Look, steps: Floats, digit: float, noise: float = 0.0) -> float:
+    """Return the share of samples beside the surface that two others contradict as distances."""
+    if not len(look.boxes):
+        return 0.0
+    h = float(steps.max())
+    boxes = look.boxes.reshape(len(look.boxes), -1) / h
+    apart = np.sqrt(((LENGTHS * steps / h) ** 2).sum(1))
+    allowed = max(EXACT, min(digit / h, MOST_DIGIT), 2.5 * noise)
+    beyond = np.abs(boxes - boxes[:, 62:63]) > apart + allowed
+    beyond &= np.abs(boxes) < MATTERS
+    return float((np.count_nonzero(beyond, axis=1) >= 2).mean())
+
+
+def _distances(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any]) -> Answer:
+    """Return distances, or why they are none to a surface in the grid."""
+    steps = np.ones(3) * unit * look.scale if given is None else given
+    facts["spacing"] = steps
+    if given is not None and np.ndim(unit):
+        shown = ",".join(f"{x:.4g}" for x in given * unit * look.scale)
+        said = f"the values show another spacing along each axis: --spacing {shown}"
+        return Answer("distance", "", facts, said)
+    if given is not None and abs(unit * look.scale - 1) > facts["error"]:
+        scale = 1 / (unit * look.scale)
+        power, short = 10.0 ** np.round(np.log10(scale)), float(f"{scale:.2g}")
+        scale = next((x for x in (power, short) if abs(scale / x - 1) < 2e-3), scale)
+        shown = ",".join(f"{x:.4g}" for x in np.unique(given) * unit * look.scale)
+        said = (
+            "they are distances in another unit than the spacing: multiply the values, --scale "
+            f"{scale:.6g} (or give --spacing {shown}, if the values are right)"
+        )
+        return Answer("distance", "", facts, said)
+    if look.is_one_sided:
+        return _to_thin_walls(look, steps, facts)
+    outside = 1 if border_share(look, lambda x: x > 0) >= 0.5 else -1
+    found = [valleys(slab, float(steps.min()), -outside) for slab in look.slabs]
+    facts["seams"] = sum(n for n, _ in found) / max(sum(n for _, n in found), 1)
+    if facts["seams"] > SEAMS:
+        why = "distances to parts that touch or overlap, with faces of these inside"
+        return Answer("smooth", why, facts)
+    return Answer("distance", "", facts)
+
+
+def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
+    """Return distances of one side: to walls thinner than the spacing, or no surface at 0.
+
+    Along a line of samples the field falls towards a wall and rises behind it. What the distances
+    on either side leave of the way between two samples is how thick it is.
+    """
+    sign, h = (1 if look.low >= 0 else -1), float(steps.max())
+    nearest = min(abs(look.low), abs(look.high))
+    if (look.low if sign > 0 else look.high) in facts["cut"]:
+        return Answer("density", "", facts, which_level(look))
+    if nearest > 1.05 / 2 * float(np.sqrt((steps**2).sum())):
+        said = "every wall is nearer to some sample than that, so there is no surface"
+        return Answer("distance", "", facts, said)
+    thickness = [np.empty(0)]
+    for planes, own in look.slabs:
+        for axis in range(3):
+            lines = np.moveaxis(planes if axis == 0 else planes[own], axis, 0) * (
+                sign / steps[axis]
+            )
+            before, left, right, after = (lines[i : len(lines) - 3 + i] for i in range(4))
+            falling, rising = before - left, after - right
+            left_over = (falling + rising) / 2 - left - right
+            thickness.append(left_over[(np.minimum(falling, rising) > 0.25) & (left_over > -0.6)])
+    walls = np.concatenate(thickness)
+    if not len(walls):
+        said = "only samples on the border of the grid are near 0, so no surface lies in it"
+        return Answer("distance", "", facts, said)
+    if np.median(walls[walls > -0.25]) > THICK if (walls > -0.25).any() else False:
+        return Answer("distance", "", facts)
+    inside = "negative" if sign > 0 else "positive"
+    said = (
+        "unsigned distances have no inside: mesh the shell round the surface with "
+        f"--inside {inside} --offset {h:.4g}"
+    )
+    return Answer("distance", "", facts, said)
+
+
+def _is_cut_near(look: Look, given: Floats, facts: dict[str, Any]) -> bool:
+    """Return whether values are distances cut off so near the surface that few slopes are left."""
+    cut = [abs(x) for x in facts["cut"]]
+    if not cut or min(cut) >= NARROW * given.max():
+        return False
+    size = np.abs(look.lines[:, 0, 2]) / (min(cut) / look.scale)
+    size = size[np.isfinite(size)]
+    facts["crowded"] = float((size > 0.9).mean()) if size.size else 0.0
+    if _contradictions(look, given / look.scale, facts["digit"]) > CONTRADICTIONS:
+        return False
+    slope = typical_slope(look, given, facts["cut"])
+    return facts["crowded"] < CROWDED and abs(slope - 1) < SLOPE_OFF
+
+
+# Questions 6 to 8: noise, densities, smooth fields
+
+
+def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answer:
+    values = np.unique(np.concatenate([look.all_pairs.ravel(), look.boxes[:, 2, 2, 2]]))
+    values = values[np.isfinite(values)]
+    is_tsdf = facts["cut"] and abs(look.low + look.high) < ALIKE * look.high
+    if not is_tsdf and np.ptp(values) < IMAGE * np.diff(values).min():
+        why = "values of few digits with no slope of distances"
+        return Answer("density", why, facts, which_level(look, signed=True))
+    if given is not None and _is_noise(look, given / look.scale, facts):
+        return Answer("noisy", "distances with noise", facts | {"spacing": given})
+    middle = np.abs(look.lines[:, 0, 2])
+    middle = middle[np.isfinite(middle)]
+    if len(middle) >= ENOUGH:
+        facts["centred"] = float(np.median(middle) / np.quantile(middle, 0.995))
+        pairs = look.all_pairs
+        at_0, best = (((pairs[0] > x) != (pairs[1] > x)).sum() for x in (0.0, _parting(look)))
+        facts["area"] = float(at_0 / max(best, 1))
+        if facts["centred"] < CENTRED and facts["area"] > AREA:
+            why = "most values are near 0"
+            return Answer("density", why, facts, which_level(look, signed=True))
+    return Answer("smooth", "the slope is not that of a distance everywhere", facts)
+
+
+def _is_noise(look: Look, steps: Floats, facts: dict[str, Any]) -> bool:
+    """Return whether noise as large as fourth differences show explains what contradicts."""
+    boxes = look.boxes
+    lines = np.stack([boxes[:, :, 2, 2], boxes[:, 2, :, 2], boxes[:, 2, 2]], 1)
+    fourth = np.abs(np.diff(lines, 4, axis=-1)[..., 0])
+    fourth = fourth[np.isfinite(fourth)]
+    if len(fourth) < 5 * ENOUGH or facts["smooth"] > SMOOTH_SHARE:
+        return False
+    # a quarter of the differences of normal noise is below .3186 sqrt(70) of its deviation
+    noise = float(np.quantile(fourth, 0.25) / 0.3186 / 70**0.5 / steps.max())
+    facts["noise"] = noise
+    if np.quantile(fourth, 0.25) < SPREAD * np.median(fourth):
+        return False
+    if _contradictions(look, steps, facts["digit"]) <= CONTRADICTIONS:
+        return False
+    return _contradictions(look, steps, facts["digit"], noise) <= NOISE
+
+
+def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
+    """Return densities, or unsigned distances of one slope or another."""
+    sign = 1 if look.low >= 0 else -1
+    pairs = look.all_pairs
+    steep = float(np.quantile(np.abs(pairs[0] - pairs[1]), 0.98)) * look.scale
+    found = sum(valleys(slab, steep, sign)[0] for slab in look.slabs)
+    share = sum(slab.planes[slab.own].size for slab in look.slabs) / np.prod(look.shape)
+    nearest = look.low if sign > 0 else look.high
+    found /= share * float(np.prod(look.shape)) ** (2 / 3)
+    if nearest not in facts["cut"] and VALLEY[0] < found < VALLEY[1]:
+        inside = "negative" if sign > 0 else "positive"
+        said = (
+            "unsigned distances have no inside: mesh the shell round the surface with "
+            f"--inside {inside} --offset {steep:.4g}"
+        )
+        return Answer("distance", "", facts, said)
+    return Answer("density", "no value is on the other side of 0", facts, which_level(look))
+
+
+def _parting(look: Look) -> float:
+    """Return the level that parts the values into two of least variance (Otsu's)."""
+    middle = look.lines[:, 0, 2]
+    counts, edges = np.histogram(middle[np.isfinite(middle)], 512)
+    mids = (edges[1:] + edges[:-1]) / 2
+    below, mean = np.cumsum(counts)[:-1], np.cumsum(counts * mids)[:-1]
+    above, other = counts.sum() - below, (counts * mids).sum() - mean
+    apart = below * above * (mean / np.maximum(below, 1) - other / np.maximum(above, 1)) ** 2
+    return float(edges[1:-1][apart.argmax()])
