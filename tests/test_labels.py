@@ -14,7 +14,7 @@ import trimesh
 from conftest import refusal, trilinear
 
 from super_sdf import load_network, make_grid, reconstruct, reconstruct_labels
-from super_sdf.check.check import check_mesh
+from super_sdf.check import check_mesh
 from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
 from super_sdf.grid.sdf_grid import volume_of_samples
 from super_sdf.labels.files import LabelName, read_names

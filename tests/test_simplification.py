@@ -15,9 +15,9 @@ from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
 from super_sdf.network.network import load_network
 from super_sdf.simplify import collapsing
-from super_sdf.simplify.collapsing import irregular_places, smallest_angles
+from super_sdf.simplify.collapsing import irregular_places
 from super_sdf.simplify.measuring import Original
-from super_sdf.truth.solid import Solid
+from super_sdf.truth.solid import Solid, smallest_angles
 
 PART = Path(__file__).parent.parent / "examples" / "part.npz"
 QUICK = ("--quality", "fast", "--factor", 2)

@@ -19,16 +19,17 @@ from numpy.typing import NDArray
 from pyfqmr import Simplify
 
 from ..surface.mesh import Mesh, row_keys
-from ..truth.solid import Points, Solid
+from ..truth.solid import Points, Solid, smallest_angles
 from .measuring import Original, mean_side
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
 # of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
 # the error, those of the second do at some places, and leave a fifth fewer triangles.
-PLANE_DISTANCES = (1.0, 1.4, 1.4, 1.4), (1.7, 1.7)
+PLANE_DISTANCES = (1.0,), (1.4, 1.4, 1.4), (1.7, 1.7)
 ROUNDS = 30, 3.0  # of the threshold, and its rise; from more rounds, meshes get no smaller
 FEW_ROUNDS, LARGE = (8, 5.0), 1 << 12  # nearly as well, from this many triangles on
+FEW_SLIVERS = 0.002  # of the triangles, which stay
 THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
 MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
 # A number of triangles is sought by the error that leaves as many.
@@ -58,7 +59,7 @@ def collapsed(
     solids = [original.solid if mesh is original.mesh else Solid(mesh)]
     kept: list[NDArray[np.bool_]] = []  # triangles of each mesh but the last
     places, since = np.zeros((0, 3)), np.zeros(0, np.intp)  # to keep, and from which pass on
-    first = 0  # pass that is to be made anew
+    first, before = 0, irregular_places(mesh)  # pass that is to be made anew
     for _ in range(MOST_REPEATS):
         count_round()
         del meshes[first + 1 :], solids[first + 1 :], kept[first:]
@@ -79,7 +80,7 @@ def collapsed(
             solids.append(Solid(result))
         if not len(result.faces):
             return None
-        wrong = faults(result, mesh)
+        wrong = faults(result, mesh, before)
         if error < np.inf:
             wrong = np.concatenate([wrong, original.compare(solids[-1], error)[0]])
         if not len(wrong):
@@ -108,9 +109,12 @@ def collapsed(
     return None
 
 
-def faults(result: Mesh, mesh: Mesh) -> Points:
-    """Return where a mesh is less of a manifold than another one, or meets itself, (n, 3)."""
-    found, before = irregular_places(result), irregular_places(mesh)
+def faults(result: Mesh, mesh: Mesh, before: NDArray[np.float64]) -> Points:
+    """Return where a mesh is less of a manifold than another one, or meets itself, (n, 3).
+
+    ``before`` are the irregular places of the other mesh.
+    """
+    found = irregular_places(result)
     made = found[~np.isin(row_keys(found), row_keys(before))]
     lost = before[~np.isin(row_keys(before), row_keys(found))]
     lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
@@ -153,31 +157,27 @@ def down_to(
         return mesh, ()
     farthest = FARTHEST * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
     error = min(FIRST_ERROR * original.side * len(mesh.faces) / triangles, farthest)
-    # an error and the triangles that it leaves: too many, and few enough
-    low, more, high, fewer = 0.0, len(mesh.faces), np.inf, 0
+    low, more, high, fewer = 0.0, len(mesh.faces), np.inf, 0  # errors and what they leave
     reached, least = None, mesh
     for _ in range(MOST_ERRORS):
         result = within(mesh, original, error, count_round)[0]
         left = len(result.faces)
-        if left == len(mesh.faces) > more and not fewer:  # the error is too large
-            farthest = min(farthest, error)
-        elif left <= triangles:
+        if left <= triangles:
             reached, high, fewer = result, error, left
-        else:
+        elif left < len(mesh.faces) or not low:
             low, more, least = error, left, min(least, result, key=lambda one: len(one.faces))
-        if triangles < MARGIN * left <= MARGIN * triangles or high < CLOSE * low:
-            break
-        if not fewer and farthest < CLOSE * low:
+        else:  # an error so large that nothing is found within it
+            farthest = error
+        if triangles < MARGIN * left <= MARGIN * triangles or min(high, farthest) < CLOSE * low:
             break
         # what is left falls about as a power of the error
-        if not fewer:
-            error = min(low * float(np.clip(more / triangles, 1.1, STRIDE)), farthest)
-            error = error if error > low else (low + farthest) / 2
-        elif not low:
-            error = high * float(np.clip(fewer / triangles, 1 / STRIDE, 0.9))
-        else:
+        if reached and low:
             share = np.log(more / triangles) / np.log(more / fewer)
             error = float(low * (high / low) ** np.clip(share, 0.15, 0.85))
+        elif reached:
+            error = high * max(fewer / triangles, 1 / STRIDE)
+        else:
+            error = min(low * min(more / triangles, STRIDE), (low * farthest) ** 0.5)
     if reached:
         return reached, ()
     steps = [{"triangles": float(triangles)}] * 5
@@ -249,18 +249,23 @@ def turn_edges(mesh: Mesh, held: NDArray[np.bool_], distance: float) -> Mesh:
     """
     points, faces, count = mesh.vertices.astype(np.float64), mesh.faces.copy(), len(mesh.vertices)
     for _ in range(4):  # not all edges can be turned at once
+        corners = points[faces]
+        thin = np.flatnonzero((smallest_angles(corners) < THIN) & ~held)
+        if len(thin) <= FEW_SLIVERS * len(faces):
+            break
+        sides = np.linalg.norm(corners[thin] - np.roll(corners[thin], -1, axis=1), axis=2)
         solid, flat = Solid(Mesh(points, faces)), faces.ravel()
-        corners, normals, opposite = points[faces], solid.normals(), solid.mesh.pair_edges()[0]
-        sides = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
-        angle, low = smallest_angles(corners), distance * sides.max(1)
-        one = np.flatnonzero((angle < THIN) & (np.linalg.norm(normals, axis=1) < low) & ~held)
-        half = 3 * one + sides[one].argmax(1)
+        normals = solid.normals()
+        is_low = np.linalg.norm(normals[thin], axis=1) < distance * sides.max(1, initial=0)
+        if not is_low.any():
+            break
+        half, opposite = (3 * thin + sides.argmax(1))[is_low], solid.mesh.pair_edges()[0]
         half = half[(opposite[half] >= 0) & ~held[opposite[half] // 3]]
         one, other = half // 3, opposite[half] // 3
         a, b, c = (flat[3 * one + (half + turn) % 3] for turn in range(3))
         d = flat[3 * other + (opposite[half] + 2) % 3]
         new = np.stack([c, a, d, d, b, c], axis=1).reshape(-1, 2, 3)
-        better = smallest_angles(points[new.reshape(-1, 3)]).reshape(-1, 2).min(1) > 2 * angle[one]
+        better = smallest_angles(points[new.reshape(-1, 3)]).reshape(-1, 2).min(1) > THIN
         after = Solid(Mesh(points, new.reshape(-1, 3))).normals().reshape(-1, 2, 3)
         lengths = np.linalg.norm(after, axis=2) * np.linalg.norm(normals[other], axis=1)[:, None]
         steady = (np.einsum("nij,nj->ni", after, normals[other]) > STEADY * lengths).all(1)
@@ -275,16 +280,6 @@ def turn_edges(mesh: Mesh, held: NDArray[np.bool_], distance: float) -> Mesh:
         if not taken:
             break
     return Mesh(mesh.vertices, faces)
-
-
-def smallest_angles(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the smallest angle of each triangle, (m,), in degrees; corners are (m, 3, 3)."""
-    found = []
-    for turn in range(3):
-        at, one, other = np.roll(corners, turn, axis=1).transpose(1, 0, 2)
-        sine = np.linalg.norm(np.cross(one - at, other - at), axis=1)
-        found.append(np.arctan2(sine, ((one - at) * (other - at)).sum(1)))
-    return np.degrees(np.min(found, axis=0))
 
 
 def irregular_places(mesh: Mesh) -> NDArray[np.float64]:

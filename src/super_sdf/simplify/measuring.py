@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..surface.mesh import Mesh, row_keys
-from ..truth.solid import Distances, Points, Solid
+from ..truth.solid import Points, Solid
 
 BETWEEN = 0.97  # of the error, which no measured point exceeds: others may be a little farther away
 SHARES = np.array([[[1]], [[2]], [[4]], [[5]]]) / 6  # where an edge is measured beside its middle,
@@ -44,6 +44,9 @@ class Original:
         self.near = np.zeros(len(mesh.vertices), np.uint64)  # key of a triangle; 0: not measured
         start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
         self.edges = np.stack([start, end])[:, start < end]
+        # of the edges: keys of what their ends and middles are near, if within the limit; distances
+        self.seen = np.zeros((3, self.edges.shape[1]), np.uint64)
+        self.off = np.zeros(self.edges.shape[1])
         self.keys, self.back = np.zeros(1, np.uint64), np.full((2, 1), np.inf)  # largest, mean
 
     def compare(self, other: Solid, error: float = np.inf) -> tuple[Points, Deviation]:
@@ -54,39 +57,50 @@ class Original:
         stale = ~np.isin(self.near, keys)
         self.distance[stale], face, _ = other.nearest(vertices[stale])
         self.near[stale] = keys[face]
-        on_edges, off = self._bent_edges(other, keys, min(limit, float(self.distance.max())))
+        bar = limit if limit < np.inf else float(self.distance.max())
+        on_edges = self._bent_edges(other, keys, bar)
         feet, largest_back, mean_back = self._back(other, keys, limit)
-        wrong = [vertices[self.distance > limit], on_edges[off > limit], feet]
+        wrong = [
+            vertices[self.distance > limit],
+            on_edges[: len(on_edges) * (limit < np.inf)],
+            feet,
+        ]
         area = np.linalg.norm(self.solid.normals(), axis=1)
         mean = float(self.distance[self.mesh.faces].mean(1) @ area / area.sum())
-        largest = float(max(self.distance.max(), off.max(initial=0)))
+        largest = float(max(self.distance.max(), self.off.max(initial=0)))
         return np.concatenate(wrong), Deviation(largest, mean, largest_back, mean_back)
 
-    def _bent_edges(
-        self, other: Solid, keys: NDArray[np.uint64], limit: float
-    ) -> tuple[Points, Distances]:
-        """Return points on edges that may be farther away than their ends, and the distances.
+    def _bent_edges(self, other: Solid, keys: NDArray[np.uint64], limit: float) -> Points:
+        """Measure edges that may be farther away than their ends; return points beyond a limit.
 
-        Between two triangles that meet at an angle, an edge of length L with both ends on them is
-        at most L / 4 times the angle away. Of triangles that share no edge, nothing is known.
+        With its ends on two triangles that share an edge, an edge of length L is at most L / 4
+        times the largest angle away that one of these makes with those beside it.
         """
+        at_ends = self.near[self.edges]
+        self.off[at_ends[0] == at_ends[1]] = 0
+        is_known = (at_ends == self.seen[:2]).all(0) & np.isin(self.seen[2], keys)
+        some = np.flatnonzero((at_ends[0] != at_ends[1]) & ~is_known)
         order = np.argsort(keys)
-        face = order[np.searchsorted(keys[order], self.near)]
+        face = order[np.searchsorted(keys[order], at_ends[:, some])]
         normals = other.normals()
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        start, end = self.edges[:, face[self.edges[0]] != face[self.edges[1]]]
-        low, high = self.solid.mesh.vertices[start], self.solid.mesh.vertices[end]
-        angle = np.linalg.norm(normals[face[start]] - normals[face[end]], axis=1)
-        rise = np.linalg.norm(high - low, axis=1) * angle / 4
-        bent = np.maximum(self.distance[start], self.distance[end]) + rise > limit
-        beside = np.arange(3 * len(keys)) // 3 * len(keys) + other.mesh.pair_edges()[0] // 3
-        bent |= ~np.isin(face[start] * len(keys) + face[end], beside)
+        beside = other.mesh.pair_edges()[0].reshape(-1, 3) // 3
+        angle = np.linalg.norm(normals[:, None] - normals[beside], axis=2).max(1)
+        low, high = self.solid.mesh.vertices[self.edges[:, some]]
+        rise = np.linalg.norm(high - low, axis=1) * angle[face].max(0) / 4
+        bent = self.distance[self.edges[:, some]].max(0) + rise > limit
+        bent |= (beside[face[0]] != face[1][:, None]).all(1)
         low, high = low[bent], high[bent]
         middles = (low + high) / 2
-        off = other.distance(middles)
+        off, nearest, _ = other.nearest(middles)
         more = (off > SUSPECT * limit) & (off <= limit)
-        points = (low[more] + SHARES * (high[more] - low[more])).reshape(-1, 3)
-        return np.concatenate([middles, points]), np.append(off, other.distance(points))
+        points = low[more] + SHARES * (high[more] - low[more])  # (4, n, 3)
+        beside_middle = other.distance(points.reshape(-1, 3)).reshape(len(SHARES), -1)
+        wrong = middles[off > limit], points[beside_middle > limit]
+        off[more] = np.maximum(off[more], beside_middle.max(0))
+        self.off[some], self.seen[:, some] = 0, at_ends[[0, 1, 0]][:, some]
+        self.off[some[bent]], self.seen[2, some[bent]] = off, keys[nearest] * (off <= limit)
+        return np.concatenate(wrong)
 
     def _back(
         self, other: Solid, keys: NDArray[np.uint64], limit: float

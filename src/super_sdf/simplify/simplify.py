@@ -100,11 +100,12 @@ def simplify_mesh(
             progress(1 - left)
         left *= LEFT
 
-    if error is not None:
-        result, warnings = within(mesh, original, error, count_round)
+    if triangles is None:
+        result, warnings = within(mesh, original, error or 0.0, count_round)
     else:
-        result, warnings = down_to(mesh, original, triangles or 0, count_round)
-    deviation = original.compare(Solid(result), float("inf") if error is None else error)[1]
+        error = float("inf")
+        result, warnings = down_to(mesh, original, triangles, count_round)
+    deviation = original.compare(Solid(result), error or 0.0)[1]
     if progress:
         progress(1.0)
     return Simplified(result, count, deviation, warnings)

@@ -205,6 +205,16 @@ class Solid:
         return int(np.count_nonzero(wrong & (lengths[:, 0] > 0)))
 
 
+def smallest_angles(corners: Points) -> Distances:
+    """Return the smallest angle of each triangle, (m,), in degrees; corners are (m, 3, 3)."""
+    found = []
+    for turn in range(3):
+        at, one, other = np.roll(corners, turn, axis=1).transpose(1, 0, 2)
+        sine = np.linalg.norm(np.cross(one - at, other - at), axis=1)
+        found.append(np.arctan2(sine, ((one - at) * (other - at)).sum(1)))
+    return np.degrees(np.min(found, axis=0))
+
+
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:
     """Read a mesh file as a solid; return it with notes on its faults.
 
