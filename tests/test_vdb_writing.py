@@ -75,7 +75,7 @@ def level_set(field) -> tuple[np.ndarray, np.float32]:
 
 def held(path, grid: SdfGrid) -> tuple[np.ndarray, np.ndarray, dict]:
     """Return the values in a file, the voxel that is the first, and what is said of the grid."""
-    with open_volume(path, "xyz", describes=True) as (volume, _):
+    with open_volume(path, describes=True) as (volume, _):
         values = volume.read()
         columns = np.array(grid.direction) * grid.spacing
         np.testing.assert_allclose(volume.direction * volume.spacing, columns, atol=1e-15)
@@ -136,8 +136,7 @@ def test_trees_of_many_nodes_have_the_right_side_everywhere(tmp_path):
         leaves.append(np.where(np.abs(values) < 0.75, values, np.sign(values) * 0.75))
     packed = [leaf_bytes(values.astype("f4"), np.abs(values) < 0.75) for values in leaves]
     count = sum(int((np.abs(values) < 0.75).sum()) for values in leaves)
-    box = np.full(3, -8), np.array([4119, 319, 319])
-    tree = LevelSet(ball(), np.float32(0.75), sides, packed, count, box)
+    tree = LevelSet(ball(), np.float32(0.75), sides, packed, count)
     with open("a.vdb", "wb") as file:
         write_tree(file, tree)
     expected = np.full(sides.shape, 0.75, np.float32)

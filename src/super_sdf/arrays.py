@@ -30,8 +30,12 @@ Vectors: TypeAlias = NDArray[np.float64]
 
 def dot(a: Vectors, b: Vectors) -> Numbers:
     """Return the products of vectors, (n,)."""
-    product: Numbers = a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
-    return product
+    return np.asarray(a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2])
+
+
+def inner(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    """Return the products of vectors in columns, (3, ...): faster than in rows."""
+    return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 def cross(a: Vectors, b: Vectors) -> Vectors:
@@ -44,20 +48,18 @@ def cross(a: Vectors, b: Vectors) -> Vectors:
 
 def face_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
     """Return normals of triangles (m, 3), as long as twice their areas."""
-    a, b, c = (points[corner] for corner in faces.T)
+    a, b, c = (points.take(corner, 0) for corner in faces.T)
     return cross(b - a, c - a)
 
 
 def length(vectors: Vectors) -> Numbers:
     """Return the lengths of vectors, (n,)."""
-    lengths: Numbers = np.sqrt(dot(vectors, vectors))
-    return lengths
+    return np.asarray(np.sqrt(dot(vectors, vectors)))
 
 
 def unit(vectors: Vectors) -> Vectors:
     """Return vectors of length 1; 0 stays 0."""
-    units: Vectors = vectors / np.maximum(length(vectors), 1e-12)[..., None]
-    return units
+    return np.asarray(vectors / np.maximum(length(vectors), 1e-12)[..., None])
 
 
 def sums_at(place: Index, vectors: Vectors, count: int) -> Vectors:

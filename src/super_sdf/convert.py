@@ -11,16 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from .files.formats import files_of
 from .files.grids import read_grid
 from .files.meshes import check_target, write_mesh
 from .files.output import check_apart, check_free
-from .files.regular import files_of
 from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
 from .pipeline import mesh_grid
 from .threads import TOTAL, Progress, Stopwatch, part_of
 
 if TYPE_CHECKING:
-    from .network.decoder import Decoder
+    from .network.contract import Decoder
     from .options import Options
     from .simplify.simplify import Simplified
     from .surface.mesh import Mesh
@@ -43,13 +43,9 @@ class Conversion:
     capped: bool  # the solid runs out of the grid, and was closed along the border
     warnings: tuple[str, ...]  # on what may be wrong with the result
     simplified: dict[str, Any] | None  # ``Simplified.report``; distances in voxels
-    notes: tuple[str, ...] = ()  # on what was inferred
+    notes: tuple[str, ...] = ()  # on what was inferred, and what the samples do not show
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
     saved_field: dict[str, Any] | None = None  # its path; shape, spacing, origin of the lattice
-
-    def remarks(self) -> list[str]:
-        """Return sentences on what the mesh has that the samples do not show."""
-        return [CAPPED] * self.capped
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -92,21 +88,16 @@ def convert(
     watch, files = Stopwatch(), files_of(source)
     check_target(target, force=force, unit=options.unit)
     check_apart(target, files)
-    saving: Any = nullcontext()
-    if save_field is not None:
-        from .files.fields import saving_field
-
-        check_apart(save_field, files)
-        saving = saving_field(save_field, force=force)
-    with saving as file:
+    with _saving(save_field, files, force=force) as file:
         grid = read_grid(source, **options.reading())
         if options.keep_volume:
             from .labels.volumes import check_has_volume  # imported here, as few need it
 
             check_has_volume(grid, options.offset, cap=options.cap)
         lattice = cubic_grid(grid, options.offset)
+        factor = options.factor_for(mask=grid.field.sides_only)
         if file:
-            file.check_fits(grid.shape, options.factor)
+            file.check_fits(grid.shape, factor)
             how["save_field"] = file.write
         watch.lap("read")
         if progress:
@@ -126,17 +117,19 @@ def convert(
         watch.lap("write")
     is_open = made.open_edges > 0
     warnings = find_warnings(grid, options.offset, made.counts, is_open=is_open)
-    notes = [*lattice.notes, *off]
+    capped = options.cap and made.leaves
+    notes = [*lattice.notes, *off, *[CAPPED] * capped]
     if options.mesher == "sharp" and not lattice.field.has_exact:
         why = f"{lattice.field.kind} values show no edges"
         notes.append(f"{why}: the mesh is that of marching cubes")
-    sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "tiles": made.tiles}
+    sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    sizes |= {"tiles": made.tiles, "factor": factor}
     return Conversion(
         grid,
         mesh,
         {**made.counts, **sizes},
         closed=simplified.mesh.is_closed() if simplified else not is_open,
-        capped=options.cap and made.leaves,
+        capped=capped,
         warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
         notes=tuple(notes),
@@ -145,15 +138,25 @@ def convert(
     )
 
 
+def _saving(path: str | Path | None, others: list[Path], *, force: bool) -> Any:
+    """Return the context of a file for the refined field, apart from others; None if unwanted."""
+    if path is None:
+        return nullcontext()
+    from .files.fields import saving_field
+
+    check_apart(path, others)
+    return saving_field(path, force=force)
+
+
 def reworked(
     mesh: Mesh, grid: SdfGrid, options: Options, progress: Progress | None
 ) -> tuple[Mesh, Simplified | None, list[str]]:
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
     simplified, volume = None, volume_of_samples(grid) if options.keep_volume else None
     if volume is not None:
-        from .labels.volumes import keep_volumes, volume_notes
+        from .labels.volumes import keep_volume, volume_notes
 
-        (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))
+        mesh = keep_volume(mesh, volume, mean_spacing(grid))
     if options.goals():
         from .simplify.simplify import simplify_mesh
 

@@ -20,18 +20,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
+from .arrays import CENTRE
 from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
-from .network.decoder import Adapter, Decoder, adapt
+from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
 from .options import MesherName, Options
 from .refine import nodes
-from .refine.band import neighbour_table
+from .refine.band import (
+    Band,
+    BandSummary,
+    BandTooLargeError,
+    neighbour_table,
+    no_surface,
+    summarise,
+    survey,
+)
 from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
-from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
@@ -84,23 +92,18 @@ def refine_band(
         parts,
         grid,
         band.offset,
-        SampleSpheres.of(grid.shape, band.voxel_ijk[band.exact], patches[band.exact]),
+        SampleSpheres(grid.shape, band.voxel_ijk[band.exact], patches[band.exact, CENTRE]),
         band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
-        counts={
-            "band_voxels": len(patches),
-            "noisy_voxels": band.count_noisy(),
-            "decoded_voxels": len(voxels),
-            "nodes": parts.count_nodes(factor),
-            "pinned_nodes": pinned,
-        },
+        found=(len(patches), band.count_noisy()),
+        pinned=pinned,
     )
 
 
 def upsample(
     grid: SdfGrid,
     network: Decoder,
-    factor: int = 4,
+    factor: int | None = None,
     *,
     offset: float = 0.0,
     progress: Progress | None = None,
@@ -114,8 +117,9 @@ def upsample(
         axes, they are resampled to the finest first; the field has that spacing.
     network : Network
         From ``load_network``.
-    factor : int
-        How many times finer per axis, K: an even number from 2 to 16.
+    factor : int, optional
+        How many times finer per axis, K: an even number from 2 to 16; by default 2 for masks,
+        else 4.
     offset : float
         Refine the surface at this distance from the solid (world units) instead of the solid's own
         (Sec. 5.3). Positive is outwards, whichever sign the input had inside, since ``grid.values``
@@ -142,7 +146,7 @@ def upsample(
     check_grid(grid)
     options.check_called(network, progress)
     asked = Options(factor, offset=offset)  # checks them
-    factor, offset = asked.factor, asked.offset
+    factor, offset = asked.factor_for(mask=grid.field.sides_only), asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
@@ -205,7 +209,7 @@ def extract_mesh(
 def reconstruct(
     grid: SdfGrid | None = None,
     network: Decoder | None = None,
-    factor: int = 4,
+    factor: int | None = None,
     *,
     function: Function | None = None,
     bounds: ArrayLike | None = None,
@@ -282,7 +286,7 @@ def reconstruct(
         return mesh
     from .functions.zero import put_on_zero
 
-    return put_on_zero(mesh, exact, grid, factor, offset)
+    return put_on_zero(mesh, exact, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,7 +295,7 @@ class Result:
 
     mesh: Mesh
     open_edges: int
-    counts: dict[str, int]  # see ``FineField``; in tiles, a pinned node may count twice
+    counts: dict[str, int]  # see ``FineField``
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
     seconds: dict[str, float]  # by step
     tiles: int
@@ -305,6 +309,7 @@ class Task:
     grid: SdfGrid  # the samples of the tile
     shape: tuple[int, int, int]  # samples of the whole grid
     options: Options
+    factor: int
     mesher: MesherName
     threads: int
     whole: BandSummary | None = None  # of a tile that is not the whole grid
@@ -332,12 +337,13 @@ def mesh_grid(
     check_grid(grid)
     options.check_called(network, progress)
     check_can_close(grid, cap=chosen.cap)
-    steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
+    factor = chosen.factor_for(mask=grid.field.sides_only)
+    steps, offset = StepCounter(progress), chosen.offset
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
-    task = Task(everything, lattice, shape, chosen, mesher, threads)
+    task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room, whole = Room.of(chosen.max_memory, factor, decoder.memory_bytes), None
     most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
     try:
@@ -387,7 +393,7 @@ def make_tile(
     save_field: Callable[[FineField], None] | None = None,
 ) -> Part:
     """Return the part of the mesh that belongs to a tile, which may be the whole grid."""
-    tile, chosen, factor = task.tile, task.options, task.options.factor
+    tile, chosen, factor = task.tile, task.options, task.factor
     band = band or survey(task.grid, chosen.offset, threads=task.threads, whole=task.whole)
     if not band.decoded.any():
         return Part.without_surface(tile)
@@ -399,11 +405,7 @@ def make_tile(
     is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
     how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": task.threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
-    counts = dict(field.counts)
-    if task.whole:
-        own = tile.owns(field.voxel_ijk + np.array(tile.low))
-        counts["decoded_voxels"] = int(np.count_nonzero(own))
-        counts["nodes"] = field.parts.count_nodes(factor, own)
+    counts = field.count(tile.owns(field.voxel_ijk + np.array(tile.low)))
     more = {"counts": counts, "leaves": field.leaves, "is_cut": is_cut}
     del field
     return own_part(mesh, keys, tile, task.shape, factor, **more)

@@ -15,9 +15,8 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from ..errors import FileError, OptionError, seen
-from ..files.formats import GRID_SUFFIXES, is_grid, mesh_path, split_member
-from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix, format_of
-from ..files.regular import is_store, reason_of
+from ..files.formats import GRID_SUFFIXES, is_grid, is_store, mesh_path, reason_of, split_member
+from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix, has_parts
 from ..labels.files import Names, with_numbers
 from ..options import BATCH_LISTS, GOALS, Options
 from .record import OWN_NAMES, Row
@@ -39,7 +38,7 @@ class Job:
     @property
     def has_label_files(self) -> bool:
         """Whether each label has its own file, of a name that is known when it is written."""
-        return self.options.labels is not None and not format_of(self.mesh).has_scene
+        return self.options.labels is not None and not has_parts(self.mesh)
 
     @property
     def target(self) -> str:
@@ -97,7 +96,7 @@ def _expand(argument: str, suffix: str, options: Options) -> list[Job]:
         for at, folders, files in os.walk(path, onerror=unread.append):
             stores = [name for name in folders if is_store(Path(at, name))]
             folders[:] = [name for name in folders if name not in stores]
-            paths += [Path(at, name) for name in (*stores, *files)]
+            paths += [Path(at, n) for n in (*stores, *files) if not n.lower().endswith(".dcm")]
     elif is_grid(path) and os.path.lexists(split_member(path)[0]):
         root, paths = split_member(path)[0].parent, [path]
     elif glob.has_magic(argument):
@@ -113,7 +112,7 @@ def _expand(argument: str, suffix: str, options: Options) -> list[Job]:
             give = "give grids, folders, patterns or a list"
             said = f"{argument or repr(argument)} does not exist: {give}"
         raise OptionError(said)
-    # Anything with a grid's suffix counts. If it is no regular file, its job fails and names it.
+    # Anything with a grid's suffix counts, but slices. What is no regular file fails and is named.
     grids = sorted({p for p in paths if is_grid(p) and (is_store(p) or not p.is_dir())})
     if not grids:
         if unread:

@@ -19,9 +19,8 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from ..errors import FileError
-from ..files.formats import split_member
+from ..files.formats import files_of, is_store, split_member
 from ..files.output import naming
-from ..files.regular import files_of, is_store
 
 NAME, LOCK_NAME, STAGE_NAME = "report.jsonl", ".super-sdf-batch.lock", ".super-sdf-parts"
 OWN_NAMES = (NAME, LOCK_NAME, STAGE_NAME)

@@ -65,8 +65,8 @@ def command(mesh: Path, grid: Path, out: Path | None, **given: Any) -> None:
     """Check the mesh, print the certificate, and fail where it exceeds a limit."""
     check_modules("check", "report", ("igl",))
     from .. import check
+    from ..files.formats import files_of
     from ..files.output import check_apart
-    from ..files.regular import files_of
 
     limits = {name: given[name] for name in check.LIMITS}
     check.check_limits(limits)

@@ -31,8 +31,7 @@ TAKES = (
     option("--spacing", type=float, metavar="H",
         help="World distance between samples, instead of -n."),
     option("--padding", type=float, metavar="VOXELS",
-        help="Voxels between the bounding box of the mesh and the outermost samples. Default: "
-        "2.37, as at a whole number faces of a box lie on planes of samples."),
+        help="Voxels between the bounding box of the mesh and the last samples. Default: 2.37."),
     option("--frame", type=click.Choice(["world", "unit"]), default="world", show_default=True,
         help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and "
         "centres it in a unit cube, sampled at n^3 voxel centres."),

@@ -8,7 +8,6 @@ voxels, else as float64.
 from __future__ import annotations
 
 import math
-import struct
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,7 +21,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
-from ..errors import FileError, OptionError, OptionTypeError, SuperSdfError, seen
+from ..errors import FileError, OptionError, OptionTypeError, SuperSdfError, check_modules, seen
 from ..grid.interpret import Field
 from ..grid.samples import SamplePlanes, in_blocks
 from ..grid.sdf_grid import SdfGrid
@@ -32,12 +31,11 @@ from ..refine.field import FineField, FineLattice, SampleSpheres, fine_grid, lat
 from ..refine.nodes import share_parts
 from ..surface.cap import check_all_seen, find_border_inside
 from ..threads import check_fits
+from .formats import check_regular_file
 from .output import check_free, naming, replacing
-from .regular import check_regular_file
 from .vdb_writer import write_level_set
 
 VERSION = 1
-CHUNK = 1 << 20  # values at a time
 PLANES = 16  # of the fine lattice at a time
 # Which kinds of numbers each array has, and its shape, where None is any length.
 ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
@@ -50,11 +48,11 @@ ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
 
 
 def write_sparse(field: FineField, path: Path) -> None:
-    """Write a field to an ``.npz`` file, its values block by block."""
-    grid, side, count = field.placed, field.factor + 1, len(field.voxel_ijk)
+    """Write a field to an ``.npz`` file."""
+    grid, side, none = field.placed, field.factor + 1, np.empty((0, 3), np.int32)
     # float32 is exact where world units only change exponents
     is_power = math.frexp(grid.voxel_size)[0] == 0.5 and 1e-20 < grid.voxel_size < 1e20
-    exact, none = np.dtype("<f4" if is_power else "<f8"), np.empty((0, 3), np.int32)
+    exact = np.dtype("<f4" if is_power else "<f8")
     samples, distances = none, np.empty(0)
     if field.spheres is not None:
         samples = field.spheres.voxel_ijk
@@ -68,24 +66,14 @@ def write_sparse(field: FineField, path: Path) -> None:
         "direction": grid.direction,
         "offset": field.offset,
         "leaves": field.leaves,
-        "values": None,  # in chunks
+        "values": field.block_distances().astype(exact).reshape(-1, side, side, side),
         "voxels": field.voxel_ijk,
         "sample_voxels": samples,
         "sample_distances": distances.astype(exact),
         "border_inside": find_border_inside(field) if field.leaves else none,
     }
-    header = {"descr": exact.str, "fortran_order": False, "shape": (count, side, side, side)}
-    step = max(CHUNK // side**3, 1)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
-                if array is not None:
-                    npy.write_array(member, np.asarray(array))
-                    continue
-                npy.write_array_header_1_0(member, header)
-                for first in range(0, count, step):
-                    blocks = field.block_distances(slice(first, min(first + step, count)))
-                    member.write(blocks.astype(exact).tobytes())
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def write_npy(field: FineField, path: Path) -> None:
@@ -100,28 +88,28 @@ def write_npy(field: FineField, path: Path) -> None:
 
 def write_vti(field: FineField, path: Path) -> None:
     """Write the whole fine lattice as VTK image data, from memory: x is the fastest there."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkImageData
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
     grid, lattice = fine_grid(field), FineLattice(field)
-    values = np.empty(grid.shape[::-1], "<f4")
+    values = np.empty(grid.shape[::-1], np.float32)
     for planes in in_blocks(lattice, PLANES):
         values[:, :, planes] = lattice[planes].transpose(2, 1, 0)
-    extent = " ".join(f"0 {nodes - 1}" for nodes in grid.shape)
-    place: dict[str, Any] = {
-        "Origin": grid.origin,
-        "Spacing": grid.spacing,
-        "Direction": np.ravel(grid.direction),
-    }
-    placed = " ".join(f'{n}="{" ".join(f"{x:.17g}" for x in at)}"' for n, at in place.items())
-    head = (
-        '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
-        f'<ImageData WholeExtent="{extent}" {placed}>\n<Piece Extent="{extent}">\n'
-        '<PointData Scalars="distance">\n<DataArray type="Float32" Name="distance" '
-        'format="appended" offset="0"/>\n</PointData>\n</Piece>\n</ImageData>\n'
-        '<AppendedData encoding="raw">\n_'
-    )
-    with path.open("wb") as file:
-        file.write(head.encode("ascii") + struct.pack("<Q", values.nbytes))
-        file.write(values.data)
-        file.write(b"\n</AppendedData>\n</VTKFile>\n")
+    image, array = vtkImageData(), numpy_to_vtk(values.ravel())
+    image.SetDimensions(grid.shape)
+    image.SetSpacing(grid.spacing)
+    image.SetOrigin(grid.origin)
+    image.SetDirectionMatrix(np.ravel(grid.direction).tolist())
+    array.SetName("distance")
+    image.GetPointData().SetScalars(array)
+    writer = vtkXMLImageDataWriter()
+    writer.SetFileName(str(path))
+    writer.SetInputData(image)
+    writer.SetCompressorTypeToNone()
+    writer.SetEncodeAppendedData(False)
+    if not writer.Write():
+        raise OSError("VTK cannot write it")
 
 
 FIELD_TABLE: dict[str, Callable[[FineField, Path], None]] = {
@@ -131,14 +119,6 @@ FIELD_TABLE: dict[str, Callable[[FineField, Path], None]] = {
     ".vti": write_vti,
 }
 """What writes a field to a path, by suffix: the last two write every node."""
-
-
-def check_field_target(path: str | Path, *, force: bool = False) -> Path:
-    """Return the path if a field can be written there; called before the work starts."""
-    path = check_path(path, "path")
-    if path.suffix.lower() not in FIELD_TABLE:
-        raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_TABLE)}")
-    return check_free(path, force=force)
 
 
 @dataclass
@@ -170,8 +150,12 @@ class FieldFile:
 @contextmanager
 def saving_field(path: str | Path, *, force: bool = False) -> Iterator[FieldFile]:
     """Yield a file to write a field to; it appears at the end of the block, if that succeeds."""
-    path = check_field_target(path, force=force)
-    with replacing(path, force=force) as part:
+    path = check_path(path, "path")
+    if path.suffix.lower() not in FIELD_TABLE:
+        raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_TABLE)}")
+    if path.suffix.lower() == ".vti":
+        check_modules("writing .vti", "vti")
+    with replacing(check_free(path, force=force), force=force) as part:
         yield FieldFile(path, part)
 
 
@@ -194,13 +178,13 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
         If the suffix is unknown, or voxels are too small or too large for OpenVDB.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; if the field is one from
-        a file and the format is not .npz: others take the coarse samples.
+        a file and the format is not .npz: others take the coarse samples; if VTK is missing for a
+        .vti.
     OutOfMemoryError
         If a .vti would not fit in memory.
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
-    path = check_field_target(path, force=force)
     with saving_field(path, force=force) as file:
         file.check_fits(field.placed.shape, field.factor)
         file.write(field)
@@ -254,31 +238,31 @@ def read_field(path: str | Path) -> FineField:
 
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file by their keys, which have the kinds and shapes of ``ARRAYS``."""
-    arrays: dict[str, NDArray[Any]] = {}
-    with zipfile.ZipFile(path) as archive:
-        sizes = {each.filename.removesuffix(".npy"): each.file_size for each in archive.infolist()}
-        missing = [key for key in ARRAYS if key not in sizes]
+    if not zipfile.is_zipfile(path):  # NumPy would take it for a pickle
+        raise FileError(f"{path} is no refined field: it is no .npz archive")
+    with np.load(path, allow_pickle=False) as archive:
+        missing = [key for key in ARRAYS if key not in archive.files]
         if missing:
             raise FileError(f"{path} is no refined field: it has no key {missing[0]!r}")
-        need = 3 * sum(sizes[key] for key in ARRAYS)
+        need = 3 * sum(each.file_size for each in archive.zip.infolist())
         check_fits(need, f"{path}, as a field,", "read it on a larger machine")
-        for key, (kinds, shape) in ARRAYS.items():
-            with archive.open(f"{key}.npy") as member:
-                array = npy.read_array(member, allow_pickle=False)
-            if key == "version" and array != VERSION:
-                said = f"has format version {array}, this program reads {VERSION}"
-                raise FileError(f"{path} {said}: use a newer one")
-            is_like = all(want in (None, n) for want, n in zip(shape, array.shape))
-            if array.dtype.kind not in kinds or array.ndim != len(shape) or not is_like:
-                said = f"{array.dtype} of shape {array.shape}"
-                raise FileError(f"{path}[{key}] is {said}: it belongs to no refined field")
-            arrays[key] = array
+        if archive["version"] != VERSION:
+            said = f"has format version {archive['version']}, this program reads {VERSION}"
+            raise FileError(f"{path} {said}: use a newer one")
+        arrays = {key: archive[key] for key in ARRAYS}
+    for key, (kinds, shape) in ARRAYS.items():
+        array = arrays[key]
+        is_like = all(want in (None, n) for want, n in zip(shape, array.shape))
+        if array.dtype.kind not in kinds or array.ndim != len(shape) or not is_like:
+            said = f"{array.dtype} of shape {array.shape}"
+            raise FileError(f"{path}[{key}] is {said}: it belongs to no refined field")
     return arrays
 
 
 def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
     """Return the field of arrays, which are checked: a mesh of others would have holes."""
-    factor, shape = OPTIONS["factor"].check(int(arrays["factor"])), tuple(map(int, arrays["shape"]))
+    factor, (nx, ny, nz) = OPTIONS["factor"].check(int(arrays["factor"])), arrays["shape"].tolist()
+    shape = nx, ny, nz
     if min(shape) < 2:
         raise FileError(f"{path} is no refined field: its grid has the shape {shape}")
     grid = SdfGrid.trusted(
@@ -289,45 +273,31 @@ def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
         field=Field(own_lattice=True),  # it is on the lattice of the field already
     )
     for key in ("voxels", "sample_voxels", "border_inside"):
-        number = arrays[key].astype(np.int64) @ (shape[1] * shape[2], shape[2], 1)
+        number = arrays[key].astype(np.int64) @ (ny * nz, nz, 1)
         if (arrays[key] < 0).any() or (arrays[key] >= shape).any() or (np.diff(number) <= 0).any():
             raise FileError(f"{path}[{key}] is damaged: its voxels are not in order in the grid")
         arrays[key] = np.ascontiguousarray(arrays[key], np.int32)
-    voxels, values, border = (arrays[key] for key in ("voxels", "values", "border_inside"))
-    samples, distances = arrays["sample_voxels"], arrays["sample_distances"]
-    parts, side = share_parts(neighbour_table(voxels, shape)), factor + 1
-    at_border = ((border == 0) | (border == np.array(shape) - 1)).any(1)
-    numbers = (np.ravel_multi_index(tuple(ijk.T), shape) for ijk in (border, voxels))
-    is_whole = values.shape == (len(voxels), side, side, side) and len(voxels) > 0
-    half = _in_half_voxels(values.reshape(len(voxels), -1), grid) if is_whole else values
-    blocks = np.ascontiguousarray(half.T)
-    for key, is_sound, fault in (
-        ("values", is_whole, f"it has the shape {values.shape} for {len(voxels)} voxels"),
-        ("sample_distances", len(samples) == len(distances), f"{len(samples):,} are wanted"),
-        ("values", np.isfinite(blocks).all(), "not all values are finite"),
-        (
-            "border_inside",
-            at_border.all() and not np.isin(*numbers).any(),
-            "not all are border voxels without a block",
-        ),
-    ):
-        if not is_sound:
-            raise FileError(f"{path}[{key}] is damaged: {fault}")
-    three = (shape[0], shape[1], shape[2])
-    plain = FineField(three, factor, voxels, blocks, parts)
-    if (plain.values[plain.numbers] != blocks.T).any():
+    voxels, values = arrays["voxels"], arrays["values"]
+    side = factor + 1
+    if values.shape != (len(voxels), side, side, side) or not len(voxels):
+        said = f"it has the shape {values.shape} for {len(voxels)} voxels"
+        raise FileError(f"{path}[values] is damaged: {said}")
+    parts = share_parts(neighbour_table(voxels, shape))
+
+    def in_half_voxels(world: NDArray[Any]) -> FloatArray:  # the float32 numbers that were written
+        half = np.divide(world, grid.voxel_size / 2, dtype=np.float64)
+        return np.ascontiguousarray(half, np.float32)
+
+    blocks = in_half_voxels(values.reshape(len(voxels), -1).T)
+    plain = FineField(shape, factor, voxels, blocks, parts)
+    if not (plain.values[plain.numbers] == blocks.T).all():  # NaN is not, either
         raise FileError(f"{path}[values] is damaged: blocks differ at nodes that they share")
+    distances = in_half_voxels(arrays["sample_distances"])
     return FineField(
-        *(three, factor, voxels, blocks, parts),
-        spheres=SampleSpheres(three, samples, _in_half_voxels(distances, grid)),
+        *(shape, factor, voxels, blocks, parts),
+        spheres=SampleSpheres(shape, arrays["sample_voxels"], distances),
         grid=grid,
         offset=float(arrays["offset"]),
         leaves=bool(arrays["leaves"]),
-        border_inside=border,
+        border_inside=arrays["border_inside"],
     )
-
-
-def _in_half_voxels(world: NDArray[Any], grid: SdfGrid) -> FloatArray:
-    """Return distances in world units in half voxels: the float32 numbers that were written."""
-    half: FloatArray = np.divide(world, grid.voxel_size / 2, dtype=np.float64).astype(np.float32)
-    return half

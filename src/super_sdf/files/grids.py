@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -17,20 +18,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError
+from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError, check_modules
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
-from ..options import AxisOrder, Options, Space, Values, check_path
+from ..options import OPTIONS, AxisOrder, Options, Space, Values, check_path
 from ..threads import held_memory, memory_bound
-from .formats import check_library, choose_axes, find_format, split_member
+from .formats import check_grid_file, find_format, split_member
 from .output import check_free, replacing
-from .regular import check_grid_file
-from .volume import Request, Volume, axes_direction, find_placement, place_in_world
+from .readers import Names, Request, Volume, axes_direction, find_placement
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 ROOM_SHARE = 0.25  # of the memory that is left: a larger .npy stays mapped in any order of axes
+NAMING = ("nrrd", "dicom")  # formats of which a file may name its labels
 
 
 def read_grid(
@@ -51,7 +52,8 @@ def read_grid(
     Parameters
     ----------
     path : path
-        The file; ``FILE:NAME`` names one of several arrays in a file.
+        The file; ``FILE:NAME`` names one of several arrays in a file, and ``FILE:NAME[3]`` or
+        ``FILE[3]`` the fourth of several times, channels or classes in an array.
     spacing, origin, direction : numbers, optional
         Used instead of those in the file; see ``make_grid``. A direction goes with files that
         state no axes.
@@ -88,20 +90,32 @@ def read_array(
     space: Space | None,
     max_memory: int | None,
 ) -> dict[str, Any]:
-    """Return values, place (unless ``given``), space and notes: see ``read_grid``."""
+    """Return values, place (unless ``given``), hint, space and notes: see ``read_grid``."""
     path, direction = check_path(path, "path"), given["direction"]
-    order = choose_axes(find_format(path), axes, direction)
-    with open_volume(path, order, memory_left(max_memory)) as (volume, request):
+    with open_volume(path, axes, memory_left(max_memory), direction) as (volume, request):
         volume = volume.in_space(space, str(path))
         if direction is not None:  # of x, y and z
-            volume = replace(volume, direction=axes_direction(volume.axes or order))
+            volume = replace(volume, direction=axes_direction(volume.axes or request.axes))
         arrays = _taken(volume, request, given)
     return arrays | {"notes": volume.notes, "space": volume.space}
 
 
+def names_in(path: str | Path) -> Names:
+    """Return the names of labels, and their colours, that a grid file states."""
+    if find_format(path).key not in NAMING:
+        return {}
+    with open_volume(Path(path), None, describes=True) as (volume, _):
+        return volume.names
+
+
 @contextmanager
 def open_volume(
-    path: Path, axes: str, left: int | None = None, *, describes: bool = False
+    path: Path,
+    axes: str | None = None,
+    left: int | None = None,
+    direction: Any = None,
+    *,
+    describes: bool = False,
 ) -> Iterator[tuple[Volume, Request]]:
     """Yield the volume in a file, and what was asked for.
 
@@ -109,16 +123,25 @@ def open_volume(
     meanwhile is dropped. ``left`` is how many bytes of memory it may take, None if unknown;
     ``describes`` says that no sample will be read.
     """
-    format_, (file, member) = find_format(path), split_member(path)
+    format_, (file, named) = find_format(path), split_member(path)
     check_grid_file(path)
-    check_library(format_)
+    if format_.extra:
+        check_modules(f"{format_.name} ({format_.suffixes[0]})", format_.extra)
+    member, brackets = re.fullmatch(r"(.*?)((?:\[\d+\])*)", named or "", re.S).groups()  # type: ignore[union-attr]
+    numbers = tuple(map(int, re.findall(r"\d+", brackets)))
+    axes = OPTIONS["axes"].check(axes)
+    if format_.axes is None and (axes or direction is not None):
+        what = f"axes is {axes!r}" if axes else "direction is given"
+        raise OptionError(f"{what}, but {format_.name} files state their axes: leave it out")
+    order = axes or format_.axes or "xyz"
     logs = logging.root.manager.disable
     try:
         with warnings.catch_warnings(), ExitStack() as files:
             warnings.simplefilter("ignore")
             logging.disable(logging.CRITICAL)  # what matters is raised
             readers = import_module(f".readers.{format_.module}", __package__)
-            request = Request(file, member, axes, files, left, describes)
+            about = member or None, numbers, order, files, left, describes, bool(axes)
+            request = Request(file, *about)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
         if str(file) in error.flagged:
@@ -141,13 +164,14 @@ def memory_left(max_memory: int | None = None) -> int | None:
 
 
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
-    """Return values (nx, ny, nz), spacing, origin and direction of a volume, for ``make_grid``."""
+    """Return values (nx, ny, nz), place and hint of a volume, for ``make_grid``."""
     check_kind(volume.dtype, volume.shape)
-    placement = find_placement(volume)
-    place = place_in_world(volume, placement, given)
+    placement = find_placement(volume, given)
+    place = {**placement.place, "hint": volume.hint}
     size = prod(volume.shape) * volume.dtype.itemsize
     is_large = request.left is not None and size > ROOM_SHARE * request.left
-    if volume.is_mapped and (placement.is_straight or is_large):
+    is_ordered = placement.order == (0, 1, 2) and all(step.step > 0 for step in placement.steps)
+    if volume.is_mapped and (is_ordered or is_large):
         return {"values": placement.ordered(volume.read()), **place}
     request.check_fits(volume.shape, volume.dtype)
     values = placement.ordered(volume.read())
@@ -184,7 +208,7 @@ def grid_from_image(
     from .readers.vtk import NAME, volume_of_image
 
     volume = volume_of_image(image, scalars)
-    request = Request(Path(NAME), None, "zyx", ExitStack(), memory_left(max_memory))
+    request = Request(Path(NAME), None, (), "zyx", ExitStack(), memory_left(max_memory))
     return make_grid(**_taken(volume, request, {}), **values)
 
 
@@ -195,20 +219,18 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     Chunks and shards are in the order of the array's own axes. Raises as ``read_grid``.
     """
     path = check_path(path, "path")
-    format_ = find_format(path)
-    with open_volume(path, choose_axes(format_, None), describes=True) as (volume, _):
+    with open_volume(path, describes=True) as (volume, _):
         if len(volume.shape) != 3:
             raise FileError(f"its array has shape {volume.shape}: give three axes")
-        placement = find_placement(volume)
-        place = place_in_world(volume, placement, {})
-    shape = placement.of_world(volume.shape)
+        order, _, place = find_placement(volume, {})
+    shape = [volume.shape[axis] for axis in order]
     facts: dict[str, Any] = {
         "file": str(path),
-        "format": format_.name,
-        "shape": list(shape),
+        "format": find_format(path).name,
+        "shape": shape,
         "dtype": str(volume.dtype),
         "bytes": prod(shape) * volume.dtype.itemsize,
-        "axes in the file": "".join("xyz"[w] for w in placement.world_axes),
+        "axes in the file": "".join("xyz"[order.index(axis)] for axis in range(3)),
         **{k: at if at is None else np.ravel(at).astype(float).tolist() for k, at in place.items()},
         **({"space": volume.space} if volume.space else {}),
         **volume.about,

@@ -1,55 +1,63 @@
-"""Mesh files: the table of formats, checks of a target, and what a format can hold.
+"""Mesh files: checks of a target, what a format can hold, and the fast formats, PLY and STL.
 
-A target is checked before the work starts, and only complete files appear. Far from the world
-origin float32 cannot tell neighbouring vertices apart: degenerate triangles, and a mesh that is no
-longer closed when a program reads it. So it is checked whether the numbers of a format can hold a
-mesh.
+``scenes`` writes the other formats. A target is checked before the work starts, and only complete
+files appear. Far from the world origin float32 cannot tell neighbouring vertices apart: degenerate
+triangles, and a mesh that is no longer closed when a program reads it. So it is checked whether the
+numbers of a format can hold a mesh.
+
+A new format is a name in ``options.MESH_FORMATS`` and a function ``write_NAME``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import struct
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..arrays import BoolArray, IntArray, Triple
-from ..errors import FileError, OptionError
-from ..options import OPTIONS, Unit, check_path
+from ..arrays import BoolArray, FloatArray, Triple
+from ..errors import FileError, MeshError, OptionError
+from ..options import MESH_FORMATS, OPTIONS, Unit, check_path
 from ..surface.mesh import Mesh, check_mesh
-from . import mesh_writers as writers
-from .mesh_writers import Parts, World
 from .output import check_free, replacing
 
-WORLD_ORIGIN = (0.0, 0.0, 0.0)
-AS_IT_IS = World()
+MESH_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
+SINGLE = (".stl", ".glb")  # have float32 coordinates, those of .glb relative to a point
+SCENES = (".glb", ".3mf")  # have parts with names and colours, and a unit
+STL_CHUNK = 1 << 18  # triangles at a time
+STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+PLY_HEADER_BYTES = 320  # padded, so that arrays of numbers can be mapped
+
+Colour: TypeAlias = tuple[int, int, int]
+"""Red, green and blue, from 0 to 255."""
+Parts: TypeAlias = Mapping[str, Mesh]
+"""Meshes by their names; a mesh alone has the name ""."""
 
 
-class MeshFormat(NamedTuple):
-    """A mesh file format."""
+@dataclass(frozen=True)
+class World:
+    """What a file says of its meshes."""
 
-    write: Callable[[Parts, Path, World], None]
-    is_single: bool = False  # whether coordinates are float32
-    has_origin: bool = False  # whether coordinates may be relative to a point
-    has_scene: bool = False  # whether it has parts with names and colours, and a unit
+    unit: str | None = None
+    space: str | None = None  # anatomical: RAS or LPS
+    colours: Mapping[str, Colour] = field(default_factory=dict)  # of some parts, by name
+    origin: Triple = (0.0, 0.0, 0.0)  # of the coordinates in the file
 
-
-MESH_TABLE = {
-    ".ply": MeshFormat(writers.write_ply),
-    ".stl": MeshFormat(writers.write_stl, is_single=True),
-    ".obj": MeshFormat(writers.write_obj),
-    ".off": MeshFormat(writers.write_off),
-    ".glb": MeshFormat(writers.write_glb, is_single=True, has_origin=True, has_scene=True),
-    ".3mf": MeshFormat(writers.write_3mf, has_scene=True),
-}
-MESH_SUFFIXES = tuple(MESH_TABLE)
+    @property
+    def note(self) -> str:
+        """Where 3D Slicer looks for the space of a mesh: a word in a header."""
+        return f"SPACE={self.space}" if self.space else ""
 
 
-def format_of(path: str | Path) -> MeshFormat:
-    """Return the format of a mesh file, whose suffix must be one of ``MESH_SUFFIXES``."""
-    return MESH_TABLE[Path(path).suffix.lower()]
+def has_parts(path: str | Path) -> bool:
+    """Return whether the format of a mesh file has parts with names and colours, and a unit."""
+    return Path(path).suffix.lower() in SCENES
 
 
 def check_target(path: str | Path, *, force: bool = False, unit: str | None = None) -> Path:
@@ -62,8 +70,8 @@ def check_mesh_suffix(path: Path, unit: str | None = None) -> None:
     """Raise OptionError if the suffix is not that of a mesh format, or of none that has a unit."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
-    if unit and not format_of(path).has_scene:
-        stating = " or ".join(suffix for suffix, kind in MESH_TABLE.items() if kind.has_scene)
+    if unit and not has_parts(path):
+        stating = " or ".join(SCENES)
         raise OptionError(f"unit is {unit}: {path} can state none, give {stating}, or no unit")
 
 
@@ -103,6 +111,8 @@ def write_mesh(
     ------
     OptionError
         If the suffix is unknown, or that of a format that states no unit.
+    MeshError
+        If the arrays are no mesh: a face names a vertex that there is not, say.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; or if the format cannot
         hold the mesh: a coordinate is not finite, or corners of a triangle would coincide.
@@ -112,18 +122,15 @@ def write_mesh(
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     check_target(path, force=force, unit=world.unit)
 
-    def tell(complete: Mapping[Path, Path]) -> None:
-        if before_rename:
-            before_rename(complete[path])
-
-    write_meshes({path: {"": mesh}}, force=force, world=world, before_rename=tell)
+    then = (lambda complete: before_rename(complete[path])) if before_rename else None
+    write_meshes({path: {"": mesh}}, force=force, world=world, before_rename=then)
 
 
 def write_meshes(
     files: Mapping[Path, Parts],
     *,
     force: bool = False,
-    world: World = AS_IT_IS,
+    world: World | None = None,
     before_rename: Callable[[Mapping[Path, Path]], None] | None = None,
 ) -> None:
     """Write files of meshes, by path and name: all of them, or none.
@@ -131,18 +138,41 @@ def write_meshes(
     ``before_rename`` is called with all complete files, by the paths that they will have. A format
     of one mesh takes the only one of its file.
     """
-    complete: dict[Path, Path] = {}
+    complete, world = dict[Path, Path](), world or World()
     with ExitStack() as stack:
         for path, parts in files.items():
-            placed = World(world.unit, world.space, world.colours, _origin(path, parts.values()))
-            for mesh in parts.values():
-                _check_holds(path, mesh, placed.origin)
+            suffix, meshes, origin = path.suffix.lower(), list(parts.values()), world.origin
+            for mesh in meshes:
+                _check_arrays(mesh)
+            boxes = [(m.vertices.min(0), m.vertices.max(0)) for m in meshes if len(m.vertices)]
+            if suffix == ".glb" and boxes and meshes[0].vertices.dtype != np.float32:
+                x, y, z = np.min(boxes, axis=(0, 1)) / 2 + np.max(boxes, axis=(0, 1)) / 2
+                origin = float(x), float(y), float(z)
+            for mesh in meshes:
+                _check_holds(path, mesh, origin)
             complete[path] = stack.enter_context(replacing(path, force=force))
-            format_of(path).write(parts, complete[path], placed)
+            write: Any = {".ply": write_ply, ".stl": write_stl}.get(suffix)
+            if write is None:
+                from . import scenes
+
+                write = getattr(scenes, f"write_{suffix[1:]}")
+            write(parts, complete[path], replace(world, origin=origin))
         if before_rename:
             before_rename(complete)
         for path in files:
             check_free(path, force=force)  # before the first of them appears
+
+
+def _check_arrays(mesh: Mesh) -> None:
+    """Raise MeshError if arrays are no mesh."""
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    for name, array, kinds in (("vertices", vertices, "f"), ("faces", faces, "iu")):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
+            said = f"the {name} of the mesh are {array.dtype} of shape {array.shape}"
+            raise MeshError(f"{said}: give rows of three {'floats' if kinds == 'f' else 'indices'}")
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
+        worst = int(faces.min() if faces.min() < 0 else faces.max())
+        raise MeshError(f"a face of the mesh names vertex {worst} of {len(vertices):,}: repair it")
 
 
 def _check_holds(path: Path, mesh: Mesh, origin: Triple) -> None:
@@ -150,26 +180,88 @@ def _check_holds(path: Path, mesh: Mesh, origin: Triple) -> None:
     vertices, faces = mesh.vertices, mesh.faces
     if not np.isfinite(vertices).all():
         raise FileError(f"{path} cannot be written: a vertex of the mesh is not finite")
-    if not format_of(path).is_single or vertices.dtype == np.float32:
+    if path.suffix.lower() not in SINGLE or vertices.dtype == np.float32:
         return
+
+    def flat(points: NDArray[Any]) -> BoolArray:  # triangles with two corners at one place
+        a, b, c = (points[faces[:, corner]] for corner in range(3))
+        same: BoolArray = (a == b).all(1) | (b == c).all(1) | (c == a).all(1)
+        return same
+
     with np.errstate(over="ignore"):
         rounded = (vertices - origin).astype(np.float32)
-    if not np.isfinite(rounded).all() or (_flat(rounded, faces) & ~_flat(vertices, faces)).any():
+    if not np.isfinite(rounded).all() or (flat(rounded) & ~flat(vertices)).any():
         said = f"{path} cannot be written: {path.suffix} has single precision, in which vertices"
         raise FileError(f"{said} of this mesh coincide; write .ply or .obj")
 
 
-def _flat(vertices: np.ndarray[Any, Any], faces: IntArray) -> BoolArray:
-    """Return which triangles have two corners at the same position."""
-    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
-    flat: BoolArray = (a == b).all(1) | (b == c).all(1) | (c == a).all(1)
-    return flat
+def write_ply(parts: Parts, path: Path, world: World) -> None:
+    """Write binary little-endian PLY."""
+    (mesh,) = parts.values()
+    kind = "double" if mesh.vertices.dtype == np.float64 else "float"
+    with path.open("wb") as file:
+        properties = [f"{kind} {axis}" for axis in "xyz"]
+        _write_ply(file, mesh.vertices, mesh.faces, properties, world.note, PLY_HEADER_BYTES)
 
 
-def _origin(path: Path, meshes: Iterable[Mesh]) -> Triple:
-    """Return the local origin of a file: the middle of float64 meshes, if the format has one."""
-    boxes = [(m.vertices.min(0), m.vertices.max(0)) for m in meshes if len(m.vertices)]
-    if not boxes or not format_of(path).has_origin or boxes[0][0].dtype == np.float32:
-        return WORLD_ORIGIN
-    x, y, z = (np.min(boxes, axis=(0, 1)) / 2 + np.max(boxes, axis=(0, 1)) / 2).tolist()
-    return x, y, z
+def write_coloured_ply(
+    mesh: Mesh,
+    residuals: FloatArray,
+    colours: NDArray[np.uint8],
+    path: Path,
+    *,
+    force: bool = False,
+) -> None:
+    """Write binary PLY whose vertices also have ``residuals`` (n,) and ``colours`` (n, 3).
+
+    Positions are written as double. The file is complete or not at all; ``force`` replaces one
+    that exists.
+    """
+    kind = [("position", "<f8", 3), ("residual", "<f4"), ("colour", "u1", 3)]
+    rows = np.empty(len(residuals), kind)
+    rows["position"], rows["residual"], rows["colour"] = mesh.vertices, residuals, colours
+    properties = [*(f"double {axis}" for axis in "xyz"), "float residual"]
+    properties += [f"uchar {colour}" for colour in ("red", "green", "blue")]
+    note = "residual: distance of samples to the mesh minus their value, in voxels"
+    with replacing(path, force=force) as part, part.open("wb") as file:
+        _write_ply(file, rows, mesh.faces, properties, note)
+
+
+def _write_ply(
+    file: IO[bytes],
+    vertices: NDArray[Any],
+    faces: NDArray[Any],
+    properties: list[str],
+    note: str,
+    header_bytes: int = 0,
+) -> None:
+    """Write rows of vertices, triangles, and before them a header whose comment is padded."""
+    first = "ply\nformat binary_little_endian 1.0\ncomment made by super-sdf"
+    first += f"\ncomment {note}" * bool(note)
+    of_vertices = "".join(f"property {each}\n" for each in properties)
+    rest = f"\nelement vertex {len(vertices)}\n{of_vertices}element face {len(faces)}\n"
+    rest += "property list uchar int vertex_indices\nend_header\n"
+    file.write((first.ljust(header_bytes - len(rest)) + rest).encode("ascii"))
+    little = vertices.astype(vertices.dtype.newbyteorder("<"), copy=False)
+    file.write(np.ascontiguousarray(little).data)
+    rows = np.empty(len(faces), PLY_FACE)
+    rows["count"], rows["corners"] = 3, faces
+    file.write(rows.data)
+
+
+def write_stl(parts: Parts, path: Path, world: World) -> None:
+    """Write binary STL: each triangle stores its normal and the positions of its corners."""
+    (mesh,) = parts.values()
+    vertices, least = mesh.vertices.astype(np.float32, copy=False), np.finfo(np.float64).tiny
+    with path.open("wb") as file:
+        file.write(f"made by super-sdf {world.note}".ljust(80).encode("ascii"))
+        file.write(struct.pack("<I", len(mesh.faces)))
+        for first in range(0, len(mesh.faces), STL_CHUNK):
+            corners = vertices[mesh.faces[first : first + STL_CHUNK]]
+            sides = corners[:, 1:].astype(np.float64) - corners[:, :1]
+            sides /= np.maximum(np.abs(sides).max((1, 2), keepdims=True), least)  # at any scale
+            normals = np.cross(sides[:, 0], sides[:, 1])
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), least)
+            rows = np.zeros(len(corners), STL_ROW)
+            rows["normal"], rows["corners"] = normals, corners
+            file.write(rows.data)

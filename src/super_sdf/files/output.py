@@ -37,7 +37,7 @@ def check_free(path: Path, *, force: bool = False) -> Path:
         raise WriteError(f"{path} exists: remove it or use --force")
     if mode is not None and not stat.S_ISREG(mode):
         raise WriteError(f"{path} is not a regular file: give another name")
-    folder = _behind_links(path).parent
+    folder = Path(os.path.realpath(path) if path.is_symlink() else path).parent
     if not folder.is_dir():
         raise WriteError(f"{folder} is not a folder: make it first")
     if not os.access(folder, os.W_OK | os.X_OK):
@@ -65,10 +65,6 @@ def _mode_of(path: Path) -> int | None:
     return mode
 
 
-def _behind_links(path: Path) -> Path:
-    return Path(os.path.realpath(path)) if path.is_symlink() else path
-
-
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
     """Turn the system's errors in the block into a WriteError that names the path."""
@@ -92,7 +88,7 @@ def replacing(path: Path, *, force: bool = True) -> Iterator[Path]:
     same target that killed processes left are removed. Without ``force`` a file that exists at the
     end stays, which is an error.
     """
-    target = _behind_links(path) if force else path
+    target = Path(os.path.realpath(path)) if force and path.is_symlink() else path
     # the last bytes of a long name; a report may hold names that no file can have
     name = target.name.encode("utf-8", "surrogatepass")[-LONGEST:].decode("utf-8", "ignore")
     part = target.with_name(f".{name}.{os.getpid()}.part")

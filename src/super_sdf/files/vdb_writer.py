@@ -28,9 +28,9 @@ from ..refine.field import FineField, FineLattice, fine_grid
 
 MAGIC = 0x56444220
 ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
-# How the inactive values of a node are stored: the first three have one, and a mask chooses between
-# two in the next three; the last stores every value.
-MINUS_BACKGROUND, ONE_VALUE, MASKED, MASKED_ONE, MASKED_TWO, ALL = 1, 2, 3, 4, 5, 6
+# How the inactive values of a node are stored: 0 to 2 have one; in 3 to 5 a mask chooses between
+# two (in 3 the background, where it is set, and minus that); the last stores every value.
+ONE_VALUE, MASKED, MASKED_ONE, MASKED_TWO, ALL = 2, 3, 4, 5, 6
 EDGES = (4096, 128)  # voxels along a child of the root, and along a child of that
 LEAF = 8
 OUTSIDE, INSIDE, MIXED = 0, 1, 2  # a cube of voxels: all background, all minus that, or neither
@@ -52,7 +52,6 @@ class LevelSet:
     sides: Sides  # of the cubes of 8^3 voxels; the first along each axis is that before voxel 0
     leaves: list[bytes]  # of the mixed cubes, in C order
     active: int  # voxels
-    box: tuple[NDArray[np.int64], NDArray[np.int64]]  # first and last of the active voxels
 
 
 def write_level_set(field: FineField, path: Path) -> None:
@@ -69,27 +68,21 @@ def write_level_set(field: FineField, path: Path) -> None:
     background = np.float32(HALF_WIDTH * grid.voxel_size)
     sides: list[Sides] = []
     leaves: list[bytes] = []
-    count, low, high = 0, np.full(3, 1 << 31), np.full(3, -LEAF)
+    count = 0
     for values in _slabs(field, background):
         cubes = values.reshape(LEAF, values.shape[1] // LEAF, LEAF, -1, LEAF)
         side = np.full(cubes.shape[1:4:2], MIXED, np.uint8)
         side[cubes.min((0, 2, 4)) >= background] = OUTSIDE
         side[cubes.max((0, 2, 4)) <= -background] = INSIDE
-        mixed = np.argwhere(side == MIXED)
         inner = cubes.transpose(1, 3, 0, 2, 4)[side == MIXED]  # (n, 8, 8, 8)
         active = np.abs(inner) < background
-        first = LEAF * (np.insert(mixed, 0, len(sides), axis=1) - 1)  # voxel of each leaf
-        for axis, across in enumerate(((2, 3), (1, 3), (1, 2))):
-            at = (first[:, axis, None] + np.arange(LEAF))[active.any(across)]
-            low[axis], high[axis] = at.min(initial=low[axis]), at.max(initial=high[axis])
         count += int(np.count_nonzero(active))
         leaves += map(leaf_bytes, inner.reshape(-1, LEAF**3), active.reshape(-1, LEAF**3))
         sides.append(side)
     if not count:
         raise NoSurfaceError("the field has no surface: there is no level set to write")
-    tree = LevelSet(grid, background, np.stack(sides), leaves, count, (low, high))
     with path.open("wb") as file:
-        write_tree(file, tree)
+        write_tree(file, LevelSet(grid, background, np.stack(sides), leaves, count))
 
 
 def _slabs(field: FineField, background: np.float32) -> Iterator[FloatArray]:
@@ -98,26 +91,22 @@ def _slabs(field: FineField, background: np.float32) -> Iterator[FloatArray]:
     Beyond the lattice are the distances from a surface of which its border is the nearest part.
     """
     lattice = FineLattice(field)
-    # how deep inside nodes may be, by their steps from the border; farther in, all is cut off
-    steps = np.array([*range(HALF_WIDTH), np.inf], np.float32)
-    least = 0 - steps * background / HALF_WIDTH
-    depths, beyond, pads = [], [], []
+    least, beyond, pads = [], [], []  # along each axis
     for n in lattice.shape:
         end = LEAF * -(-(n + HALF_WIDTH - 1) // LEAF)  # what is beyond is all background
-        at = np.arange(-LEAF, end)
-        steps = np.maximum(np.maximum(-at, at - n + 1), 0)
-        beyond.append(np.where(steps < HALF_WIDTH, steps * (background / HALF_WIDTH), np.inf))
-        inner = np.minimum(np.arange(n), n - 1 - np.arange(n))
-        depths.append(np.minimum(inner, HALF_WIDTH).astype(np.uint8))
+        at, inner = np.arange(-LEAF, end), np.arange(n)
+        depth = np.minimum(inner, n - 1 - inner)  # no node is deeper inside than the border is away
+        least.append((depth * -background / HALF_WIDTH).astype(np.float32) + np.float32(0))
+        beyond.append(np.maximum(np.maximum(-at, at - n + 1), 0) * background / HALF_WIDTH)
         pads.append((LEAF, end - n))
-    depth_across = np.minimum(depths[1][:, None], depths[2])
+    least_across = np.maximum(least[1][:, None], least[2])
     beyond_across = np.hypot(beyond[1][:, None], beyond[2])
     count = lattice.shape[0]
     for first in range(-LEAF, count + pads[0][1], LEAF):
         x = np.arange(first, first + LEAF).clip(0, count - 1)
         planes = lattice[int(x[0]) : int(x[-1]) + 1]
-        depth = depths[0][x[0] : x[-1] + 1, None, None]
-        planes = np.maximum(planes, least[np.minimum(depth, depth_across)])
+        floor = np.maximum(least[0][x[0] : x[-1] + 1, None, None], least_across)
+        planes = np.maximum(planes, floor)
         values = np.pad(planes[x - x[0]], [(0, 0), *pads[1:]], mode="edge")
         away = np.hypot(beyond[0][first + LEAF : first + 2 * LEAF, None, None], beyond_across)
         np.hypot(values, away.astype(np.float32), out=values, where=away > 0)
@@ -127,7 +116,7 @@ def _slabs(field: FineField, background: np.float32) -> Iterator[FloatArray]:
 def leaf_bytes(values: FloatArray, active: BoolArray) -> bytes:
     """Return a leaf of 512 values, those that are not ``active`` the background or minus it."""
     stored = values[active].astype("<f4", copy=False).tobytes()
-    return _mask(active) + _inactive(values > 0, ~active) + stored
+    return _mask(active) + bytes([MASKED]) + _mask(values > 0) + stored
 
 
 def write_tree(file: IO[bytes], tree: LevelSet) -> None:
@@ -141,8 +130,6 @@ def write_tree(file: IO[bytes], tree: LevelSet) -> None:
     file.write(bytes(start - places))  # they follow
     entries = (
         ("class", "string", b"level set"),
-        ("file_bbox_max", "vec3i", struct.pack("<3i", *tree.box[1])),
-        ("file_bbox_min", "vec3i", struct.pack("<3i", *tree.box[0])),
         ("file_voxel_count", "int64", struct.pack("<q", tree.active)),
         ("is_saved_as_half_float", "bool", b"\0"),
         ("name", "string", b"surface"),
@@ -160,9 +147,8 @@ def write_tree(file: IO[bytes], tree: LevelSet) -> None:
 
 def _write_topology(file: IO[bytes], tree: LevelSet) -> list[int]:
     """Write the nodes without the leaves' values; return the numbers of the leaves in order."""
-    leaves = _padded(tree.sides, WIDTHS[1])
-    inner = _padded(_joined(leaves, WIDTHS[1]), WIDTHS[0])
-    root = _joined(inner, WIDTHS[0])
+    leaves, inner = _nodes(tree.sides, WIDTHS[1])
+    inner, root = _nodes(inner, WIDTHS[0])
     numbers = np.cumsum(leaves == MIXED, dtype=np.int32).reshape(leaves.shape) - 1
     order: list[int] = []
     children = np.argwhere(root != OUTSIDE)
@@ -202,32 +188,21 @@ def _mask(on: BoolArray) -> bytes:
 
 def _node(sides: Sides) -> bytes:
     """Return a node without its children: which there are, no active tile, and the others."""
-    child = sides.ravel() == MIXED
-    return _mask(child) + bytes(len(child) // 8) + _inactive(sides.ravel() == OUTSIDE, ~child)
+    outside = _mask(sides.ravel() == OUTSIDE)
+    return _mask(sides.ravel() == MIXED) + bytes(len(outside)) + bytes([MASKED]) + outside
 
 
-def _inactive(outside: BoolArray, which: BoolArray) -> bytes:
-    """Return how the inactive values of a node are stored: which are the background."""
-    if outside[which].all():
-        return bytes(1)
-    if not outside[which].any():
-        return bytes([MINUS_BACKGROUND])
-    return bytes([MASKED]) + _mask(outside)
+def _nodes(sides: Sides, width: int) -> tuple[Sides, Sides]:
+    """Return cubes in whole nodes of ``width``^3, and what the nodes are.
 
-
-def _padded(sides: Sides, width: int) -> Sides:
-    """Return cubes, of which the first are those before node 0, in whole nodes of ``width``^3."""
+    The first cubes are those before node 0.
+    """
     before = width - 1
-    return np.pad(sides, [(before, -(before + count) % width) for count in sides.shape])
-
-
-def _joined(sides: Sides, width: int) -> Sides:
-    """Return what nodes of ``width``^3 cubes are."""
-    x, y, z = (count // width for count in sides.shape)
-    cubes = sides.reshape(x, width, y, width, z, width)
+    padded = np.pad(sides, [(before, -(before + count) % width) for count in sides.shape])
+    x, y, z = (count // width for count in padded.shape)
+    cubes = padded.reshape(x, width, y, width, z, width)
     low, high = cubes.min((1, 3, 5)), cubes.max((1, 3, 5))
-    joined: Sides = np.where(low == high, low, np.uint8(MIXED))
-    return joined
+    return padded, np.where(low == high, low, np.uint8(MIXED))
 
 
 def _part(cubes: NDArray[Any], place: NDArray[np.int64], width: int) -> NDArray[Any]:

@@ -11,7 +11,6 @@ CSV, TSV                1,liver
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -20,18 +19,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import FileError, MeshError, OptionError, flag, seen
-from ..files.mesh_writers import World
-from ..files.meshes import check_mesh_suffix, check_target, format_of, write_meshes
+from ..files.formats import check_regular_file, files_of, parse_json
+from ..files.grids import names_in
+from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, write_meshes
 from ..files.output import check_apart
-from ..files.regular import check_regular_file, files_of
-from ..files.volume import PLACE
-from ..grid.sdf_grid import SdfGrid, describe_place, mean_spacing
-from ..network.decoder import Decoder
+from ..files.readers import PLACE
+from ..grid.sdf_grid import SdfGrid, describe_place
+from ..network.contract import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..surface.mesh import Mesh
 from ..threads import Progress, Stopwatch
 from .reconstruct import find_image, in_order, label_meshes
-from .volumes import keep_volumes, volume_notes
+from .volumes import volume_notes
 
 LONGEST = 80  # characters of a name
 
@@ -61,11 +60,6 @@ class LabelConversion:
     warnings: tuple[str, ...] = ()
     closed: bool = True
 
-    def remarks(self) -> list[str]:
-        """Return a note on the labels that the image lacks, if there are some."""
-        names = ", ".join(row["name"] for row in self.missing)
-        return [f"no sample has a label that was asked for: {names}"] * bool(names)
-
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
         made = {"labels": self.labels, "missing": self.missing, "inferred": list(self.notes)}
@@ -85,13 +79,15 @@ def convert_labels(
     """Convert a file with a label image to closed meshes of its labels, which share their walls.
 
     A target ``.glb`` or ``.3mf`` gets all labels as its parts; of another, ``part.ply`` say, each
-    label has its own file, ``part-1.ply``. ``names`` of ``read_names`` take the place of numbers in
-    ``options.labels``, in files and as parts, and parts have their colours. Listed labels that the
-    image lacks are left out. The other parameters are those of ``convert``; options besides
+    label has its own file, ``part-1.ply``. ``names`` of ``read_names``, by default those that the
+    source states, take the place of numbers in ``options.labels``, in files and as parts, and parts
+    have their colours. Listed labels that the image lacks are left out. The other parameters are
+    those of ``convert``; options besides
     ``options.LABELS`` must have their defaults. Errors are those of ``reconstruct_labels`` and
     ``write_mesh``, OptionError if an option does not go with labels; nothing is written then.
     """
-    watch, options, known = Stopwatch(), options or Options(), names or {}
+    watch, options = Stopwatch(), options or Options()
+    known = names or {n: LabelName(*each) for n, each in names_in(source).items()}
     options = with_numbers(replace(options, labels=options.labels or ALL), known)
     check_mesh_suffix(Path(target), options.unit)
     wanted, place = in_order(options.labels), {name: getattr(options, name) for name in PLACE}
@@ -102,21 +98,20 @@ def convert_labels(
     ends = {n: end.encode()[:LONGEST].decode(errors="ignore") for n, end in ends.items()}
     path, ends = Path(target), told_apart(ends, "-")
     paths = [path.with_name(f"{path.stem}-{end}{path.suffix}") for end in ends.values()]
-    if format_of(path).has_scene:
+    if has_parts(path):
         paths = [path] * len(called)
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
     watch.lap("read")
-    meshes = label_meshes(image, network, options.factor, options.max_memory, progress)
+    meshes, notes, warnings = label_meshes(image, network, options, progress)
     for label, mesh in zip(called, meshes):
         if mesh.open_edges():
             raise MeshError(f"the mesh of label {label} is torn: run it again, and report it")
-    volumes, off = image.volumes, list[str]()
+    volumes = image.volumes
     if options.keep_volume:
-        meshes = keep_volumes(meshes, volumes, mean_spacing(grid))
         made = zip(called.values(), meshes, volumes)
-        off = volume_notes({entry.name: (mesh.volume(), volume) for entry, mesh, volume in made})
+        notes += volume_notes({entry.name: (mesh.volume(), volume) for entry, mesh, volume in made})
     watch.lap("mesh")
     files: dict[Path, dict[str, Mesh]] = {path: {} for path in paths}
     rows = []
@@ -131,7 +126,11 @@ def convert_labels(
     watch.lap("write")
     lacking = names_of(image.missing, known)
     missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
-    return LabelConversion(grid, rows, missing, (*grid.notes, *off), watch.seconds)
+    if missing:
+        listed = ", ".join(entry.name for entry in lacking.values())
+        notes.append(f"no sample has a label that was asked for: {listed}")
+    said = (*grid.notes, *notes)
+    return LabelConversion(grid, rows, missing, said, watch.seconds, tuple(warnings))
 
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:
@@ -199,7 +198,7 @@ def read_names(path: str | Path) -> Names:
 
 def _of_json(text: str) -> Iterator[tuple[Any, str, list[str]]]:
     """Yield the labels and names of an object that maps numbers to names, or names to numbers."""
-    found = json.loads(text)
+    found = parse_json(text, "it")
     found = found.get("labels", found) if isinstance(found, dict) else found
     if not isinstance(found, dict):
         raise ValueError("it is no object of names")

@@ -25,9 +25,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, IntArray
+from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, part_of_node
 from ..threads import map_chunks, map_threads, rows_in_chunk, worthwhile_threads
@@ -163,7 +164,7 @@ def choose_cases(
     unsure = np.flatnonzero(table.ambiguous[corners])
     low, row = cells_low_nodes(field.factor)[cell[unsure]], row[unsure]
     steps = CORNERS @ strides(field.factor)
-    values = [field.blocks[low + step, row].astype(np.float64) for step in steps]
+    values = [values_at(field, low + step, row).astype(np.float64) for step in steps]
     joined = np.zeros(len(unsure), np.uint8)
     for n, (a, b, c, d) in enumerate(FACES):
         excess = values[a] * values[c] - values[b] * values[d]
@@ -171,6 +172,17 @@ def choose_cases(
     some = corners[unsure]
     case[unsure] = table.number[some, joined & table.ambiguous[some]]
     return case
+
+
+def values_at(field: FineField, node: NDArray[Any], row: NDArray[Any]) -> FloatArray:
+    """Return the values at nodes of voxels' blocks, of the shape of both.
+
+    NumPy takes a third of the time for one index into a line of all values than for two.
+    """
+    size, last = field.blocks.itemsize, np.array(field.blocks.shape) - 1
+    steps = np.array(field.blocks.strides) // size
+    line = as_strided(field.blocks, (int(last @ steps) + 1,), (size,))
+    return np.asarray(line.take(node * steps[0] + row * steps[1]))
 
 
 @lru_cache
@@ -190,13 +202,14 @@ def lattice_positions(
     ``border`` is that of the grid, see ``cap``.
     """
     axis, node = np.divmod(edge, np.int16(len(field.blocks)))
-    low = field.blocks[node, row].astype(np.float64)
-    high = field.blocks[edge_ends(field.factor)[edge], row].astype(np.float64)
+    low = values_at(field, node, row).astype(np.float64)
+    high = values_at(field, edge_ends(field.factor).take(edge), row).astype(np.float64)
     share = np.clip(low / (low - high), CLEARANCE, 1 - CLEARANCE)
     positions = np.empty((3, len(row)))
+    voxels, nodes = field.voxel_ijk.take(row, 0), block_ijk(field.factor).take(node, 0)
     for along, (before, after) in enumerate(border.T.tolist()):
-        voxel, runs = field.voxel_ijk[row, along], axis == along
-        start = field.factor * voxel + block_ijk(field.factor)[node, along]
+        voxel, runs = voxels[:, along], axis == along
+        start = field.factor * voxel + nodes[:, along]
         positions[along] = start + np.where(runs, share, 0.0)
         if ((voxel < before) | (voxel >= after)).any():  # voxels of a cap: moved onto the border
             ends = before * field.factor - CAP_HEIGHT, after * field.factor + CAP_HEIGHT

@@ -1,5 +1,234 @@
 """The readers of grid files, a module for each library: each turns a Request into a Volume.
 
-A reader says what the file says, in the world coordinates of the file. It may raise anything:
-``files.grids`` turns what a library raises into one line.
+A reader says what the file says, in the world coordinates of the file. Here, and nowhere else, the
+axes of the array are brought into the order and sense in which they lie nearest to the world's.
+What is left is the direction of the grid. A reader may raise anything: ``files.grids`` turns what a
+library raises into one line.
 """
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from itertools import permutations
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...arrays import Triple
+from ...errors import FileError, GridError, OptionError, OutOfMemoryError
+from ...grid.samples import as_direction, check_direction
+from ...threads import in_words
+
+STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
+MOST_NAMED = 10  # arrays that an error lists
+COPIES = 2  # of an array that is loaded, while its axes are put in order
+PLACE = ("spacing", "origin", "direction")
+XYZ = np.eye(3)
+LABELS, DENSITY, DISTANCE = "labels", "density", "distance"  # what a file says its values are
+
+Index: TypeAlias = tuple[slice | int, ...]
+"""Which samples of an array are read: all along its axes in space, one number of each other."""
+Names: TypeAlias = dict[int, tuple[str, tuple[int, int, int] | None]]
+"""Name of each label, and its colour in red, green and blue if the file states one."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a reader is asked for."""
+
+    path: Path
+    member: str | None  # the name of an array in the file
+    numbers: tuple[int, ...]  # along the axes that are not in space, of which one is read
+    axes: str  # the order in a file that does not state one: "xyz" or "zyx"
+    files: ExitStack  # closes what the reader opens, once the samples are read
+    left: int | None = None  # bytes of memory that the process may still take, if that is known
+    describes: bool = False  # no sample will be read: the file is described
+    axes_given: bool = False  # whether the user gave the order
+
+    def check_fits(self, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
+        """Raise OutOfMemoryError if an array that is loaded whole does not fit."""
+        size = prod(map(int, shape)) * dtype.itemsize
+        need, listed = COPIES * size, " x ".join(map(str, shape))
+        if self.left is not None and need > self.left:
+            raise OutOfMemoryError(
+                f"{self.path}, {listed} {dtype}, {size:,} bytes, is loaded whole, which takes "
+                f"{in_words(need)} of memory, {in_words(self.left)} are left; allow more "
+                "(--max-memory), or save it as .npy in C order"
+            )
+
+    def choose(self, names: Sequence[str], what: str) -> str:
+        """Return the name of the array to read: the one asked for, else the only one."""
+        if not names:
+            raise FileError(f"{self.path} holds no {what}")
+        more = f" and {len(names) - MOST_NAMED:,} more" * (len(names) > MOST_NAMED)
+        listed = ", ".join(names[:MOST_NAMED]) + more
+        if self.member is not None:
+            same = [name for name in names if name.strip("/") == self.member.strip("/")]
+            if not same:
+                raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
+            return same[0]
+        if len(names) > 1:
+            raise FileError(
+                f"{self.path} holds several arrays, {listed}: give {self.path}:{names[0]}, say"
+            )
+        return names[0]
+
+    def choose_array(self, shapes: Mapping[str, Sequence[int]], what: str) -> str:
+        """Return the name of the array to read, of three axes or more, by the shapes of all.
+
+        Without a name, those with more than three axes longer than 1 count only beside a number,
+        or if there are no others.
+        """
+        arrays = {name: sum(n > 1 for n in s) > 3 for name, s in shapes.items() if len(s) >= 3}
+        wanted = [name for name, is_more in arrays.items() if is_more == bool(self.numbers)]
+        return self.choose(list(arrays) if self.member or not wanted else wanted, what)
+
+    def pick(
+        self, shape: Sequence[int], kept: Sequence[int] | None = None, names: Sequence[str] = ()
+    ) -> Index:
+        """Return which samples of an array are read; GridError if a number is missing.
+
+        ``kept`` are the axes in space. Without it, axes of length 1 are left out, and of those left
+        the longest are in space.
+        """
+        if kept is None:
+            by_length = sorted(range(len(shape)), key=lambda axis: (shape[axis], axis))
+            kept = by_length[-3:]
+        others = [n for n, count in enumerate(shape) if n not in kept and count != 1]
+        if len(self.numbers) > len(others):
+            raise OptionError(f"{self.path} has {len(others)} axes to choose from by [0], [1], ...")
+        chosen = dict(zip(others, self.numbers))
+        for axis in others:
+            called, count = (names[axis] if names else "") or axis, shape[axis]
+            if axis not in chosen:
+                name = f"{self.path}:{self.member}" if self.member else self.path
+                said = f"{self.path}: its axis {called} has {count} entries"
+                raise GridError(f"{said}: choose one, {name}{'[0]' * len(others)}, say")
+            if chosen[axis] >= count:
+                said = f"its axis {called} has {count} entries, from 0 on"
+                raise GridError(f"{said}: there is none with the number {chosen[axis]}")
+        whole = slice(None)
+        return tuple(whole if n in kept else chosen.get(n, 0) for n in range(len(shape)))
+
+
+@dataclass(frozen=True)
+class Volume:
+    """An array of samples in a file, and where they are in the world.
+
+    Sample (a, b, c) of the axes in space is at ``origin + direction @ (spacing * (a, b, c))``:
+    spacings are those along the axes of the array, and the columns of ``direction`` (unit vectors)
+    their world directions.
+    """
+
+    load: Callable[[Index], Any]  # returns the samples at an index
+    stored: Sequence[int]  # the shape of the array
+    dtype: np.dtype[Any]
+    spacing: Triple | None = None
+    origin: Triple | None = None
+    direction: NDArray[np.float64] | None = None
+    index: Index = (slice(None),) * 3
+    axes: str | None = None  # order of x, y and z along the array, if the file or user names it
+    space: str | None = None  # "RAS" or "LPS", if the file states one of them
+    notes: tuple[str, ...] = ()  # sentences on what the file says, for the user
+    about: dict[str, Any] = field(default_factory=dict)  # how it is stored, for ``info``
+    # spacing, origin, direction of x, y, z as the file has them, unchecked, instead of those above
+    place: dict[str, Any] = field(default_factory=dict)
+    is_mapped: bool = False  # the samples stay in the file
+    hint: str = ""  # what the file says its values are: LABELS, DENSITY, DISTANCE
+    names: Names = field(default_factory=dict)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of samples along each axis in space."""
+        kept = (count for count, at in zip(self.stored, self.index) if isinstance(at, slice))
+        return tuple(map(int, kept)) if len(self.stored) >= 3 else tuple(self.stored)
+
+    def read(self) -> NDArray[Any]:
+        """Return the samples along the axes in space."""
+        samples: NDArray[Any] = np.asanyarray(self.load(self.index))
+        if samples.shape != self.shape:
+            raise FileError(f"its header promises {self.shape} samples, it holds {samples.shape}")
+        return samples
+
+    def in_space(self, space: str | None, name: str) -> Volume:
+        """Return it in an anatomical space, its own if None; OptionError if it states none."""
+        if space in (None, self.space):
+            return self
+        if self.space is None:
+            raise OptionError(f"space is {space}: {name} states neither RAS nor LPS, leave it out")
+        turn = np.array([-1.0, -1.0, 1.0])  # between the two
+        origin = None if self.origin is None else triple(turn * self.origin)
+        turned = turn[:, None] * (XYZ if self.direction is None else self.direction)
+        return replace(self, origin=origin, direction=turned, space=space)
+
+
+def of_array(values: Any) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
+    """Return how a ``Volume`` loads an array that is at hand, its shape and its type."""
+    return lambda index: values[index], tuple(values.shape), np.dtype(values.dtype)
+
+
+def triple(numbers: Any) -> Triple:
+    """Return three numbers as floats."""
+    x, y, z = (float(number) for number in numbers)
+    return x, y, z
+
+
+def from_affine(matrix: NDArray[Any]) -> dict[str, Any]:
+    """Split an affine (3 or 4, 4) into spacing, origin and direction of the array's axes."""
+    columns = np.asarray(matrix, np.float64)[:3, :3]
+    lengths = np.linalg.norm(columns, axis=0)
+    direction = columns / np.where(lengths > 0, lengths, 1)
+    return {"spacing": triple(lengths), "origin": triple(matrix[:3, 3]), "direction": direction}
+
+
+def axes_direction(axes: str) -> NDArray[np.float64]:
+    """Return the direction of an array whose axes are the world's in an order, such as "zyx"."""
+    return XYZ[:, ["xyz".index(name) for name in axes]]
+
+
+class Placement(NamedTuple):
+    """How the axes of an array come to lie along x, y and z, or nearest to them, and its place."""
+
+    order: tuple[int, ...]  # the axes of the array along x, y and z
+    steps: tuple[slice, ...]  # along each axis of the array, forwards or backwards
+    place: dict[str, Any]  # spacing, origin and direction then, None if not known
+
+    def ordered(self, samples: NDArray[Any]) -> NDArray[Any]:
+        """Return a view of samples with their axes along x, y and z."""
+        return samples[self.steps].transpose(self.order)
+
+
+def find_placement(volume: Volume, given: dict[str, Any]) -> Placement:
+    """Return how an array lies; what is ``given`` replaces what the file says of its place.
+
+    GridError if its axes are not at right angles.
+    """
+    direction = XYZ if volume.direction is None else np.asarray(volume.direction, np.float64)
+    check_direction(direction)
+
+    def nearness(order: tuple[int, ...]) -> float:
+        return float(np.abs(direction[(0, 1, 2), order]).sum())
+
+    order = max(permutations(range(3)), key=nearness)
+    is_back = direction[(0, 1, 2), order] < 0
+    turned = direction[:, order] * np.where(is_back, -1, 1)
+    is_straight = np.abs(turned - XYZ).max() <= STRAIGHT
+    place = {k: volume.place.get(k) if given.get(k) is None else given[k] for k in PLACE}
+    spacing, origin, _ = place.values()
+    if spacing is None and volume.spacing is not None:
+        spacing = tuple(volume.spacing[axis] for axis in order)
+    origin = volume.origin if origin is None else origin
+    if origin is not None and is_back.any():  # to the sample that comes first now
+        ends = np.array([volume.shape[axis] - 1 for axis in order]) * is_back
+        steps = np.broadcast_to(np.asarray(spacing, np.float64), 3)
+        origin = np.asarray(origin, np.float64) - (XYZ if is_straight else turned) @ (ends * steps)
+    if place["direction"] is None:
+        place["direction"] = None if is_straight else as_direction(turned)
+    backwards = {order[world] for world in range(3) if is_back[world]}
+    flips = tuple(slice(None, None, -1 if axis in backwards else 1) for axis in range(3))
+    return Placement(order, flips, {**place, "spacing": spacing, "origin": origin})

@@ -5,16 +5,20 @@ Arrays in HDF5, Zarr, NetCDF, MATLAB and TIFF share this.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import FileError, GridError
+from ...errors import FileError, GridError, seen
 from ...grid.samples import UNNAMED, even_steps
-from ..volume import axes_direction, kept_axes, triple
+from . import Index, Request, axes_direction, triple
 
 SPACE = "xyz"
+STATED = ("spacing", "origin", "direction", "element_size_um")
+SIZES = re.compile(r"resolution|offset|voxel|pixel|extent|ext(min|max)\d|spacing|origin|size", re.I)
+"""Names of attributes that may state sizes, of which only ``STATED`` are read."""
 
 
 class Axis(NamedTuple):
@@ -25,6 +29,7 @@ class Axis(NamedTuple):
     step: float | None = None  # from a sample to the next, below 0 along a falling axis
     start: float | None = None  # position of the first sample
     alias: str = ""  # another name, by an attribute of its coordinates
+    is_down: bool = False  # the file's coordinates grow downwards; step and start are those upwards
 
 
 def one_unit(units: Sequence[str]) -> tuple[bool, tuple[str, ...]]:
@@ -38,38 +43,56 @@ def one_unit(units: Sequence[str]) -> tuple[bool, tuple[str, ...]]:
 
 
 def measured(name: str, places: Any, about: dict[str, Any]) -> Axis:
-    """Return an axis by its coordinates, which must be evenly spaced, and their attributes."""
+    """Return an axis by its coordinates, which must be evenly spaced, and their attributes.
+
+    By the conventions for climate and forecast data an axis may be ``positive: down``.
+    """
     if places is None or len(places) < 2:
         return Axis(name)
     start, step = even_steps(name, np.asarray(places))
-    unit, alias = (
+    unit, alias, positive = (
         said.decode() if isinstance(said, bytes) else str(said)
-        for said in (about.get("units", ""), about.get("axis", ""))
+        for said in (about.get(key, "") for key in ("units", "axis", "positive"))
     )
-    return Axis(name, unit, step, start, alias)
+    sign = -1 if positive.lower() == "down" else 1
+    return Axis(name, unit, sign * step, sign * start, alias, sign < 0)
 
 
 def placed(
-    axes: Sequence[Axis], attributes: dict[str, Any], shape: Sequence[int], order: str
+    request: Request,
+    axes: Sequence[Axis],
+    attributes: dict[str, Any],
+    shape: Sequence[int],
+    order: str = "",
+    beside: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return what a ``Volume`` says of the place of an array: which axes are kept, and where.
 
     Attributes replace what ``axes`` says: ``element_size_um``, as the HDF5 plugin of ImageJ writes
     it, has the order of the array's axes; ``spacing`` and ``origin`` are x, y, z. The columns of
     ``direction``, nine numbers row by row, are the world directions of the axes x, y and z.
-    ``order`` is that of axes that have no names.
+    ``order`` is that of axes that have no names. With ``beside``, attributes elsewhere in the file,
+    notes say what was not taken from the file.
     """
+    if len(shape) < len(SPACE):
+        raise GridError(f"values have shape {tuple(shape)}: give three axes (x, y, z)")
+    order = order or request.axes
     names = ["" if axis.name in UNNAMED else axis.name.strip().lower() for axis in axes]
     aliases = [(axis.alias or name).strip().lower() for axis, name in zip(axes, names)]
     names = aliases if _are_space(aliases) and not _are_space(names) else names
-    kept = _kept(names, shape)
-    named, notes = [names[axis] for axis in kept], []
+    in_space = [n for n, name in enumerate(names) if name in tuple(SPACE)]
+    index = request.pick(shape, in_space if _are_space(names) else None, names)
+    kept = [n for n, at in enumerate(index) if isinstance(at, slice)]
+    named, notes = [names[axis] for axis in kept], list[str]()
     if order == "zyx" and _are_space(names):
         order = "".join(named)
     elif any(named) and not _are_space(names):
         listed = ", ".join(name or "?" for name in named)
         notes = [f"its axes are named {listed}: taken as {', '.join(order)}"]
+    elif beside is not None and not any(named) and not request.axes_given:
+        notes = ["its axes have no names: taken as z, y, x (--axes xyz is the other order)"]
     world = [axes[kept[order.index(name)]] for name in SPACE]
+    notes += [f"its {each.name} grows downwards: turned" for each in world if each.is_down]
     is_one, told = one_unit([axis.unit for axis in world])
     missing = [name for name, axis in zip(SPACE, world) if not axis.step]
     if 0 < len(missing) < 3:
@@ -88,32 +111,29 @@ def placed(
         if said.size != 9 or said.dtype.kind not in "fiu":
             raise FileError(f"its attribute direction is {said.tolist()!r}: give nine numbers")
         direction = said.reshape(3, 3) @ direction
+    spacing = _stated(attributes, "element_size_um", spacing)
+    if beside is not None and spacing is None:
+        unread = {n: each for n, each in {**beside, **attributes}.items() if SIZES.search(n)}
+        listed = ", ".join(f"{n} {seen(_plain(x))}" for n, x in unread.items() if n not in STATED)
+        note = f"it states {listed}, which is not read (give --spacing and --origin)"
+        told += (note,) * bool(listed)
     return {
-        "spacing": _stated(attributes, "element_size_um", spacing),
+        "spacing": spacing,
         "origin": _stated(attributes, "origin", starts),
-        **{"direction": direction, "kept": kept, "axes": order, "notes": (*notes, *told)},
+        **{"direction": direction, "index": index, "axes": order, "notes": (*notes, *told)},
     }
+
+
+def _plain(said: Any) -> Any:
+    """Return an attribute as it is shown: letters that are stored one by one are a word."""
+    array = np.asarray(said)
+    if array.dtype.kind == "S":
+        return b"".join(array.ravel().tolist()).decode(errors="replace")
+    return array.tolist()
 
 
 def _are_space(names: Sequence[str]) -> bool:
     return sorted(name for name in names if name in tuple(SPACE)) == list(SPACE)
-
-
-def _kept(names: Sequence[str], shape: Sequence[int]) -> tuple[int, ...]:
-    """Return the axes of an array that are in space, in order; others must have length 1."""
-    if len(shape) < len(SPACE):
-        raise GridError(f"values have shape {tuple(shape)}: give three axes (x, y, z)")
-    kept = list(kept_axes(shape))
-    if _are_space(names):
-        kept = [axis for axis, name in enumerate(names) if name in tuple(SPACE)]
-    kept = sorted(sorted(kept, key=lambda axis: (shape[axis], axis))[-len(SPACE) :])
-    for axis, count in enumerate(shape):
-        if axis not in kept and count != 1:
-            raise GridError(
-                f"its axis {names[axis] or axis} has {count} entries, and a grid has "
-                "three axes in space: store one of them as an array of its own"
-            )
-    return tuple(kept)
 
 
 def _stated(attributes: dict[str, Any], name: str, default: Any) -> Any:
@@ -128,7 +148,7 @@ def _stated(attributes: dict[str, Any], name: str, default: Any) -> Any:
 
 def stored(
     values: Any, attributes: dict[str, Any], none: Any = None, absent: int = 0, fill: Any = None
-) -> tuple[Callable[[], Any], tuple[int, ...], np.dtype[Any]]:
+) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
     """Return how a ``Volume`` loads an array of a file, its shape, and the type of the values.
 
     By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
@@ -144,8 +164,8 @@ def stored(
     missing = np.ravel(attributes.get("_FillValue", none))
     kind = np.result_type(dtype, np.float32) if is_packed else dtype
 
-    def load() -> Any:
-        numbers = np.asarray(values[...])
+    def load(index: Index) -> Any:
+        numbers = np.asarray(values[index])
         if absent and not fill and dtype.kind in "fi" and (numbers < 0).any():
             raise GridError(
                 f"{absent:,} of its chunks are not stored and read as 0, which is the surface: "

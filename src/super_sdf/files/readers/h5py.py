@@ -1,4 +1,4 @@
-"""HDF5, and what is made of it: NetCDF 4 and MATLAB 7.3; an array of three axes.
+"""HDF5, and what is made of it: NetCDF and MATLAB, whose older files SciPy reads.
 
 Axes are (z, y, x) unless dimension labels, scales, ``axistags`` or ``--axes`` say otherwise.
 """
@@ -11,10 +11,17 @@ from typing import Any
 
 from ...errors import FileError
 from ...options import LPS
-from ..volume import Request, Volume, triple
+from . import PLACE, Request, Volume, of_array, triple
 from .axes import Axis, measured, placed, stored
 
 NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
+IMARIS = "DataSetInfo/Image"  # where its files state extents
+INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
+NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
+ORDER = (
+    "its axes are taken as x, y, z, the order of ndgrid; of an array in the order of meshgrid, "
+    "which is y, x, z, save permute(V, [2 1 3])"
+)
 
 
 def read_hdf5(request: Request) -> Volume:
@@ -22,12 +29,11 @@ def read_hdf5(request: Request) -> Volume:
     import h5py
 
     file = request.files.enter_context(h5py.File(request.path, "r"))
-    names: list[str] = []
-    asked = (request.member or "").strip("/")
+    shapes: dict[str, tuple[int, ...]] = {}
 
     def note(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset) and (name == asked or may_be_grid(entry.shape)):
-            names.append(f"/{name}")
+        if isinstance(entry, h5py.Dataset):
+            shapes[f"/{name}"] = entry.shape or ()
 
     file.visititems(note)
     if "ITKImage" in file:  # in LPS, with a direction a row
@@ -38,14 +44,10 @@ def read_hdf5(request: Request) -> Volume:
             "direction": image["Directions"][:].T[:, ::-1],
             "space": LPS,
         }
-        return volume_of(image["VoxelData"], place)
-    values = file[request.choose(names, "3D dataset")]
-    return volume_of(values, placed(_axes(values), dict(values.attrs), values.shape, request.axes))
-
-
-def may_be_grid(shape: tuple[int, ...] | None) -> bool:
-    """Return whether an array has three axes, besides some of length 1."""
-    return shape is not None and len(shape) >= 3 >= sum(count > 1 for count in shape)
+        return _volume_of(image["VoxelData"], place)
+    values = file[request.choose_array(shapes, "3D dataset")]
+    about, beside = dict(values.attrs), dict(file[IMARIS].attrs) if IMARIS in file else {}
+    return _volume_of(values, placed(request, _axes(values), about, values.shape, beside=beside))
 
 
 def _axes(values: Any) -> list[Axis]:
@@ -63,22 +65,22 @@ def _axes(values: Any) -> list[Axis]:
         places, about = None, {}
         if scale is not None and scale.shape == (count,):
             about = dict(scale.attrs)
-            check_own(scale)
+            _check_own(scale)
             if NO_COORDINATES not in bytes(about.get("NAME", b"")):
                 places = scale[:]
         axes.append(measured(name, places, about))
     return axes
 
 
-def check_own(values: Any) -> None:
+def _check_own(values: Any) -> None:
     """Raise FileError if the numbers of a dataset are in other files, which may be any."""
     if values.is_virtual or values.external:
         raise FileError(f"the numbers of {values.name} are in other files: save them in this one")
 
 
-def volume_of(values: Any, place: dict[str, Any]) -> Volume:
+def _volume_of(values: Any, place: dict[str, Any]) -> Volume:
     """Return a dataset at its place."""
-    check_own(values)
+    _check_own(values)
     absent, about = 0, {}
     if values.chunks:
         about = {"chunks": list(values.chunks)}
@@ -86,3 +88,55 @@ def volume_of(values: Any, place: dict[str, Any]) -> Volume:
         absent = total - values.id.get_num_chunks()
     numbers = stored(values, dict(values.attrs), absent=absent, fill=values.fillvalue)
     return Volume(*numbers, **place, about=about)
+
+
+def read_netcdf(request: Request) -> Volume:
+    """Read ``FILE.nc:/VARIABLE``; without a name the only variable of three axes."""
+    import h5py
+    from scipy.io import netcdf_file
+
+    if h5py.is_hdf5(request.path):
+        return read_hdf5(request)
+    file = request.files.enter_context(netcdf_file(request.path, mmap=False))
+    variables = file.variables
+    shapes = {f"/{name}": values.shape for name, values in variables.items()}
+    values = variables[request.choose_array(shapes, "variable of three axes")[1:]]
+    about = values._attributes
+    axes = []
+    for name in values.dimensions:
+        scale = variables.get(name)
+        axes.append(Axis(name) if scale is None else measured(name, scale.data, scale._attributes))
+    place = placed(request, axes, about, values.shape)
+    return Volume(*stored(values.data, about), **place)
+
+
+def read_mat(request: Request) -> Volume:
+    """Read ``FILE.mat:VARIABLE``; without a name the only array of three axes.
+
+    Variables ``spacing``, ``origin`` and ``direction`` beside it are its place, as in ``.npz``. In
+    files of version 7.3, which are HDF5, the axes of all are in reverse order.
+    """
+    import h5py
+    from scipy.io import loadmat, whosmat
+
+    what, shapes = "array of three axes", dict[str, tuple[int, ...]]()
+    is_hdf5 = h5py.is_hdf5(request.path)
+    if is_hdf5:
+        file = request.files.enter_context(h5py.File(request.path, "r"))
+        for name, entry in file.items():
+            if str(entry.attrs.get("MATLAB_class", b""), "ascii") in NUMBERS:
+                shapes[name] = entry.shape or ()
+        values = file[request.choose_array(shapes, what)]
+        stated = {key: file[key][()].T for key in PLACE if key in file}
+    else:
+        shapes = {name: shape for name, shape, kind in whosmat(request.path) if kind in NUMBERS}
+        name = request.choose_array(shapes, what)
+        variables = loadmat(request.path, variable_names=[name, *PLACE])
+        stated = {key: variables[key] for key in PLACE if key in variables}
+        values = variables[name].T  # planes of the last axis are contiguous
+        if values.shape[::-1] != shapes[name]:
+            raise FileError(f"it is damaged: {name} has shape {values.shape[::-1]}")
+    axes = [Axis()] * len(values.shape)
+    place = placed(request, axes, stated, values.shape, request.axes[::-1])
+    place["notes"] = (ORDER,) if request.axes == "xyz" else ()
+    return _volume_of(values, place) if is_hdf5 else Volume(*of_array(values), **place)

@@ -1,4 +1,4 @@
-"""MRC and CCP4 maps, with mrcfile: lengths are in angstrom.
+"""MRC and CCP4 maps, with mrcfile: lengths are in angstrom, values are densities.
 
 Columns, rows and sections run along the world's axes in the order of ``mapc``, ``mapr`` and
 ``maps``.
@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError, GridError
-from ..volume import XYZ, Request, Volume, triple
+from . import DENSITY, XYZ, Request, Volume, triple
 
 VOLUME_STACKS = 401  # space groups from here on are of stacks of volumes
 RIGHT = 0.01  # degrees
 
 
 def read_mrc(request: Request) -> Volume:
-    """Read a ``.mrc``, ``.map`` or ``.ccp4`` file, or one that is packed with gzip.
+    """Read a ``.mrc``, ``.map``, ``.rec`` or ``.ccp4`` file, or one that is packed with gzip.
 
     The origin is the field of this name, in angstrom; if it is 0 the place of the first sample in
     the unit cell, in samples.
@@ -51,16 +51,16 @@ def read_mrc(request: Request) -> Volume:
         both = f"its origin is {_listed(stated)} and its nstart means {_listed(in_cell)}"
         notes = (f"{both}: the origin is taken",)
 
-    def load() -> Any:
+    def load(index: Any) -> Any:
         with mrcfile.open(request.path, permissive=True) as opened:
             if opened.data is None:
                 raise FileError("it is truncated")
             return opened.data
 
     spacing = triple(steps[order]) if is_stated else None
-    origin = triple(stated if stated.any() else in_cell)
+    place = spacing, triple(stated if stated.any() else in_cell), XYZ[:, order]
     dtype = data_dtype_from_header(header)
-    return Volume(load, sizes, dtype, spacing, origin, XYZ[:, order], notes=notes)
+    return Volume(load, sizes, dtype, *place, notes=notes, hint=DENSITY)
 
 
 def _listed(numbers: Any) -> str:

@@ -6,7 +6,6 @@ NIfTI states all.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
 from itertools import product
 from typing import Any
@@ -15,11 +14,12 @@ import numpy as np
 
 from ...errors import GridError
 from ...options import RAS
-from ..regular import check_beside
-from ..volume import XYZ, Request, Volume, from_affine, triple
+from ..formats import check_beside
+from . import LABELS, XYZ, Request, Volume, from_affine, triple
 
 PAIRS = (".img", ".IMG", ".img.gz")
 UNITS = {1: "metre", 3: "micrometre"}  # of lengths, but for millimetres
+INTENT_LABEL = 1002
 ASTRAY = 0.1  # of a voxel: how far sform and qform may place a corner apart without a note
 NO_PLACE = (
     "Analyze files state no place and not which side is left: x, y and z are taken as stored, from "
@@ -36,31 +36,33 @@ def read_nifti(request: Request) -> Volume:
     """
     image, header = _load(request)
     unit = UNITS.get(int(header["xyzt_units"]) & 7)
-    notes: tuple[str, ...] = (f"lengths are in the unit that it states, {unit}",) * bool(unit)
+    image["notes"] = (f"lengths are in the unit that it states, {unit}",) * bool(unit)
+    if int(header["intent_code"]) == INTENT_LABEL:
+        image["hint"] = LABELS
     codes = int(header["sform_code"]), int(header["qform_code"])
     if codes == (0, 0):
-        notes += (
+        image["notes"] += (
             "it states no place (sform_code and qform_code are 0): its axes are taken as x, y and "
             "z, as ITK does; nibabel would mirror x",
         )
-        return Volume(*image, triple(np.abs(header.get_zooms()[:3])), None, XYZ, notes=notes)
+        return Volume(**image, spacing=triple(np.abs(header.get_zooms()[:3])), direction=XYZ)
     if min(codes) > 0:
-        corners = np.array(list(product(*((0, size - 1) for size in image[1]), [1])))
+        corners = np.array(list(product(*((0, size - 1) for size in image["stored"][:3]), [1])))
         off = 0.0
         with suppress(ValueError):  # if the qform is no rotation
             off = np.abs(corners @ (header.get_sform() - header.get_qform()).T).max()
         if off > ASTRAY * min(header.get_zooms()[:3]):
-            notes += (
+            image["notes"] += (
                 f"its sform (code {codes[0]}) and qform (code {codes[1]}) place a corner {off:.3g} "
                 "apart: the sform is taken, as nibabel does; ITK may take the qform",
             )
-    return Volume(*image, *from_affine(header.get_best_affine()), notes=notes, space=RAS)
+    return Volume(**image, **from_affine(header.get_best_affine()), space=RAS)
 
 
 def read_mgh(request: Request) -> Volume:
     """Read a ``.mgh`` or ``.mgz`` file of FreeSurfer."""
     image, header = _load(request)
-    return Volume(*image, *from_affine(header.get_affine()), space=RAS)
+    return Volume(**image, **from_affine(header.get_affine()), space=RAS)
 
 
 def read_analyze(request: Request) -> Volume:
@@ -71,17 +73,19 @@ def read_analyze(request: Request) -> Volume:
         if file.read(348)[344:347] == b"ni1":
             return read_nifti(request)
     image, header = _load(request)
-    return Volume(*image, triple(header.get_zooms()[:3]), None, XYZ, notes=(NO_PLACE,))
+    return Volume(**image, spacing=triple(header.get_zooms()[:3]), direction=XYZ, notes=(NO_PLACE,))
 
 
-def _load(request: Request) -> tuple[tuple[Callable[[], Any], tuple[int, ...], Any], Any]:
-    """Return how an image is loaded, its shape and type; and its header."""
+def _load(request: Request) -> tuple[dict[str, Any], Any]:
+    """Return how an image is loaded, its shape, type and index; and its header."""
     import nibabel
 
     image: Any = nibabel.load(request.path, mmap=False)
     proxy, shape, dtype = image.dataobj, image.shape, image.get_data_dtype()
-    if len(shape) < 3 or any(size != 1 for size in shape[3:]):
+    if len(shape) < 3:
         raise GridError(f"{request.path} has shape {shape}: give a file of three axes (x, y, z)")
     if (getattr(proxy, "slope", 1), getattr(proxy, "inter", 0)) != (1, 0):
         dtype = np.asarray(proxy[(slice(0, 1),) * len(shape)]).dtype
-    return (lambda: np.asarray(proxy).reshape(shape[:3]), shape[:3], dtype), image.header
+    index = request.pick(shape, kept=(0, 1, 2))
+    whole = {"load": lambda at: np.asarray(proxy[at]), "stored": shape, "dtype": dtype}
+    return {**whole, "index": index}, image.header

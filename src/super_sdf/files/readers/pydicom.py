@@ -1,4 +1,4 @@
-"""Folders of DICOM slices, with pydicom: one series, sorted by position; coordinates are LPS.
+"""DICOM images and segmentations, with pydicom; coordinates are LPS.
 
 Not with SimpleITK, which reads the frames of an enhanced image in the order of the file and without
 a place, and takes missing slices for evenly spaced ones.
@@ -8,20 +8,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ...errors import GridError
+from ...errors import FileError, GridError
 from ...options import LPS
-from ..regular import check_beside
-from ..volume import Request, Volume, triple
+from ..formats import check_beside
+from . import DENSITY, LABELS, MOST_NAMED, Index, Names, Request, Volume, triple
 
 EVEN = 0.01  # share of the spacing by which slices may be off
 PARALLEL = 1e-4  # by which components of directions may differ
+PREAMBLE = 128  # bytes before the mark DICM, mostly 0
+BEYOND = 2  # empty slices on both sides of those that a segmentation stores
+BITS, LABEL_MAP = "1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"
+"""The two classes of segmentations: a frame is of one segment, or holds the numbers of all."""
+
+Image = tuple[Path, Any]  # a file and its header
 
 
 class _Slice(NamedTuple):
@@ -34,30 +39,77 @@ class _Slice(NamedTuple):
     across: NDArray[np.float64]  # world directions along a row and down a column
     spacing: NDArray[np.float64]  # of rows and of columns
     scale: tuple[float, float]
-
-    def read(self) -> NDArray[Any]:
-        from pydicom.pixels.utils import pixel_array
-
-        return np.asarray(pixel_array(self.path, index=self.frame))
+    segment: int
 
 
 def read_dicom(request: Request) -> Volume:
-    """Read ``FOLDER``, or ``FOLDER:SERIES`` by the UID of one of several series.
+    """Read ``FOLDER``, a file of several frames, or ``FOLDER:NAME``.
 
-    The slices must have one size, spacing and direction, and lie in even steps.
+    The name is the UID of one of several series, or the label of a segment of a segmentation.
+    """
+    series, notes = _images_in(request.path)
+    segments = {
+        uid: {int(each.SegmentNumber): str(each.SegmentLabel) for each in header.SegmentSequence}
+        for uid, ((_, header), *_) in series.items()
+        if header.get("SOPClassUID") in (BITS, LABEL_MAP)
+    }
+    named = {name: uid for uid, found in segments.items() for name in found.values()}
+    names = [*series, *(named if request.member else ())]
+    name = request.choose(names, "series of DICOM images")
+    uid = named.get(name, name)
+    if uid not in segments:
+        return _of_slices(list(_slices(series[uid])), notes)
+    if len(series[uid]) > 1:
+        raise GridError(f"{uid} is several segmentations: give one of its files")
+    chosen = [number for number, label in segments[uid].items() if label == name]
+    return _of_segments(*series[uid][0], segments[uid], chosen, notes)
+
+
+def _images_in(path: Path) -> tuple[dict[str, list[Image]], tuple[str, ...]]:
+    """Return the images of each series in a folder, or of a file, and notes on what is left out.
+
+    Files of other kinds are left out. FileError names a damaged image.
     """
     import pydicom
 
-    series: dict[str, list[tuple[Path, Any]]] = {}
-    for name in sorted(os.listdir(request.path)):
-        if (request.path / name).is_file():
-            path = check_beside(request.path, name)
-            with suppress(pydicom.errors.InvalidDicomError):
-                header = pydicom.dcmread(path, stop_before_pixels=True)
-                if "Rows" in header:
-                    uid = str(header.get("SeriesInstanceUID", ""))
-                    series.setdefault(uid, []).append((path, header))
-    slices = list(_slices(series[request.choose(list(series), "series of DICOM images")]))
+    series: dict[str, list[Image]] = {}
+    inner = sorted(each.name for each in path.glob("*") if each.is_dir())
+    names = sorted({*os.listdir(path)} - {*inner}) if path.is_dir() else [path.name]
+    for name in names:
+        file = check_beside(path, name) if path.is_dir() else path
+        with file.open("rb") as opened:
+            start = opened.read(PREAMBLE + 4)
+        if start[PREAMBLE:] != b"DICM":
+            if file.suffix.lower() == ".dcm" or not any(start):
+                raise FileError(f"{file} is damaged, or no DICOM file: replace it, or remove it")
+            continue
+        header = pydicom.dcmread(file, stop_before_pixels=True)
+        if "Rows" in header:
+            series.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((file, header))
+            continue
+        kind = header.file_meta.get("MediaStorageSOPClassUID")
+        if not kind or "Image" in kind.name or kind in (BITS, LABEL_MAP):
+            raise FileError(f"{file} is damaged: it has no rows; replace it")
+    listed = ", ".join(inner[:MOST_NAMED])
+    if inner and not series:
+        raise FileError(f"{path} holds no DICOM images, but folders: give one of them ({listed})")
+    return series, (f"folders in it are not read: {listed}",) * bool(inner)
+
+
+def _pixels(path: Path, frame: int | None = None) -> NDArray[Any]:
+    """Return the values of a frame, or of all: FileError names the file that is damaged, say."""
+    from pydicom.pixels.utils import pixel_array
+
+    try:
+        return np.asarray(pixel_array(path, index=frame))
+    except Exception as error:
+        if isinstance(error, MemoryError):
+            raise
+        raise FileError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+
+
+def _of_slices(slices: list[_Slice], notes: tuple[str, ...]) -> Volume:
+    """Return slices of one size, spacing and direction, which lie in even steps, as a volume."""
     first = slices[0]
     normal = np.cross(*first.across)
     slices.sort(key=lambda each: float(each.corner @ normal))
@@ -80,21 +132,80 @@ def read_dicom(request: Request) -> Volume:
         )
     scales = np.array([each.scale for each in slices])
     is_plain, is_whole = (scales == (1, 0)).all(), (scales == np.rint(scales)).all()
-    dtype = slices[0].read().dtype if is_plain else np.dtype(np.int32 if is_whole else np.float32)
+    dtype = np.dtype(np.int32 if is_whole else np.float32)
+    dtype = _pixels(first.path, first.frame).dtype if is_plain else dtype
 
-    def load() -> NDArray[Any]:
+    def load(index: Index) -> NDArray[Any]:
         planes = np.empty((len(slices), *first.shape), dtype)
         for plane, each in zip(planes, slices):
-            plane[:] = each.read() if is_plain else each.read() * each.scale[0] + each.scale[1]
+            values = _pixels(each.path, each.frame)
+            plane[:] = values if is_plain else values * each.scale[0] + each.scale[1]
         return planes.T
 
     direction = np.column_stack([*first.across, shift / step])
-    spacing = triple((*first.spacing[::-1], step))
+    place = triple((*first.spacing[::-1], step)), triple(corners[0]), direction
     shape = (*first.shape[::-1], len(slices))
-    return Volume(load, shape, dtype, spacing, triple(corners[0]), direction, space=LPS)
+    return Volume(load, shape, dtype, *place, space=LPS, notes=notes)
 
 
-def _slices(images: list[tuple[Path, Any]]) -> Iterator[_Slice]:
+def _of_segments(
+    path: Path, header: Any, labels: dict[int, str], chosen: list[int], notes: tuple[str, ...]
+) -> Volume:
+    """Return the numbers of the segments, or 1 in those ``chosen``; frames left out are 0.
+
+    A fractional segment that is chosen comes as its fractions.
+    """
+    frames, shared = list(_slices([(path, header)])), header.SharedFunctionalGroupsSequence
+    chosen = list(labels) if len(labels) == 1 else chosen
+    first = frames[0]
+    normal = np.cross(*first.across)
+    heights = np.array([each.corner @ normal for each in frames])
+    gaps = np.diff(np.unique(heights.round(4)))
+    measures = [*shared, header], "PixelMeasuresSequence"
+    between, thick = (_stated(*measures, n) for n in ("SpacingBetweenSlices", "SliceThickness"))
+    step = float(between or (gaps.min() if len(gaps) else thick) or 0)
+    if not step > 0:
+        raise GridError("it states neither the spacing between slices nor their thickness")
+    places = (heights - heights.min()) / step
+    numbers = np.rint(places).astype(int)
+    if (off := np.abs(places - numbers).max()) > 10 * EVEN:
+        raise GridError(f"its frames are {off * step:.4g} mm off from even steps of {step:.6g}")
+    is_map, most = header.SOPClassUID == LABEL_MAP, header.get("MaximumFractionalValue")
+    is_fraction = bool(chosen) and header.get("SegmentationType") == "FRACTIONAL" and most
+    kind = np.float32 if is_fraction else np.uint8 if chosen or max(labels) < 256 else np.uint16
+    shape = (int(numbers.max()) + 1 + 2 * BEYOND, *first.shape)
+
+    def load(index: Index) -> NDArray[Any]:
+        planes = np.zeros(shape, kind)
+        pixels = _pixels(path).reshape(-1, *first.shape)  # frames need not be whole bytes
+        for number, each, values in zip(numbers + BEYOND, frames, pixels):
+            plane = planes[number]
+            if is_map:
+                plane[:] = np.isin(values, chosen) if chosen else values
+            elif is_fraction and each.segment in chosen:
+                plane[:] = values / most
+            elif not chosen or each.segment in chosen:
+                inside = values > (most or 1) / 2
+                if plane[inside].any():
+                    label = labels[each.segment]
+                    raise GridError(f"its segments overlap: give one of them, {path}:{label}")
+                plane[inside] = 1 if chosen else each.segment
+        return planes.T
+
+    origin = first.corner + normal * (heights.min() - heights[0] - BEYOND * step)
+    place = triple((*first.spacing[::-1], step)), triple(origin)
+    names: Names = {number: (label, None) for number, label in labels.items()}
+    return Volume(
+        *(load, shape[::-1], np.dtype(kind), *place, np.column_stack([*first.across, normal])),
+        space=LPS,
+        notes=notes,
+        hint=DENSITY if is_fraction else "" if chosen else LABELS,
+        names={1: names[chosen[0]]} if chosen else names,
+        about={"segments": list(labels.values())},
+    )
+
+
+def _slices(images: list[Image]) -> Iterator[_Slice]:
     for path, header in images:
         if header.get("SamplesPerPixel", 1) != 1 or "ModalityLUTSequence" in header:
             raise GridError(f"{path.name} has colours or a table of values: give grey images")
@@ -116,11 +227,13 @@ def _slices(images: list[tuple[Path, Any]]) -> Iterator[_Slice]:
                 _stated(groups, "PixelValueTransformationSequence", f"Rescale{name}")
                 for name in ("Slope", "Intercept")
             )
+            segment = _stated(groups, "SegmentIdentificationSequence", "ReferencedSegmentNumber")
             place = (np.array(numbers, np.float64) for numbers in (corner, across, steps))
             corner, across, steps = place
             scale = (1.0 if slope is None else float(slope), float(intercept or 0))
             shape = (header.Rows, header.Columns)
-            yield _Slice(path, index, shape, corner, across.reshape(2, 3), steps, scale)
+            about = shape, corner, across.reshape(2, 3), steps, scale, int(segment or 0)
+            yield _Slice(path, index, *about)
 
 
 def _stated(groups: list[Any], sequence: str, name: str) -> Any:

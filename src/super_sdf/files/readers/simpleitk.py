@@ -9,15 +9,14 @@ from __future__ import annotations
 import re
 import zlib
 from math import prod
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ...errors import FileError, GridError, seen
+from ...errors import FileError, GridError
 from ...options import LPS
-from ..regular import LONGEST_HEADER, check_beside
-from ..volume import Request, Volume, kept_axes, triple
+from ..formats import LONGEST_HEADER, data_files
+from . import Index, Request, Volume, triple
 
 NO_UNIT = ("", "?", "mm", "UNKNOWN")
 
@@ -40,8 +39,8 @@ def read_metaimage(request: Request) -> Volume:
         return fields.get(name, "F")[:1] in ("T", "t", "1")  # as ITK reads it
 
     named = found[1].decode(errors="surrogateescape").strip()
-    names = [] if named.lower() == "local" else _names(named, beginning[found.end() :])
-    files = [check_beside(path, name) for name in names]
+    is_local = named.lower() == "local"
+    files = [] if is_local else data_files(path, named, beginning[found.end() :])
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
@@ -50,10 +49,12 @@ def read_metaimage(request: Request) -> Volume:
         reader.ReadImageInformation()
     except RuntimeError:
         raise FileError("its header is damaged, or not that of a MetaImage file") from None
-    size, kept = reader.GetSize(), kept_axes(reader.GetSize())
-    if len(kept) != 3 or reader.GetNumberOfComponents() != 1:
+    size = reader.GetSize()
+    if len(size) < 3 or reader.GetNumberOfComponents() != 1:
         more = f" of {reader.GetNumberOfComponents()} numbers"
         raise GridError(f"{path} has shape {size}{more}: give a file of three axes (x, y, z)")
+    index = request.pick(size)
+    kept = [n for n, at in enumerate(index) if isinstance(at, slice)]
     one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
     data, start = (files[0], 0) if files else (path, found.end())
@@ -62,44 +63,26 @@ def read_metaimage(request: Request) -> Volume:
     if not is_packed and len(files) <= 1 and promised > follow:
         raise FileError(f"{data} is truncated: {promised:,} bytes are promised, {follow:,} follow")
 
-    def load() -> Any:
+    def load(index: Index) -> Any:
         if not is_packed:
-            return SimpleITK.GetArrayFromImage(reader.Execute()).T
+            return SimpleITK.GetArrayFromImage(reader.Execute()).T[index]
         is_big = is_true("BinaryDataByteOrderMSB") or is_true("ElementByteOrderMSB")
         stored = dtype.newbyteorder(">" if is_big else "<")
-        return np.frombuffer(_unpacked(data, start, promised), stored).reshape(size[::-1]).T
+        unpacker = zlib.decompressobj()
+        numbers = unpacker.decompress(data.read_bytes()[start:], promised + 1)
+        if len(numbers) != promised or not unpacker.eof:
+            raise FileError(
+                f"{data} is damaged: {promised:,} bytes are promised, and its compressed data is "
+                f"torn or has others ({len(numbers):,})"
+            )
+        return np.frombuffer(numbers, stored).reshape(size[::-1]).T[index]
 
-    steps = np.array(reader.GetSpacing())[list(kept)]
+    steps = np.array(reader.GetSpacing())[kept]
     direction = np.array(reader.GetDirection()).reshape(len(size), -1)[np.ix_(kept, kept)]
-    origin = triple(np.array(reader.GetOrigin())[list(kept)])
+    origin = triple(np.array(reader.GetOrigin())[kept])
     place = triple(np.abs(steps)), origin, direction * np.sign(steps)
     unit = fields.get("DistanceUnits", "?")
     notes = (f"lengths are in the unit that it states, {unit}",) * (unit not in NO_UNIT)
     if not {"ElementSpacing", "ElementSize"} & set(fields):
         notes += ("it states no ElementSpacing: taken as 1, as ITK does",)
-    return Volume(load, size, dtype, *place, kept, notes=notes, space=LPS)
-
-
-def _names(named: str, rest: bytes) -> list[str]:
-    """Return the names of the data files, of which a list or a pattern has one a slice."""
-    if named.upper().startswith("LIST"):
-        return [line for line in rest.decode(errors="surrogateescape").split("\n") if line.strip()]
-    if "%" not in named:
-        return [named]
-    pattern, *numbers = named.split()
-    if not re.fullmatch("[^%]*%0?[0-9]?d[^%]*", pattern) or len(numbers) < 2:
-        raise FileError(f"its ElementDataFile is {seen(named)}: give NAME%03d.raw 1 20 1")
-    first, last, step = (int(number) for number in (*numbers, "1")[:3])
-    return [pattern % number for number in range(first, last + 1, step)]
-
-
-def _unpacked(path: Path, start: int, size: int) -> bytes:
-    """Return the ``size`` bytes of a zlib stream; FileError unless it is whole and has as many."""
-    unpacker = zlib.decompressobj()
-    data = unpacker.decompress(path.read_bytes()[start:], size + 1)
-    if len(data) != size or not unpacker.eof:
-        raise FileError(
-            f"{path} is damaged: {size:,} bytes are promised, and its compressed data is torn or "
-            f"has others ({len(data):,})"
-        )
-    return data
+    return Volume(load, size, dtype, *place, index, notes=notes, space=LPS)

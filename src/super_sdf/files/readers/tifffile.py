@@ -6,13 +6,12 @@ axes; ImageJ states an origin, too.
 
 from __future__ import annotations
 
-import re
 from typing import Any
 from xml.etree import ElementTree
 
 from ...errors import GridError
-from ..regular import check_beside
-from ..volume import Request, Volume
+from ..formats import check_beside
+from . import Index, Request, Volume
 from .axes import Axis, placed
 
 
@@ -29,22 +28,29 @@ def read_tiff(request: Request) -> Volume:
         if named and named != request.path.name:
             check_beside(request.path, named)
     series = file.series[0]
-    if len(series.shape) != 3 or "S" in series.axes:
+    shape, names = series.shape, series.axes.lower()
+    if len(shape) < 3 or "s" in names:
         raise GridError(
-            f"{request.path} has axes {series.axes} of shape {series.shape}: give a stack of "
-            "three axes (z, y, x), without channels"
+            f"{request.path} has axes {series.axes} of shape {shape}: give a stack of three axes "
+            "(z, y, x), without colours"
         )
-    is_named = request.axes == "zyx" and sorted(series.axes) == ["X", "Y", "Z"]
-    names = series.axes.lower() if is_named else request.axes
+    if request.axes != "zyx" or not {*"xyz"} <= {*names}:  # pages are z, whatever they are called
+        names = names[:-3] + request.axes
+    request.check_fits(shape, series.dtype)
     sizes, unit = _pixel_sizes(file)
     stated = _ome_axes(ome) if ome is not None else _imagej_axes(file, sizes, unit)
-    place = placed([stated.get(name, Axis(name)) for name in names], {}, series.shape, names)
-    if ome is None and not stated and sizes and unit:
+    axes, order = [stated.get(name, Axis(name)) for name in names], [n for n in names if n in "xyz"]
+    place = placed(request, axes, {}, shape, "".join(order))
+    if not stated and ome is None and sizes and unit:
         place["notes"] += (
             f"its pixels are {sizes[0]:.6g} x {sizes[1]:.6g} {unit}, but it does not state how far "
             "its pages are apart: no spacing is taken from it (give --spacing X,Y,Z)",
         )
-    return Volume(series.asarray, series.shape, series.dtype, **place)
+
+    def load(index: Index) -> Any:
+        return series.asarray()[index]
+
+    return Volume(load, shape, series.dtype, **place)
 
 
 def _pixel_sizes(file: Any) -> tuple[tuple[float, float] | None, str]:
@@ -72,10 +78,8 @@ def _imagej_axes(file: Any, sizes: tuple[float, float] | None, printed: str) -> 
         return {}  # x and y may be those of a print
     unit = str(metadata.get("unit") or printed)
     # ImageJ writes letters beyond ASCII by their numbers
-    units = [
-        re.sub(r"\\u([0-9a-fA-F]{4})", lambda number: chr(int(number[1], 16)), each)
-        for each in (str(metadata.get(f"{axis}unit") or unit) for axis in "xyz")
-    ]
+    units = [str(metadata.get(f"{axis}unit") or unit) for axis in "xyz"]
+    units = [each.encode("ascii", "backslashreplace").decode("unicode_escape") for each in units]
     steps = [*sizes, abs(float(metadata.get("spacing") or 1))]
     is_bare = not any(unit and not unit.startswith("pixel") for unit in units)
     if is_bare and "spacing" not in metadata and sizes == (1, 1):

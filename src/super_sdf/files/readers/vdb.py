@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import struct
 import zlib
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from ...arrays import BoolArray
 from ...errors import FileError, GridError
 from .. import vdb_writer as vdb
-from ..volume import Request, Volume, from_affine
+from . import DISTANCE, Request, Volume, from_affine
 
 Ints = NDArray[np.int64]
 
@@ -46,17 +45,14 @@ def read_vdb(request: Request) -> Volume:
     """
     start = _Cursor(str(request.path), request.path.read_bytes())
     entries = _entries(start)
-    usable = [entry for entry in entries if entry[1].removesuffix(HALF) in TYPES]
-    names = [name for name, *_ in usable]
-    if request.describes and request.member is None:
-        names = names[:1]
-    name, kind, parent, place = usable[
-        names.index(request.choose(names, "grid of floating-point values"))
-    ]
+    usable = [name for name, (kind, _, _) in entries.items() if kind.removesuffix(HALF) in TYPES]
+    names = usable[: 1 if request.describes and request.member is None else None]
+    name = request.choose(names, "grid of floating-point values")
+    kind, parent, place = entries[name]
     cursor = start.at(place)
     flags, metadata, affine = cursor.number("I"), cursor.metadata(), cursor.transform()
     if parent:  # whose tree it shares
-        cursor = start.at(next(place for name, _, _, place in entries if name == parent))
+        cursor = start.at(entries[parent][2])
         flags, _, _ = cursor.number("I"), cursor.metadata(), cursor.transform()
     tree = _Tree(cursor, kind, flags)
     stated = metadata.get("file_voxel_count", tree.active_count)
@@ -70,34 +66,26 @@ def read_vdb(request: Request) -> Volume:
     margin = 0 if unknown else MARGIN
     low, high = np.min(lows, 0) - margin, np.max(highs, 0) + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
-    shape, notes = tuple((high - low).tolist()), tuple[str, ...]()
+    shape, notes, about = tuple((high - low).tolist()), tuple[str, ...](), dict[str, Any]()
 
-    def load() -> NDArray[Any]:
+    def load(index: Any) -> NDArray[Any]:
         voxels = tree.voxels(low, shape, unknown=unknown)
         return voxels if size == 1 else voxels * voxels.dtype.type(size)
 
     matrix = size * np.column_stack([affine[:, :3], affine[:, :3] @ low + affine[:, 3]])
     if "PicoGK.VoxelSize" in metadata:
         notes = (f"voxels of {size:.6g} mm, as PicoGK states: the mesh is in millimetres",)
-    volume = Volume(load, shape, tree.dtype, *from_affine(matrix), notes=notes)
-    return _with_grids(volume, start, entries, name) if request.describes else volume
+    if request.describes:
+        about["grids"] = [start.described(*each) for each in entries.items()]
+        other = f"shape and place are those of {name!r}: give {start.name}:NAME for another"
+        notes += (f"{other} grid",) * (len(entries) > 1)
+    hint = DISTANCE if metadata.get("class") == "level set" else ""
+    said: dict[str, Any] = {"notes": notes, "about": about, "hint": hint, **from_affine(matrix)}
+    return Volume(load, shape, tree.dtype, **said)
 
 
-def _with_grids(volume: Volume, start: _Cursor, entries: list[Any], read: str) -> Volume:
-    """Return a volume that says which grids its file holds, and which of them it is."""
-    grids = []
-    for name, kind, _, place in entries:
-        metadata = start.at(place + 4).metadata()
-        kind = kind.removeprefix("Tree_").split("_")[0]
-        grids.append({"name": name, "type": kind, "class": metadata.get("class", "unknown")})
-        grids[-1]["active_voxels"] = metadata.get("file_voxel_count")
-    other = f"shape and place are those of {read!r}: give {start.name}:NAME for another grid"
-    notes = volume.notes + (other,) * (len(grids) > 1)
-    return replace(volume, about={"grids": grids}, notes=notes)
-
-
-def _entries(cursor: _Cursor) -> list[tuple[str, str, str, int]]:
-    """Return name, type, name of the grid whose tree it shares, and place of each grid."""
+def _entries(cursor: _Cursor) -> dict[str, tuple[str, str, int]]:
+    """Return type, name of the grid whose tree it shares, and place of each grid by its name."""
     if len(cursor.data) < 12 or cursor.number("q") != vdb.MAGIC:
         raise FileError(f"{cursor.name} is no .vdb file: its first bytes are not OpenVDB's")
     if (version := cursor.number("I")) < OLDEST:
@@ -107,14 +95,14 @@ def _entries(cursor: _Cursor) -> list[tuple[str, str, str, int]]:
     seekable = cursor.number("?")
     cursor.take(36)  # the file's own number
     cursor.metadata()
-    count, entries = cursor.number("I"), []
+    count, entries = cursor.number("I"), {}
     if not seekable and count > 1:
         said = f"{cursor.name} holds {count} grids one after the other, as a stream"
         raise FileError(f"{said}: save it with openvdb.write")
     for _ in range(count):
         name, kind, parent = (cursor.text().replace("\x1e", "#") for _ in range(3))
         _, _, end = cursor.unpack("qqq")
-        entries.append((name, kind, parent, cursor.place))
+        entries[name] = kind, parent, cursor.place
         if count > 1:
             cursor.place = end
     return entries
@@ -161,6 +149,12 @@ class _Cursor:
                 found[name] = struct.unpack("<" + NUMBERS[kind], data)[0]
         return found
 
+    def described(self, name: str, entry: tuple[str, str, int]) -> dict[str, Any]:
+        metadata = self.at(entry[2] + 4).metadata()
+        kind = entry[0].removeprefix("Tree_").split("_")[0]
+        about = {"name": name, "type": kind, "class": metadata.get("class", "unknown")}
+        return {**about, "active_voxels": metadata.get("file_voxel_count")}
+
     def transform(self) -> NDArray[np.float64]:
         """Return the matrix (3, 4) from indices to world coordinates."""
         kind = self.text()
@@ -204,10 +198,10 @@ class _Tree:
         cube = (vdb.LEAF,) * 3
         for corner in leaves:  # after the topology, each after its mask
             active = cursor.bits(vdb.LEAF**3)
-            values, state = self._values(active)
+            values = self._values(active)
             self.active_count += int(active.sum())
             self.cubes.append((corner, vdb.LEAF, values.reshape(cube), active.reshape(cube)))
-            shown = np.argwhere((active if state == 0 else active | True).reshape(cube))
+            shown = np.argwhere((active | (values != self.background)).reshape(cube))
             if len(shown):
                 self.ends.append((corner + shown.min(0), corner + shown.max(0) + 1))
 
@@ -216,7 +210,7 @@ class _Tree:
         edge = edges[1] if len(edges) > 1 else vdb.LEAF
         count = edges[0] // edge
         child, active = self.cursor.bits(count**3), self.cursor.bits(count**3)
-        values, _ = self._values(active)
+        values = self._values(active)
         corners = corner + edge * np.argwhere(np.ones((count,) * 3, bool))
         for n in np.flatnonzero(~child & (active | (values != self.background))):
             self.cubes.append((corners[n], edge, values[n], active[n]))
@@ -227,8 +221,8 @@ class _Tree:
                 self.cursor.take(vdb.MASK_BYTES)  # there again before the leaf's values
                 leaves.append(place)
 
-    def _values(self, active: BoolArray) -> tuple[NDArray[Any], int]:
-        """Return the next values, and how those of inactive voxels are stored."""
+    def _values(self, active: BoolArray) -> NDArray[Any]:
+        """Return the next values of a node."""
         cursor, count = self.cursor, len(active)
         state = cursor.number("B")
         if state > vdb.ALL:
@@ -239,10 +233,10 @@ class _Tree:
         masked = state in (vdb.MASKED, vdb.MASKED_ONE, vdb.MASKED_TWO)
         selection = cursor.bits(count) if masked else np.zeros(count, bool)
         if state == vdb.ALL or not self.flags & vdb.ACTIVE_MASK:
-            return self._numbers(count), state
+            return self._numbers(count)
         filled = np.where(selection, *np.array(values[::-1], self.dtype))
         filled[active] = self._numbers(int(active.sum()))
-        return filled, state
+        return filled
 
     def _numbers(self, count: int) -> NDArray[Any]:
         """Return the next numbers, which are a zlib stream, a Blosc buffer, or as they are."""

@@ -3,48 +3,37 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
 from math import prod
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...errors import FileError, GridError, OptionTypeError, seen
 from ...grid.samples import even_steps
-from ..volume import XYZ, Request, Volume, of_array, triple
+from . import XYZ, Request, Volume, of_array, triple
 
 NAME = "the image"  # in memory, in error messages
 MARKS = ("vtkGhostType", "vtkValidPointMask")
 
 
-def read_vti(request: Request) -> Volume:
-    """Read an array of points or of cells of a ``.vti`` file: the named one, else the only one."""
-    from vtkmodules.vtkIOXML import vtkXMLImageDataReader
-
-    return _read(request, vtkXMLImageDataReader())
+READERS = {
+    ".vti": ("vtkIOXML", "vtkXMLImageDataReader"),
+    ".vtk": ("vtkIOLegacy", "vtkDataSetReader"),
+    ".vtkhdf": ("vtkIOHDF", "vtkHDFReader"),
+}
 
 
 def read_vtk(request: Request) -> Volume:
-    """Read a legacy file, in text or binary."""
-    from vtkmodules.vtkIOLegacy import vtkDataSetReader
-
-    reader = vtkDataSetReader()
-    reader.ReadAllScalarsOn()
-    reader.ReadAllFieldsOn()
-    return _read(request, reader)
-
-
-def read_vtkhdf(request: Request) -> Volume:
-    """Read a ``.vtkhdf`` file."""
-    from vtkmodules.vtkIOHDF import vtkHDFReader
-
-    return _read(request, vtkHDFReader())
-
-
-def _read(request: Request, reader: Any) -> Volume:
+    """Read an array of points or of cells: the named one, else the only one."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
     from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 
+    module, name = READERS[request.path.suffix.lower()]
+    reader = getattr(import_module(f"vtkmodules.{module}"), name)()
+    if request.path.suffix.lower() == ".vtk":
+        reader.ReadAllScalarsOn()
+        reader.ReadAllFieldsOn()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     said, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
     vtkOutputWindow.SetInstance(said)
@@ -60,24 +49,20 @@ def _read(request: Request, reader: Any) -> Volume:
     if image is None or "error" in said.GetOutput().lower():
         raise FileError("VTK finds it damaged, or truncated")
     arrays = _arrays(image)
-    _check_text(request.path, sum(array.GetNumberOfValues() for array, _ in arrays.values()))
-    # what has several numbers a sample, and VTK's own marks, is read only if it is named
-    plain = [
-        name
-        for name, (array, _) in arrays.items()
-        if name == request.member or (array.GetNumberOfComponents() == 1 and name not in MARKS)
-    ]
-    name = request.choose(plain or list(arrays), "array of points or cells")
-    return _volume_of(image, *arrays[name], f"its array {name!r}")
-
-
-def _check_text(path: Path, promised: int) -> None:
-    """Raise FileError if text holds fewer values than it promises: VTK makes others up."""
-    text = path.read_bytes()
-    if re.match(rb"# vtk.*\n.*\nASCII\s", text):
+    promised = sum(array.GetNumberOfValues() for array, _ in arrays.values())
+    text = request.path.read_bytes()
+    if re.match(rb"# vtk.*\n.*\nASCII\s", text):  # VTK makes up what is missing
         start = re.search(rb"^(?:POINT|CELL)_DATA ", text, re.M)
         if len(text[start.start() if start else 0 :].split()) < promised:
             raise FileError(f"it is truncated: fewer values follow than the {promised:,} promised")
+    # what has several numbers a sample, and VTK's own marks, is read only if it is named
+    plain = []
+    for name, (array, _) in arrays.items():
+        is_mark = name.removeprefix("CellData/") in MARKS
+        if name == request.member or (array.GetNumberOfComponents() == 1 and not is_mark):
+            plain.append(name)
+    name = request.choose(plain or list(arrays), "array of points or cells")
+    return _volume_of(image, *arrays[name], f"its array {name!r}", *request.numbers)
 
 
 def volume_of_image(image: Any, scalars: str | None) -> Volume:
@@ -85,12 +70,12 @@ def volume_of_image(image: Any, scalars: str | None) -> Volume:
     if not (hasattr(image, "IsA") and image.IsA("vtkImageData")):
         raise OptionTypeError(f"image is {seen(image)}: give VTK image data")
     arrays = _arrays(image)
+    if not arrays:
+        raise GridError(f"{NAME} holds no array of points or cells")
     listed = ", ".join(arrays)
     active = [data.GetScalars() for data in (image.GetPointData(), image.GetCellData())]
     named = [str(each.GetName()) for each in active if each]
     ours = named or [name for name, (_, of_points) in arrays.items() if of_points] or list(arrays)
-    if not arrays:
-        raise GridError(f"{NAME} holds no array of points or cells")
     if scalars is None and not named and len(ours) > 1:
         raise GridError(f"{NAME} holds several arrays, {listed}: give scalars={ours[0]!r}, say")
     name = scalars or ours[0]
@@ -110,7 +95,7 @@ def _arrays(image: Any) -> dict[str, tuple[Any, bool]]:
     return arrays
 
 
-def _volume_of(image: Any, array: Any, of_points: bool, what: str) -> Volume:
+def _volume_of(image: Any, array: Any, of_points: bool, what: str, *numbers: int) -> Volume:
     """Return an array at the points of an image, or at the centres of its cells.
 
     Point (i, j, k) of the extent, which need not begin at 0, is at
@@ -133,10 +118,11 @@ def _volume_of(image: Any, array: Any, of_points: bool, what: str) -> Volume:
         raise GridError(f"{said}: sample its distances on a lattice, and write that as .vti")
     shape = tuple(int(n) for n in extent[1::2] - extent[::2] + of_points)
     components, length = array.GetNumberOfComponents(), array.GetNumberOfTuples()
-    if components != 1:
-        raise GridError(f"{what} has {components} numbers per sample: give an array of one")
+    if components != 1 and not (len(numbers) == 1 and numbers[0] < components):
+        said = f"{what} has {components} numbers per sample"
+        raise GridError(f"{said}: give an array of one, or NAME[0]")
     if length != prod(shape):
         raise GridError(f"{what} has {length:,} values for {prod(shape):,} samples")
     start = direction @ (np.array(spacing) * (first + (0 if of_points else 0.5)))
-    values = vtk_to_numpy(array).reshape(shape[::-1]).T
+    values = vtk_to_numpy(array).reshape(*shape[::-1], -1)[..., numbers[0] if numbers else 0].T
     return Volume(*of_array(values), triple(spacing), triple(np.array(origin) + start), direction)

@@ -8,7 +8,6 @@ metadata names when it opens an array: they are checked before.
 
 from __future__ import annotations
 
-import json
 import os
 import zipfile
 from collections.abc import Iterator
@@ -20,12 +19,11 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError, GridError, seen
-from ..regular import check_beside, check_regular_file
-from ..volume import Request, Volume
+from ..formats import check_beside, check_regular_file, parse_json
+from . import Request, Volume
 from .axes import Axis, measured, placed, stored
 
-MOST_AXES = 5  # time, channel, and three of space
-ARRAY_2, ATTRIBUTES_2, NODE_3 = ".zarray", ".zattrs", "zarr.json"
+METADATA = (".zarray", ".zgroup", ".zattrs", "zarr.json")
 # None of these runs what the store names, and all return numbers.
 CODECS = {
     *("bytes", "endian", "transpose", "sharding_indexed", "crc32c"),
@@ -39,100 +37,82 @@ Document = dict[str, Any]
 
 def read_zarr(request: Request) -> Volume:
     """Read ``FOLDER.zarr``, or ``FOLDER.zarr:/ARRAY`` of a group; of OME-Zarr the finest level."""
-    store = _Store(request)
-    if "" in store.arrays and request.member is not None:
-        raise FileError(f"{request.path} is one array: give no name of another in it")
-    name = "" if "" in store.arrays else _choose(store, request)
-    array, axes = store.open(name), _image_axes(store, name)
-    attributes, version = dict(array.attrs), 2 if store.document(name, ARRAY_2) else 3
-    if axes and (not {*"xyz"} <= {axis.name for axis in axes} or len(axes) != array.ndim):
+    nodes = _nodes_of(request)
+    name = _choose(nodes, request)
+    array, axes = _open(nodes, name, request), _image_axes(nodes, name)
+    attributes, version = dict(array.attrs), nodes[name]["zarr_format"]
+    if axes is None:
+        axes = _named_axes(nodes, name, array, request)
+    elif {*"xyz"} <= {axis.name for axis in axes} and len(axes) == array.ndim:
+        attributes = {}
+    else:
         listed = ", ".join(axis.name for axis in axes)
         said = f"an array of {array.ndim} axes has the axes {listed}"
         raise GridError(f"{said}: give an image of z, y, x")
-    if axes:
-        place = placed(axes, {}, array.shape, request.axes)
-    else:
-        place = placed(_named_axes(store, name, array), attributes, array.shape, request.axes)
+    place = placed(request, axes, attributes, array.shape)
     total = prod(-(-size // chunk) for size, chunk in zip(array.shape, array.chunks))
     absent = max(total - array.nchunks_initialized, 0)
     none = array.fill_value if version == 2 else None  # as xarray takes it
-    about = {"chunks": list(array.chunks), "zarr format": version}
-    if shards := getattr(array, "shards", None):
-        about["shards"] = list(shards)
+    sizes = {name: getattr(array, name, None) for name in ("chunks", "shards")}
+    about = {"zarr format": version, **{name: list(size) for name, size in sizes.items() if size}}
     numbers = stored(array, attributes, none, absent, array.fill_value)
     return Volume(*numbers, **place, about=about)
 
 
-class _Store:
-    """The arrays of a store in a folder or zip file, which may not lead out of it, by their path.
+def _nodes_of(request: Request) -> dict[str, Document]:
+    """Return the metadata of the arrays and groups of a store, which may not lead out of it.
 
-    Metadata is read here without zarr.
+    It is read without zarr, and that of version 2 has its attributes as that of version 3 has.
     """
+    path, nodes = request.path, dict[str, Document]()
+    if is_zip := not path.is_dir():
+        archive = request.files.enter_context(zipfile.ZipFile(path))
+        keys = archive.namelist()
+    else:
+        listed = (Path(at, n) for at, inner, names in os.walk(path) for n in (*inner, *names))
+        keys = [each.relative_to(path).as_posix() for each in listed]
+        for key in keys:
+            if (path / key).is_symlink():
+                check_beside(path, key)
+            elif not (path / key).is_dir() and not (path / key).is_file():
+                check_regular_file(path / key)
+    for key in keys:
+        node, _, name = key.rpartition("/")
+        if name in METADATA:
+            data = archive.read(key) if is_zip else (path / key).read_bytes()
+            content = parse_json(data, f"{path}/{key}")
+            if not isinstance(content, dict):
+                raise FileError(f"{path} is damaged: {key} is no JSON object")
+            content = {"attributes": content} if name == ".zattrs" else content
+            nodes[node] = nodes.get(node, {}) | content
+    return nodes
 
-    def __init__(self, request: Request) -> None:
-        self.path, self.files = request.path, request.files
-        self.zip: zipfile.ZipFile | None = None
-        if not self.path.is_dir():
-            self.zip = request.files.enter_context(zipfile.ZipFile(self.path))
-        self.keys = set(self.zip.namelist() if self.zip else self._listed())
-        self.arrays: dict[str, int] = {}  # the number of axes of each
-        for key in self.keys:
-            path, _, name = key.rpartition("/")
-            if name in (ARRAY_2, NODE_3):
-                about = self.document(path, name)
-                if name == ARRAY_2 or about.get("node_type") == "array":
-                    self.arrays[path] = len(about.get("shape", ()))
 
-    def _listed(self) -> Iterator[str]:
-        for at, folders, names in os.walk(self.path):
-            for name in (*folders, *names):
-                path = Path(at, name)
-                key = path.relative_to(self.path).as_posix()
-                if path.is_symlink():
-                    check_beside(self.path, key)
-                elif not path.is_dir() and not path.is_file():
-                    check_regular_file(path)
-                yield key
+def _images(nodes: dict[str, Document], path: str) -> list[Document]:
+    """Return the images that the metadata of a group describes, as OME-NGFF has it."""
+    attributes: Document = nodes.get(path, {}).get("attributes") or {}
+    images: list[Document] = attributes.get("ome", attributes).get("multiscales") or []
+    return images
 
-    def document(self, path: str, name: str) -> Document:
-        """Return the metadata of an array or a group, empty if the store has none of this name."""
-        key = f"{path}/{name}" if path else name
-        if key not in self.keys:
-            return {}
-        content = json.loads(self.zip.read(key) if self.zip else (self.path / key).read_bytes())
-        if not isinstance(content, dict):
-            raise FileError(f"{self.path} is damaged: {key} is no JSON object")
-        return content
 
-    def attributes(self, path: str) -> Document:
-        of_3 = self.document(path, NODE_3).get("attributes") or {}
-        return {**self.document(path, ATTRIBUTES_2), **of_3}
+def _open(nodes: dict[str, Document], path: str, request: Request) -> Any:
+    """Return an array, whose codecs must be in the list."""
+    import zarr
 
-    def images(self, path: str) -> list[Document]:
-        """Return the images that the metadata of a group describes, as OME-NGFF has it."""
-        attributes = self.attributes(path)
-        images: list[Document] = attributes.get("ome", attributes).get("multiscales") or []
-        return images
-
-    def open(self, path: str) -> Any:
-        """Return an array, whose codecs must be in the list."""
-        import zarr
-
-        if path not in self.arrays:
-            raise FileError(f"{self.path} is damaged: its metadata names no array at {path!r}")
-        for name in (ARRAY_2, NODE_3):
-            for codec in _codecs_of(self.document(path, name)):
-                if codec not in CODECS:
-                    raise FileError(
-                        f"{self.path} names the codec {seen(codec)}, which is not among those that "
-                        f"are read ({', '.join(sorted(CODECS))}): store it with one of these"
-                    )
-        if not self.zip:
-            return zarr.open_array(str(self.path), path=path, mode="r")
-        store = zarr.storage.ZipStore(str(self.path), mode="r")
-        array = zarr.open_array(store, path=path, mode="r")
-        self.files.callback(store.close)  # only now is there something to close
-        return array
+    if "shape" not in nodes.get(path, {}):
+        raise FileError(f"{request.path} is damaged: its metadata names no array at {path!r}")
+    for codec in _codecs_of(nodes[path]):
+        if codec not in CODECS:
+            raise FileError(
+                f"{request.path} names the codec {seen(codec)}, which is not among those that are "
+                f"read ({', '.join(sorted(CODECS))}): store it with one of these"
+            )
+    if request.path.is_dir():
+        return zarr.open_array(str(request.path), path=path, mode="r")
+    store = zarr.storage.ZipStore(str(request.path), mode="r")
+    array = zarr.open_array(store, path=path, mode="r")
+    request.files.callback(store.close)  # only now is there something to close
+    return array
 
 
 def _codecs_of(about: Document) -> Iterator[str]:
@@ -145,21 +125,25 @@ def _codecs_of(about: Document) -> Iterator[str]:
                 yield from _codecs_of(named["configuration"])
 
 
-def _choose(store: _Store, request: Request) -> str:
+def _choose(nodes: dict[str, Document], request: Request) -> str:
     """Return the array to read: of an image the finest level, unless another is named."""
+    shapes = {f"/{n}": node["shape"] for n, node in sorted(nodes.items()) if "shape" in node}
+    if "/" in shapes:
+        if request.member is not None:
+            raise FileError(f"{request.path} is one array: give no name of another in it")
+        return ""
     named = (request.member or "").strip("/")
-    is_group = any(name.startswith(f"{named}/") for name in store.arrays) and bool(named)
-    before = f"{named}/" if is_group else ""
-    images = store.images(before.strip("/"))
+    is_group = bool(named) and any(name.startswith(f"/{named}/") for name in shapes)
+    before = f"/{named}/" if is_group else "/"
+    images = _images(nodes, before.strip("/"))
     if images and (is_group or request.member is None):
-        return before + str(images[0]["datasets"][0]["path"]).strip("/")
-    counts = sorted(item for item in store.arrays.items() if item[0].startswith(before))
-    names = [f"/{name}" for name, axes in counts if 3 <= axes <= MOST_AXES]
+        return (before + str(images[0]["datasets"][0]["path"]).strip("/"))[1:]
+    inner = {name: shape for name, shape in shapes.items() if name.startswith(before)}
     asked = replace(request, member=None) if is_group else request
-    return asked.choose(names, "3D array").strip("/")
+    return asked.choose_array(inner, "3D array").strip("/")
 
 
-def _named_axes(store: _Store, name: str, array: Any) -> list[Axis]:
+def _named_axes(nodes: dict[str, Document], name: str, array: Any, request: Request) -> list[Axis]:
     """Return the axes of an array by the names of its dimensions, and by arrays of these names."""
     said = getattr(getattr(array, "metadata", None), "dimension_names", None)
     names = [str(each or "") for each in said or array.attrs.get("_ARRAY_DIMENSIONS") or ()]
@@ -167,14 +151,13 @@ def _named_axes(store: _Store, name: str, array: Any) -> list[Axis]:
     group, axes = name.rpartition("/")[0], []
     for axis, count in zip(names, array.shape):
         path = f"{group}/{axis}".lstrip("/")
-        is_there = bool(name and axis) and store.arrays.get(path) == 1
-        places = store.open(path)[:] if is_there else ()
-        about = store.attributes(path) if is_there else {}
-        axes.append(measured(axis, places if len(places) == count else None, about))
+        is_there = bool(name and axis) and nodes.get(path, {}).get("shape") == [count]
+        places = _open(nodes, path, request)[:] if is_there else None
+        axes.append(measured(axis, places, nodes.get(path, {}).get("attributes") or {}))
     return axes
 
 
-def _image_axes(store: _Store, name: str) -> list[Axis] | None:
+def _image_axes(nodes: dict[str, Document], name: str) -> list[Axis] | None:
     """Return the axes of an array that is a level of an image of OME, None if it is of none.
 
     The transformations of a level come first, then those of the whole image.
@@ -183,7 +166,7 @@ def _image_axes(store: _Store, name: str) -> list[Axis] | None:
     levels = (
         (image, level)
         for depth in range(len(parts))
-        for image in store.images("/".join(parts[:depth]))
+        for image in _images(nodes, "/".join(parts[:depth]))
         for level in image["datasets"]
         if str(level["path"]).strip("/") == "/".join(parts[depth:])
     )

@@ -12,7 +12,6 @@
    rule was fitted by ``export.edges``, on shapes with and without edges, to how far from the middle
    to that point the true surface lies; it is in ``rule.json``.
 5. Beside features, vertices are moved as much of the way onto the settled planes.
-6. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
 
 References
 ----------
@@ -28,26 +27,19 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import BoolArray, Index, IntArray, Numbers, Vectors, dot, length, unit
+from ...arrays import BoolArray, Index, IntArray, Numbers, Vectors, dot, inner, length, unit
 from ...refine.field import FineField, SampleSpheres
 from ...threads import map_chunks
 from ..marching import CAP_HEIGHT, Crossings, tables
 from ..mesh import CLEARANCE
 from .folds import REACH, Rounding, without_folds
-from .patches import (
-    Patches,
-    Placed,
-    beside,
-    find_patches,
-    triangles_of,
-    unfolded,
-    voxels_near_kinks,
-)
+from .patches import Patches, Placed, beside, find_patches, triangles_of, voxels_near_kinks
 from .planes import ROUNDS, Planes, planes_at_crossings, settle_planes, square_falloff
 
 RULE = Path(__file__).with_name("rule.json")
@@ -63,7 +55,7 @@ FARTHEST_MOVE = 0.5  # fine spacings
 OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
 OF_PATCH = 4  # numbers of evidence that are not averaged along the chain
 LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and normals say nothing
-TEMPORARIES = 1000  # numbers per patch in the search for its spheres among 125 samples
+TEMPORARIES = 500  # numbers per patch in the search for its spheres among 125 samples
 # Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
 # is the fan beside.
 REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + REACH + 5
@@ -190,8 +182,7 @@ def place(patches: Patches, own: Planes, candidates: Candidates, share: Numbers)
     kept = share > LEAST_SHARE
     position = _move_beside(patches, own, candidates, share)
     vertex = candidates.middle + share[:, None] * (candidates.edge - candidates.middle)
-    placed = Placed(position, candidates.planes.normal, candidates.patch[kept], vertex[kept])
-    return unfolded(patches, placed)
+    return Placed(position, candidates.planes.normal, candidates.patch[kept], vertex[kept])
 
 
 def find_candidates(
@@ -228,25 +219,27 @@ def is_sharp(patches: Patches, normal: Vectors, trust: Numbers) -> BoolArray:
 def _least_cosine(patches: Patches, normal: Vectors, *, first: bool = False) -> Numbers:
     """Return the least cosine of the normals of each patch's crossings, (P,); or of the first's."""
     least: Numbers = np.full(len(patches.row), np.inf)
-    for other in range(1, patches.crossing.shape[1]):
-        rows = np.flatnonzero(patches.crossing[:, other] >= 0)  # then it has all before, too
-        mine = normal[patches.crossing[rows, other]]
+    columns = np.ascontiguousarray(normal.T)
+    corners = [columns.take(crossing, 1, mode="clip") for crossing in patches.crossing.T]
+    for other in range(1, len(corners)):
+        rows = np.flatnonzero(patches.sides > other)  # long loops are rare
+        mine = corners[other].take(rows, 1)
         for one in range(1 if first else other):
-            cosine = dot(normal[patches.crossing[rows, one]], mine)
+            cosine = inner(corners[one].take(rows, 1), mine)
             least[rows] = np.minimum(least[rows], cosine)
     return least
 
 
 def _mean_along_chain(patches: Patches, evidence: Vectors) -> Vectors:
     """Return the evidence of patches (f, n) averaged over those that they are joined to."""
-    patch, crossing = patches.joined()
-    used, crossing = np.unique(crossing, return_inverse=True)
-    shared = np.bincount(crossing, minlength=len(used))
+    patch = np.repeat(np.arange(len(patches.sides)), patches.sides)
+    _, crossing = np.unique(patches.crossing[patches.crossing >= 0], return_inverse=True)
+    shared = np.bincount(crossing)
     columns = []
     for mean in evidence.T:
         for _ in range(CHAIN_ROUNDS):
-            at_crossing = np.bincount(crossing, mean[patch], len(used)) / shared
-            mean = np.bincount(patch, at_crossing[crossing], len(mean)) / patches.sides
+            at_crossing = np.bincount(crossing, mean.take(patch)) / shared
+            mean = np.bincount(patch, at_crossing.take(crossing)) / patches.sides
         columns.append(mean)
     return np.stack(columns, 1)
 
@@ -282,13 +275,13 @@ def _nearest_feature(
     known[features] = np.arange(len(features))
     for _ in range(MOVED_RINGS):
         rows = np.flatnonzero(known >= 0)
-        place, nth = np.nonzero(patches.there[rows])
-        peak, at = known[rows[place]], patches.crossing[rows[place], nth]
-        apart = length(point[at] - vertex[peak])
+        joined = patches.crossing.take(rows, 0)
+        peak, at = np.repeat(known[rows], patches.sides[rows]), joined[joined >= 0]
+        apart = length(point.take(at, 0) - vertex.take(peak, 0))
         np.minimum.at(distance, at, apart)
-        best = apart == distance[at]
+        best = np.flatnonzero(apart == distance.take(at))
         nearest[at[best]] = peak[best]
-        away = distance[patches.crossing]
+        away = distance.take(patches.crossing, mode="wrap")
         chosen = np.take_along_axis(patches.crossing, away.argmin(1)[:, None], 1)[:, 0]
         known = np.where(np.isfinite(away.min(1)), nearest[chosen], -1)
     return distance[:-1], nearest
@@ -350,17 +343,19 @@ def _measure(
     is outside.
     """
     patches, factor = patches.chosen(rows), field.factor
-    crossing, there, count = patches.crossing, patches.there, len(patches.row)
-    wedges = wedges_of(planes.point[crossing] / factor, planes.normal[crossing], there)
+    crossing, count = patches.crossing.T, len(patches.row)
+    there = crossing >= 0
+    point, normal = planes.point.take(crossing, 0), planes.normal.take(crossing, 0)
+    wedges = wedges_of(np.moveaxis(point, 2, 0) / factor, np.moveaxis(normal, 2, 0) * there, there)
     assert field.spheres is not None  # otherwise no features are looked for
-    near = find_spheres(wedges, field.voxel_ijk[patches.row].astype(np.int64), field.spheres)
-    point = lean(wedges, near)
-    contact = contact_of(point, near)
+    near = find_spheres(wedges, field.voxel_ijk.take(patches.row, 0), field.spheres)
+    leant = lean(wedges, near)
+    contact = contact_of(leant, near)
     own_cosine = _least_cosine(patches, own.normal)
-    settled = np.where(there, length(planes.point[crossing] - own.point[crossing]), 0).max(1)
-    trust = planes.trust[crossing]
-    flattest = np.log(np.where(there, trust, 0).max(1) + 1e-3)
-    roughest = np.log(np.where(there, trust, np.inf).min(1) + 1e-3)
+    settled = np.where(there, length(point - own.point.take(crossing, 0)), 0).max(0)
+    trust = planes.trust.take(crossing)
+    flattest = np.log(np.where(there, trust, 0).max(0) + 1e-3)
+    roughest = np.log(np.where(there, trust, np.inf).min(0) + 1e-3)
     pierced: Numbers = np.full(count, -0.1)
     np.maximum.at(pierced, near.wedge[contact.is_close], -contact.gap[contact.is_close])
     touching = contact.in_cone & (np.abs(contact.gap) < TOUCHING)
@@ -371,90 +366,97 @@ def _measure(
         *(own_cosine, np.maximum(roughest - np.log(0.1), 0)),
         np.clip(pierced, 0, 0.15),
         np.minimum(np.bincount(near.wedge[touching], minlength=count), 3),
-        np.minimum(length((point - wedges.point).T), 0.15),
-        dot(point.T - middle / factor, unit(patches.mean(planes.normal))),
+        np.minimum(length((leant - wedges.point).T), 0.15),
+        dot(leant.T - middle / factor, unit(patches.mean(planes.normal))),
     )
     spheres = np.bincount(near.wedge, minlength=count).astype(np.int32)
-    return middle, factor * point.T, np.stack(columns, 1).astype(np.float64), spheres
+    return middle, factor * leant.T, np.stack(columns, 1).astype(np.float64), spheres
 
 
 def wedges_of(point: Vectors, normal: Vectors, there: BoolArray) -> Wedges:
     """Return the wedges of patches, at the points nearest to all planes of each.
 
-    A plane is given by a point and a normal, (f, S, 3) each; ``there``, (f, S), says which are.
+    A plane is given by a point and a normal, (3, S, f) each; ``there``, (S, f), says which are.
+    Normals of the others must be 0.
     """
-    count, normal = there.sum(1), normal * there[..., None]
-    stiffness = np.einsum("pei,pej->pij", normal, normal) / count[:, None, None]
-    values, vectors = np.linalg.eigh(stiffness)
-    middle = (point * there[..., None]).sum(1) / count[:, None]
-    height = dot(point - middle[:, None], normal)
-    right = (height[..., None] * normal).sum(1) / count[:, None]
+    count = there.sum(0)
+    stiffness = np.stack([(normal[i] * normal).sum(1) for i in range(3)]) / count
+    values, vectors = np.linalg.eigh(np.moveaxis(stiffness, 2, 0))
+    middle = (point * there).sum(1) / count
+    height = inner(point - middle[:, None], normal)
+    right = (height * normal).sum(1) / count
     inverse = np.where(values > RANK * values[:, -1:], 1 / np.maximum(values, 1e-9), 0)
-    step = np.einsum("pij,pj->pi", vectors, inverse * np.einsum("pij,pi->pj", vectors, right))
-    peak = middle + step
-    cosine = np.einsum("pei,pfi->pef", normal, normal)
-    cosine[~(there[:, :, None] & there[:, None, :])] = 2
-    one, other = np.divmod(cosine.reshape(len(cosine), -1).argmin(1), there.shape[1])
-    row = np.arange(len(peak))
-    first, second = normal[row, one], normal[row, other]
-    above = dot(point[row, one] - peak, second) + dot(point[row, other] - peak, first)
+    step = np.einsum("pij,pj->pi", vectors, inverse * np.einsum("pij,ip->pj", vectors, right))
+    peak = middle + step.T
+    pairs = list(combinations(range(len(there)), 2))
+    cosines = [
+        np.where(there[i] & there[j], inner(normal[:, i], normal[:, j]), 2) for i, j in pairs
+    ]
+    one, other = np.array(pairs)[np.argmin(cosines, axis=0)].T
+    row = np.arange(len(count))
+    first, second = normal[:, one, row], normal[:, other, row]
+    above = inner(point[:, one, row] - peak, second) + inner(point[:, other, row] - peak, first)
     convex = np.where(above < 0, 1.0, -1.0)
     corner = values[:, 0] > RANK * values[:, -1]
     tangent = np.where(corner, 0, vectors[:, :, 0].T)
-    sides = np.stack([first.T, second.T])
-    return Wedges(peak.T.copy(), tangent, sides, dot(first, second), convex, stiffness)
+    sides = np.stack([first, second])
+    return Wedges(peak, tangent, sides, inner(first, second), convex, np.moveaxis(stiffness, 2, 0))
 
 
-def find_spheres(wedges: Wedges, voxel: Index, spheres: SampleSpheres) -> Nearby:
+def find_spheres(wedges: Wedges, voxel: IntArray, spheres: SampleSpheres) -> Nearby:
     """Return the spheres that pass within ``FARTHEST_SPHERE`` of each wedge's edge.
 
     Wedges of a ``voxel``, (f, 3), follow each other, and have the same samples around.
     """
     first = np.append(True, np.any(np.diff(voxel, axis=0) != 0, axis=1))[: len(voxel)]
     number = _samples_around(voxel[first], spheres)
-    distance: Numbers = spheres.distance.astype(np.float64) / 2
-    usable = (number >= 0) & (np.abs(distance) < LARGEST_RADIUS)[number]
-    of_wedge = np.cumsum(first) - 1
-    wedge, place = np.nonzero(usable[of_wedge])
+    radius = np.abs(spheres.distance) / 2
+    usable, of_wedge = (number >= 0) & (radius < LARGEST_RADIUS)[number], np.cumsum(first) - 1
+    steps = np.indices((2 * NEAR + 1,) * 3).reshape(3, -1) - float(NEAR)
+    start = wedges.point - voxel.T - 0.5
+    along = inner(start, wedges.tangent)[:, None] - wedges.tangent.T @ steps
+    across = inner(start, start)[:, None] - 2 * start.T @ steps + inner(steps, steps) - along**2
+    off = np.sqrt(np.maximum(across, 0))
+    off -= np.where(usable, radius[number], np.inf).take(of_wedge, 0)
+    kept = (np.abs(off) < FARTHEST_SPHERE) & (np.abs(along) < FARTHEST_ALONG)
+    wedge, place = np.nonzero(kept)
     number = number[of_wedge[wedge], place]
-    centre = np.stack([axis[number] + 0.5 for axis in spheres.voxel_ijk.T])
-    radius = np.abs(distance)[number]
-    away = wedges.point[:, wedge] - centre
-    along = _along(away, wedges.tangent[:, wedge])
-    across = np.sqrt(np.maximum(_along(away, away) - along * along, 0))
-    kept = (np.abs(across - radius) < FARTHEST_SPHERE) & (np.abs(along) < FARTHEST_ALONG)
-    wedge, number = wedge[kept], number[kept]
-    convex, tangent = wedges.convex[wedge], wedges.tangent[:, wedge]
-    may_touch = (np.sign(distance[number]) == convex) & tangent.any(0)
-    outward = -convex * wedges.sides[..., wedge]
-    cosine = wedges.cosine[wedge]
-    return Nearby(wedge, centre[:, kept], radius[kept], tangent, outward, cosine, may_touch)
+    centre, tangent = spheres.voxel_ijk.take(number, 0).T + 0.5, wedges.tangent.take(wedge, 1)
+    convex = wedges.convex[wedge]
+    may_touch = (np.sign(spheres.distance[number]) == convex) & tangent.any(0)
+    outward = -convex * wedges.sides.take(wedge, 2)
+    columns = centre, radius[number].astype(np.float64), tangent, outward, wedges.cosine[wedge]
+    return Nearby(wedge, *columns, may_touch)
 
 
-def _samples_around(voxel: Index, spheres: SampleSpheres) -> Index:
+def _samples_around(voxel: IntArray, spheres: SampleSpheres) -> Index:
     """Return the numbers of the exact samples within ``NEAR`` of voxels (v, 3), -1 for none.
 
     A line of them along the last axis is searched for at once: (v, 125).
     """
     keys, (nx, ny, nz) = spheres.index.keys, spheres.shape
-    steps = np.indices((2 * NEAR + 1,) * 2).reshape(2, -1) - NEAR
-    i, j, k = voxel[:, 0, None] + steps[0], voxel[:, 1, None] + steps[1], voxel[:, 2, None]
+    di, dj = np.indices((2 * NEAR + 1,) * 2).reshape(2, -1) - NEAR
+    i, j, k = voxel[:, 0, None] + di, voxel[:, 1, None] + dj, voxel[:, 2, None]
     line = (i * ny + j) * nz
     start = np.searchsorted(keys, line + np.maximum(k - NEAR, 0))
     number = start[..., None] + np.arange(2 * NEAR + 1)
     there = ((i >= 0) & (i < nx) & (j >= 0) & (j < ny))[..., None] & (number < len(keys))
-    there &= keys.take(number, mode="clip") <= (line + np.minimum(k + NEAR, nz - 1))[..., None]
-    return np.where(there, number, -1).reshape(len(voxel), -1)
+    place = keys.take(number, mode="clip") - (line + k - NEAR)[..., None]
+    there &= place <= (np.minimum(nz - 1 - k, NEAR) + NEAR)[..., None]
+    found = np.flatnonzero(there)
+    around = np.full(number.size, -1)
+    around[found - found % (2 * NEAR + 1) + place.ravel()[found]] = number.ravel()[found]
+    return around.reshape(len(voxel), -1)
 
 
 def contact_of(point: Vectors, near: Nearby) -> Contact:
     """Return how spheres stand to edges at points (3, f); none must touch a corner."""
-    away = point[:, near.wedge] - near.centre
-    along = _along(away, near.tangent)
+    away = point.take(near.wedge, 1) - near.centre
+    along = inner(away, near.tangent)
     across = away - along * near.tangent
-    apart = np.sqrt(_along(across, across))
+    apart = np.sqrt(inner(across, across))
     direction = across / np.maximum(apart, 1e-12)
-    first, second = _along(direction, near.outward[0]), _along(direction, near.outward[1])
+    first, second = inner(direction, near.outward[0]), inner(direction, near.outward[1])
     in_cone = (first > near.cosine * second) & (second > near.cosine * first)
     in_cone &= near.may_touch & (apart > LEAST_RADIUS)
     return Contact(direction, along, apart - near.radius, in_cone, np.abs(along) < CLOSE_BY)
@@ -481,9 +483,3 @@ def lean(wedges: Wedges, near: Nearby) -> Vectors:
         step = np.linalg.solve(stiff, pull[..., None])[..., 0].T
         point = point + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
     return point
-
-
-def _along(a: Vectors, b: Vectors) -> Numbers:
-    """Return the products of vectors (3, n)."""
-    product: Numbers = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return product

@@ -95,7 +95,7 @@ def find_suspects(patches: Patches, placed: Placed, lattice: Vectors) -> BoolArr
     moved = length(placed.position - lattice) > LEAST_MOVE * to_node
     changed = np.concatenate([moved, np.ones(len(placed.feature), bool)])
     _, triangles = triangles_of(patches, placed, _having(patches, placed, changed))
-    a, b, c = (placed.points[corner] for corner in triangles.T)
+    a, b, c = (placed.points.take(corner, 0) for corner in triangles.T)
     normals = np.tile(unit(cross(b - a, c - a)), (3, 1))
     suspect = _turns(triangles.T.ravel(), normals, len(changed))
     nodes, node = np.unique(keys_of(np.rint(lattice)), return_inverse=True)
@@ -110,7 +110,7 @@ def _turns(place: Index, normals: Vectors, count: int) -> BoolArray:
     """Return which of ``count`` places have normals that do not face one way."""
     mean = unit(sums_at(place, normals, count))
     found: BoolArray = np.zeros(count, bool)
-    found[place[dot(normals, mean[place]) < ONE_WAY]] = True
+    found[place[dot(normals, mean.take(place, 0)) < ONE_WAY]] = True
     return found
 
 
@@ -144,7 +144,7 @@ def overlapping_boxes(points: Vectors, triangles: Index, suspect: BoolArray) -> 
 
     A triangle is listed in the cells from which it reaches into the next, or in its only one.
     """
-    a, b, c = (points[corner] for corner in triangles.T)
+    a, b, c = (points.take(corner, 0) for corner in triangles.T)
     low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
     first, last = np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
     chosen: BoolArray = np.any(suspect[triangles], axis=1)
@@ -194,9 +194,9 @@ def intersecting(points: Vectors, first: Index, second: Index) -> tuple[Index, I
 
 def _heights_over(points: Vectors, first: Index, second: Index) -> Vectors:
     """Return how far over the first triangles the second's corners are, (3, m); NaN if common."""
-    a, b, c = (points[corner] for corner in first.T)
+    a, b, c = (points.take(corner, 0) for corner in first.T)
     normals = unit(cross(b - a, c - a))
-    heights = np.stack([dot(points[corner] - a, normals) for corner in second.T])
+    heights = np.stack([dot(points.take(corner, 0) - a, normals) for corner in second.T])
     heights[np.any(second.T[:, None] == first.T, axis=1)] = np.nan
     return heights
 

@@ -39,12 +39,19 @@ from ...arrays import (
 from ...refine.field import FineField
 from ...refine.nodes import block_ijk
 from ...threads import map_chunks
-from ..marching import Crossings, cells_low_nodes, edge_steps, edge_table, owners_of, tables
+from ..marching import (
+    Crossings,
+    cells_low_nodes,
+    edge_steps,
+    edge_table,
+    owners_of,
+    tables,
+    values_at,
+)
 
 NEAR_SURFACE = 1.0  # fine spacings: slopes count at nodes that are nearer
 BEND = 0.3  # change of the slopes at a node, 1 for a distance, from which there may be an edge
 TEMPORARIES = 8  # numbers per node of a block
-PULL = 0.5  # share of the way to the middle of its crossings that a vertex which folds its fan goes
 
 
 def voxels_near_kinks(field: FineField, threads: int = 1) -> BoolArray:
@@ -58,20 +65,20 @@ def voxels_near_kinks(field: FineField, threads: int = 1) -> BoolArray:
 def _largest_bends(field: FineField, rows: slice) -> FloatArray:
     """Return by how much slopes change at a node near the surface, the length over the axes."""
     side, unit_slope = field.factor + 1, np.float32(2 / field.factor)
-    cubes, squares = field.blocks.reshape(side, side, side, -1), np.float32(0)
+    nodes, squares = np.arange(side**3).reshape(side, side, side), np.float32(0)
+    blocks = field.blocks.reshape(*nodes.shape, -1)[..., rows]
+    near_surface = np.abs(blocks) < np.float32(NEAR_SURFACE) * unit_slope
     for axis in range(3):
-        cube = np.moveaxis(cubes, axis, 0)
-        mine = cube[..., rows]
-        near = np.abs(mine) < np.float32(NEAR_SURFACE) * unit_slope
-        bends = np.abs(np.diff(mine, n=2, axis=0)) * near[1:-1]
-        largest = bends.reshape(-1, mine.shape[-1]).max(0)
+        mine, near, node = (np.moveaxis(each, axis, 0) for each in (blocks, near_surface, nodes))
+        steps = mine[1:] - mine[:-1]
+        bends = np.abs(steps[1:] - steps[:-1])
+        largest = np.multiply(bends, near[1:-1], out=bends).max((0, 1, 2))
         for step, beyond, face, within in ((-STRIDES[axis], -2, 0, 1), (STRIDES[axis], 1, -1, -2)):
             other = field.parts.table[CENTRE + step, rows]
-            there = np.flatnonzero(other >= 0)
-            after = cube[beyond][..., other[there]]
-            bend = np.abs(after + mine[within][..., there] - 2 * mine[face][..., there])
-            bend *= near[face][..., there]
-            largest[there] = np.maximum(largest[there], bend.reshape(side**2, len(there)).max(0))
+            after = values_at(field, node[beyond][..., None], other)
+            bends = after + mine[within] - 2 * mine[face]
+            counts = near[face] & (other >= 0)
+            largest = np.maximum(largest, (np.abs(bends) * counts).max((0, 1)))
         squares = squares + (largest / unit_slope) ** 2
     return np.sqrt(cast(FloatArray, squares))
 
@@ -99,31 +106,23 @@ class Patches:
     crossing: Index
 
     def chosen(self, rows: Any) -> Patches:
-        """Return some of the patches."""
-        return Patches(*(values[rows] for values in vars(self).values()))
-
-    @property
-    def there(self) -> BoolArray:
-        """Which entries of ``crossing`` are crossings, (P, S)."""
-        return self.crossing >= 0
-
-    def joined(self) -> tuple[Index, Index]:
-        """Return the patch and the crossing of every entry of ``crossing`` that is one."""
-        patch, place = np.nonzero(self.there)
-        return patch, self.crossing[patch, place]
+        """Return some of the patches, by their rows or a slice."""
+        if isinstance(rows, slice):
+            return Patches(*(values[rows] for values in vars(self).values()))
+        return Patches(*(values.take(rows, 0) for values in vars(self).values()))
 
     def mean(self, vectors: Vectors) -> Vectors:
         """Return the mean of the vectors (n, 3) at the crossings of each patch, (P, 3)."""
         total = np.zeros((len(self.sides), 3))
         for crossing in self.crossing.T:
             there = np.flatnonzero(crossing >= 0)
-            total[there] += vectors[crossing[there]]
+            total[there] += vectors.take(crossing[there], 0)
         return total / self.sides[:, None]
 
     def having(self, chosen: BoolArray) -> BoolArray:
         """Return which patches have some of the chosen crossings, (P,)."""
-        found: BoolArray = np.any(np.append(chosen, False)[self.crossing], axis=1)
-        return found
+        found = np.append(chosen, False).take(self.crossing, mode="wrap")
+        return cast(BoolArray, found.any(1))
 
     def dilate(self, chosen: BoolArray | Index, rings: int, count: int) -> BoolArray:
         """Return which of ``count`` crossings are within some rings of patches of chosen ones."""
@@ -131,7 +130,7 @@ class Patches:
         for _ in range(rings):
             near[self.crossing[chosen]] = True
             near[-1] = False
-            chosen = cast(BoolArray, near[self.crossing].any(1))
+            chosen = cast(BoolArray, near.take(self.crossing, mode="wrap").any(1))
         return near[:-1]
 
 
@@ -191,10 +190,10 @@ class Placed:
 
     def facing(self, corners: tuple[Index, Index, Index], *crossings: Index) -> Numbers:
         """Return the least cosine between triangles, corners (t,) each, and planes of crossings."""
-        a, b, c = (self.points[corner] for corner in corners)
+        a, b, c = (self.points.take(corner, 0) for corner in corners)
         normal = unit(cross(b - a, c - a))
-        least: Numbers = np.min([dot(normal, self.normal[at]) for at in crossings], axis=0)
-        return least
+        least = [dot(normal, self.normal.take(at, 0)) for at in crossings]
+        return least[0] if len(least) == 1 else np.minimum(*least)
 
 
 Triangles = tuple[Index, Index]
@@ -218,18 +217,6 @@ def _sides_of(patches: Patches, placed: Placed) -> Sides:
     start = patches.crossing[patch, nth]
     end = patches.crossing[patch, np.where(nth + 1 < sides[fan], nth + 1, 0)]
     return Sides(patch, start, end, len(placed.position) + fan)
-
-
-def unfolded(patches: Patches, placed: Placed) -> Placed:
-    """Return the vertices, those that lie beyond a side of their fan moved inwards."""
-    sides = _sides_of(patches, placed)
-    corners = sides.start, sides.end, sides.peak
-    beyond = (placed.facing(corners, sides.start) < 0) & (placed.facing(corners, sides.end) < 0)
-    folded = np.zeros(len(placed.feature), bool)
-    folded[sides.peak[beyond] - len(placed.position)] = True
-    middle = patches.chosen(placed.feature).mean(placed.position)
-    inwards = np.where(folded[:, None], PULL * (middle - placed.peak), 0)
-    return replace(placed, peak=placed.peak + inwards)
 
 
 def triangles_of(patches: Patches, placed: Placed, chosen: BoolArray) -> Triangles:

@@ -19,11 +19,11 @@ from functools import cached_property, lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import CENTRE, STRIDES, Index, IntArray, Numbers, Vectors, dot, length, unit
+from ...arrays import CENTRE, STRIDES, Index, IntArray, Numbers, Vectors, dot, inner, unit
 from ...refine.field import FineField
 from ...refine.nodes import block_ijk
 from ...threads import chunks_of, map_chunks, map_threads, worthwhile_threads
-from ..marching import Crossings, edge_ends, lattice_positions
+from ..marching import Crossings, edge_ends, lattice_positions, values_at
 from .patches import Patches
 
 ROUNDS = 4  # in each, every crossing looks at those it shares a patch with
@@ -63,33 +63,32 @@ def planes_at_crossings(
     Normals are between the gradients at both ends, in which they trust if the slope is about 1.
     """
     planes = Planes(np.empty((len(chosen), 3)), np.empty((len(chosen), 3)), np.empty(len(chosen)))
-    size = len(field.blocks)
+    size, nodes = len(field.blocks), block_ijk(field.factor)
 
     def fill(some: slice) -> None:
-        row, edge = crossings.own_row[chosen[some]], crossings.own_edge[chosen[some]]
+        row, edge = crossings.own_row.take(chosen[some]), crossings.own_edge.take(chosen[some])
         axis, node = np.divmod(edge.astype(np.int64), size)
-        position = lattice_positions(field, row, edge, border).T
-        each = np.arange(len(row))
-        start = field.factor * field.voxel_ijk[row, axis] + block_ijk(field.factor)[node, axis]
-        share = np.clip(position[each, axis] - start, 0, 1)
+        position = lattice_positions(field, row, edge, border)
+        start = field.factor * field.voxel_ijk.take(row, 0) + nodes.take(node, 0)
+        share = np.clip(np.choose(axis, position - start.T), 0, 1)
         width = int(row[-1] - row[0]) + 1  # a node at the end of many edges is worked on once
-        ends = np.stack([node, edge_ends(field.factor)[edge]]) * width + (row - row[0])
+        ends = np.stack([node, edge_ends(field.factor).take(edge)]) * width + (row - row[0])
         number = np.zeros(size * width, np.int32)
         number[ends] = 1
         at = np.flatnonzero(number)
         number[at] = np.arange(len(at))
-        ends = number[ends]
+        ends = number.take(ends)
         node, row = np.divmod(at, width)[0], row[0] + at % width
         gradient = _gradient(field, row, node)
-        slope_trust = square_falloff((length(gradient) - 1) / SLOPE_ERROR) + LEAST_TRUST
-        low, high = gradient[ends]
-        trust = slope_trust[ends]
+        slope = np.sqrt(inner(gradient, gradient))
+        trust = (square_falloff((slope - 1) / SLOPE_ERROR) + LEAST_TRUST).take(ends)
+        low, high = np.moveaxis(gradient.take(ends, 1), 1, 0)
         weight = (1 - share) * trust[0], share * trust[1]
-        agree = dot(*unit(gradient)[ends]) > 0.9
-        mean = low * weight[0][:, None] + high * weight[1][:, None]
-        nearer = np.where((weight[0] >= weight[1])[:, None], low, high)
-        planes.point[some] = position
-        planes.normal[some] = unit(np.where(agree[:, None], mean, nearer))
+        first, second = np.moveaxis((gradient / np.maximum(slope, 1e-12)).take(ends, 1), 1, 0)
+        mean = low * weight[0] + high * weight[1]
+        nearer = np.where(weight[0] >= weight[1], low, high)
+        planes.point[some] = position.T
+        planes.normal[some] = unit(np.where(inner(first, second) > 0.9, mean, nearer).T)
         planes.trust[some] = np.maximum(*trust)
 
     map_chunks(fill, len(chosen), TEMPORARIES, threads)
@@ -106,20 +105,18 @@ def square_falloff(off: Numbers, other: Numbers | float = 0.0) -> Numbers:
 
 
 def _gradient(field: FineField, row: NDArray[np.intp], node: NDArray[np.intp]) -> Vectors:
-    """Return the field's gradient at nodes of blocks, (n, 3); 1 is the slope of a distance.
+    """Return the field's gradient at nodes of blocks, (3, n); 1 is the slope of a distance.
 
     Along each axis by the parabola through three of five nodes that bends least: it does not
     straddle a kink. It is 0 where all three have missing values.
     """
-    gradient, c = np.empty((len(row), 3)), field.blocks[node, row].astype(np.float64)
-    for axis, walk in enumerate(_walks(field.factor)):
-        found = []
-        for place, end in walk:
-            beside = field.parts.table[place[node], row]
-            value = field.blocks[end[node], beside].astype(np.float64)
-            value[beside < 0] = np.nan  # there is no block
-            found.append(value)
-        a, b, d, e = found
+    gradient, c = np.empty((3, len(row))), values_at(field, node, row).astype(np.float64)
+    table = np.ascontiguousarray(field.parts.table).ravel()
+    for axis, (place, end) in enumerate(_walks(field.factor)):
+        beside = table.take(place.take(node, 1) * len(field.voxel_ijk) + row)
+        values = values_at(field, end.take(node, 1), beside).astype(np.float64)
+        values[beside < 0] = np.nan  # there is no block
+        a, b, d, e = values
         least, slope = np.full(len(c), np.inf), np.zeros(len(c))
         for bend, own in (
             (c - 2 * b + a, 1.5 * c - 2 * b + 0.5 * a),
@@ -130,24 +127,25 @@ def _gradient(field: FineField, row: NDArray[np.intp], node: NDArray[np.intp]) -
             better = bend < least  # never of NaN
             np.copyto(least, bend, where=better)
             np.copyto(slope, own, where=better)
-        gradient[:, axis] = slope
+        gradient[axis] = slope
     return gradient * (field.factor / 2)
 
 
 @lru_cache
-def _walks(factor: int) -> list[list[tuple[Index, Index]]]:
-    """Return the neighbours, (Q,), and nodes, (Q,), -2, -1, 1 and 2 nodes away along each axis."""
+def _walks(factor: int) -> list[tuple[Index, Index]]:
+    """Return the neighbours, (4, Q), and nodes -2, -1, 1 and 2 nodes away along each axis."""
     side = factor + 1
 
-    def walk(axis: int, step: int) -> tuple[Index, Index]:
+    def walk(axis: int, step: int) -> Index:
         ijk = block_ijk(factor).astype(np.int64)
         ijk[:, axis] += step
         beyond = np.where(ijk[:, axis] > factor, 1, np.where(ijk[:, axis] < 0, -1, 0))
         ijk[:, axis] -= factor * beyond
         end = (ijk[:, 0] * side + ijk[:, 1]) * side + ijk[:, 2]
-        return CENTRE + int(STRIDES[axis]) * beyond, end
+        return np.stack([CENTRE + int(STRIDES[axis]) * beyond, end])
 
-    return [[walk(axis, step) for step in (-2, -1, 1, 2)] for axis in range(3)]
+    walks = (np.stack([walk(axis, step) for step in (-2, -1, 1, 2)], 1) for axis in range(3))
+    return [(place, end) for place, end in walks]
 
 
 def settle_planes(patches: Patches, own: Planes, threads: int = 1) -> Planes:
@@ -161,67 +159,72 @@ def settle_planes(patches: Patches, own: Planes, threads: int = 1) -> Planes:
         np.ascontiguousarray(patches.crossing[patches.sides == sides, :sides].T)
         for sides in range(3, patches.crossing.shape[1] + 1)
     ]
-    rough: Numbers = np.zeros(len(own.trust))  # the largest 1 - cosine of normals in a patch
-    for loop in _chunks_of_loops(loops):
-        normal = own.normal.T[:, loop]
-        for turn in range(1, len(loop) // 2 + 1):  # a pair is met from both sides
-            bend = 1 - _along(normal, np.roll(normal, turn, axis=1))
-            np.maximum.at(rough, loop, np.maximum(bend, np.roll(bend, -turn, axis=0)))
-    trust = own.trust * square_falloff(rough / ROUGH) + LEAST_TRUST
-    unsettled = patches.having(trust < SETTLED)
-    near = patches.dilate(unsettled, SMOOTHED_RINGS, len(trust))
-    planes, rows = Planes(own.point, own.normal, trust), np.flatnonzero(near)
-    chunks = _chunks_of_loops([loop[:, near[loop].any(0)] for loop in loops])
-    threads = worthwhile_threads(PAIR_TEMPORARIES * sum(loop.size for loop in chunks), threads)
-    if not chunks:
-        return planes
-    crossing = np.concatenate([loop.ravel() for loop in chunks])
-    start = own.point[rows]
-    for _ in range(ROUNDS):
-        parts = map_threads(partial(_sums_in_loops, planes, own), chunks, threads)
-        sums = np.concatenate(parts, 1)
-        summed = np.stack([np.bincount(crossing, each, len(trust))[rows] for each in sums])
-        total, off, passed_on = summed[:3]
-        mine, trusted = planes.normal[rows], planes.trust[rows]
-        mean = unit(summed[3:].T + trusted[:, None] * mine)
-        here = dot(start - planes.point[rows], mine)
-        height = (off + trusted * here) / (total + trusted)
-        planes = Planes(planes.point.copy(), planes.normal.copy(), planes.trust.copy())
-        planes.point[rows], planes.normal[rows] = start - height[:, None] * mean, mean
-        planes.trust[rows] = np.maximum(trusted, WEAKENING * passed_on / (total + 1e-12))
-    return planes
-
-
-def _chunks_of_loops(loops: list[Index]) -> list[Index]:
-    return [
-        loop[:, some]
-        for loop in loops
+    normal, point = np.ascontiguousarray(own.normal.T), np.ascontiguousarray(own.point.T)
+    trust = own.trust * square_falloff(_roughness(normal, loops) / ROUGH) + LEAST_TRUST
+    near = patches.dilate(patches.having(trust < SETTLED), SMOOTHED_RINGS, len(trust))
+    chunks = [
+        np.ascontiguousarray(loop[:, some])
+        for loop in (loop.compress(near[loop].any(0), 1) for loop in loops)
         for some in chunks_of(loop.shape[1], PAIR_TEMPORARIES * len(loop))
     ]
+    if not chunks:
+        return Planes(own.point, own.normal, trust)
+    rows, crossing = np.flatnonzero(near), np.concatenate([loop.ravel() for loop in chunks])
+    table = np.concatenate([normal, [own.height, trust]])
+    work = [(point.take(loop, 1), loop) for loop in chunks]
+    start = point.take(rows, 1)
+    placed = start.copy()
+    threads = worthwhile_threads(PAIR_TEMPORARIES * len(crossing), threads)
+    for _ in range(ROUNDS):
+        sums = np.concatenate(map_threads(partial(_sums_in_loops, table), work, threads), 1)
+        total, off, passed_on, *mean = (
+            np.bincount(crossing, each, len(trust)).take(rows) for each in sums
+        )
+        mine, trusted = table[:3].take(rows, 1), table[4].take(rows)
+        normal = unit((np.stack(mean) + trusted * mine).T).T
+        height = (off + trusted * inner(start - placed, mine)) / (total + trusted)
+        placed = start - height * normal
+        trusted = np.maximum(trusted, WEAKENING * passed_on / (total + 1e-12))
+        table[:, rows] = *normal, inner(placed, normal), trusted
+    point[:, rows] = placed
+    return Planes(point.T.copy(), table[:3].T.copy(), table[4])
 
 
-def _sums_in_loops(planes: Planes, own: Planes, loop: Index) -> Vectors:
+def _roughness(normal: Vectors, loops: list[Index]) -> Numbers:
+    """Return the largest 1 - cosine of normals in the patches of each crossing, (n,)."""
+    rough: Numbers = np.zeros(normal.shape[1])
+    for loop in loops:
+        mine, largest = normal.take(loop, 1), np.zeros(loop.shape)
+        for turn in range(1, len(loop) // 2 + 1):  # a pair is met from both sides
+            bend = 1 - inner(mine, np.roll(mine, turn, axis=1))
+            np.maximum(largest, np.maximum(bend, np.roll(bend, -turn, axis=0)), out=largest)
+        np.maximum.at(rough, loop.ravel(), largest.ravel())
+    return rough
+
+
+def _sums_in_loops(table: Vectors, work: tuple[Vectors, Index]) -> Vectors:
     """Return for each crossing of patches (S, p) sums over the others of its patch, (6, S p).
 
-    Of the weights, and weighted: how far it lies off their planes, their trust, their normals.
+    Of the weights, and weighted: how far it lies off their planes, their trust, their normals. The
+    ``table`` has the normal, height and trust of each plane, (5, n); ``work`` are the positions and
+    the numbers of the crossings.
     """
-    sides, sums = len(loop), np.zeros((6, *loop.shape))
-    twice = np.concatenate([loop, loop[:-1]])  # so that the next ones of all follow each other
-    start, normal = own.point.T[:, loop], planes.normal.T[:, twice]
-    height, trust = planes.height[twice], planes.trust[twice]
+    start, loop = work
+    sides, sums, here = len(loop), np.zeros((6, *loop.shape)), table.take(loop, 1)
+    twice = np.concatenate(
+        [here, here[:, :-1]], 1
+    )  # so that the next ones of all follow each other
+    bends: list[Numbers] = []
     for turn in range(1, sides):
-        here = slice(turn, turn + sides)
-        off = _along(start, normal[:, here]) - height[here]
-        turned = (1 - _along(normal[:, :sides], normal[:, here])) / ALIGNED
-        weight = trust[here] * square_falloff(turned, off / OFF_PLANE)
+        other = twice[:, turn : turn + sides]
+        off = inner(start, other[:3]) - other[3]
+        if turn <= sides // 2:
+            bends.append((1 - inner(here[:3], other[:3])) / ALIGNED)
+        back = sides - turn  # the pair is the same from the other side
+        bend = bends[turn - 1] if turn <= back else np.roll(bends[back - 1], back, axis=0)
+        weight = other[4] * square_falloff(bend, off / OFF_PLANE)
         sums[0] += weight
         sums[1] += weight * off
-        sums[2] += weight * trust[here]
-        sums[3:] += weight * normal[:, here]
+        sums[2] += weight * other[4]
+        sums[3:] += weight * other[:3]
     return sums.reshape(6, -1)
-
-
-def _along(a: Vectors, b: Vectors) -> Numbers:
-    """Return the products of vectors (3, ...)."""
-    product: Numbers = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return product
