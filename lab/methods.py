@@ -18,13 +18,12 @@ from scipy import ndimage
 from super_sdf.arrays import FloatArray
 from super_sdf.errors import NoSurfaceError, OptionError
 from super_sdf.grid.sdf_grid import SdfGrid
-from super_sdf.network.decoder import Decoder, adapt
+from super_sdf.network.contract import Decoder, adapt
 from super_sdf.options import AUTO, MARCHING, SHARP
 from super_sdf.pipeline import extract_mesh, reconstruct, refine_band
-from super_sdf.refine.band import neighbour_table
+from super_sdf.refine.band import neighbour_table, survey
 from super_sdf.refine.field import FineField, SampleSpheres
 from super_sdf.refine.nodes import block_ijk, share_parts
-from super_sdf.refine.survey import survey
 from super_sdf.simplify.simplify import simplify_mesh
 from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import grid_points

@@ -79,6 +79,7 @@ def test_folders_are_mirrored_failures_named_and_meshes_those_of_single_runs(bat
     by_name = {row["out"]: row for row in rows()}
     assert len(rows()) == len(by_name) == 4 and is_made(by_name["a.ply"])
     assert by_name["a.ply"]["in"] == os.path.abspath("in/a.npy") and by_name["a.ply"]["closed"]
+    assert by_name["a.ply"]["precision"] == "int8"  # that ran; asked was for "auto"
     assert by_name["a.ply"]["triangles"] == len(trimesh.load("out/a.ply").faces)
     bad = by_name["bad.ply"]
     assert (bad["status"], bad["reason"], bad["retry"]) == ("failed", CONSTANT, False)
@@ -134,29 +135,24 @@ def test_files_that_no_batch_made_or_that_were_changed_are_replaced_by_force_onl
     assert Path("in/a.npy").stat().st_size > 1000
 
 
-def test_a_file_that_appears_meanwhile_is_kept(batch, monkeypatch):
-    def interfere(source, *rest, **options):
-        Path("out/a.ply").write_text("mine")
-        return convert(source, *rest, **options)
-
-    monkeypatch.setattr(batch_work, "convert", interfere)
-    for _ in range(2):
-        assert batch("in/a.npy")[0] == 1 and Path("out/a.ply").read_text() == "mine"
-
-
-def test_what_was_not_the_inputs_fault_stops_nothing_and_is_tried_again(batch, monkeypatch):
-    reason = "KeyError: 'odd\\nthing'"
-
-    def fail(source, *rest, **options):
+def test_what_another_did_meanwhile_or_a_bug_costs_one_file_alone_and_is_tried_again(
+    batch, monkeypatch
+):
+    def disturb(source, *rest, **options):
         if source.name == "a.npy":
+            Path("out/a.ply").write_text("mine")
+        if source.name == "b.npz":
             raise KeyError("odd\nthing")
         return convert(source, *rest, **options)
 
-    monkeypatch.setattr(batch_work, "convert", fail)
-    code, facts, err = batch("in")
-    assert code == 1 and f"Failed: in/a.npy: {reason}\n" in err and facts["done"] == 2
-    monkeypatch.setattr(batch_work, "convert", convert)
-    assert batch("in/a.npy")[:1] == (0,)
+    with monkeypatch.context() as patch:
+        patch.setattr(batch_work, "convert", disturb)
+        for _ in range(2):
+            code, facts, err = batch("in")
+            assert code == 1 and "Failed: in/deep/b.npz: KeyError: 'odd\\nthing'\n" in err
+            assert Path("out/a.ply").read_text() == "mine"
+        assert facts["done_before"] == 1
+    assert batch("in/deep/b.npz")[0] == 0
 
 
 def test_two_inputs_for_one_output_are_refused_and_one_named_twice_is_one(batch, command):
@@ -181,10 +177,9 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(batch):
 
 
 def test_fail_fast_begins_nothing_after_a_failure(batch):
-    Path("list.jsonl").write_text('{"in": "in/bad.npy"}\n{"in": "in/a.npy"}')
     np.save("in/bad.npy", np.ones((30, 30, 30)))  # the largest goes first
     for _ in range(2):
-        code, facts, _ = batch("list.jsonl", "--fail-fast")
+        code, facts, _ = batch("in/bad.npy", "in/a.npy", "--fail-fast")
         assert code == 1 and (facts["done"], facts["failed"], facts["not_begun"]) == (0, 1, 1)
 
 
@@ -242,21 +237,29 @@ def test_a_list_without_meaning_is_refused_before_the_work(command, text):
     assert not Path("out").exists()
 
 
-def test_arguments_that_name_no_grid_are_refused(command):
+KINDS = ", ".join(GRID_SUFFIXES)
+NO_GRIDS = {
+    "none.npy": "does not exist: give grids, folders, patterns or a list",
+    "in/*.raw": f"holds no grid ({KINDS})",
+    "empty": f"holds no grid ({KINDS})",
+    "odd.raw": f"is neither a grid ({KINDS}) nor a list (.txt, .jsonl)",
+}
+
+
+@pytest.mark.parametrize("argument", NO_GRIDS)
+def test_arguments_that_name_no_grid_are_refused(command, argument):
     Path("empty").mkdir()
     Path("odd.raw").write_text("")
-    kinds = ", ".join(GRID_SUFFIXES)
-    for argument, why in {
-        "none.npy": "does not exist: give grids, folders, patterns or a list",
-        "in/*.raw": f"holds no grid ({kinds})",
-        "empty": f"holds no grid ({kinds})",
-        "odd.raw": f"is neither a grid ({kinds}) nor a list (.txt, .jsonl)",
-    }.items():
-        said = command("batch", "in", argument, "--out", "out")
-        assert said == (2, "", f"Error: {argument} {why}\n")
+    said = command("batch", "in", argument, "--out", "out")
+    assert said == (2, "", f"Error: {argument} {NO_GRIDS[argument]}\n")
 
 
-def test_odd_files_and_names_fail_alone(batch):
+def test_odd_files_names_and_folders_fail_alone(batch, monkeypatch):
+    def refuse(path, scan=os.scandir):
+        if str(path).endswith("deep"):
+            raise PermissionError(13, "Permission denied", str(path))
+        return scan(path)
+
     os.mkfifo("in/pipe.npy")
     Path("in/loop.npz").symlink_to("loop.npz")
     os.link("in/bad.npy", b"in/bad\n\xff.npy")
@@ -264,26 +267,14 @@ def test_odd_files_and_names_fail_alone(batch):
     Path("in/list.jsonl").write_text(
         f'{{"in": "{long}.npy"}}\n{{"in": "a.npy", "out": "m{long}.ply"}}'
     )
+    monkeypatch.setattr(os, "scandir", refuse)
     code, facts, err = batch("in", "in/list.jsonl")
-    assert code == 1 and facts["done"] == 3 and facts["failed"] == 6, err
+    assert code == 1 and (facts["done"], facts["failed"]) == (1, 7), err
+    assert f"Failed: {Path('in/deep')} cannot be read: permission denied" in err
     assert "Failed: in/pipe.npy is a named pipe: give a file\n" in err
     assert "Failed: in/loop.npz cannot be read: " in err
     assert "Failed: in/bad\\n\\udcff.npy: every value is 1" in err
     assert f"{Path('out', 'm' + long)}.ply cannot be written: File name too long\n" in err
-
-
-def test_folders_that_cannot_be_read_are_named(batch, monkeypatch):
-    scan = os.scandir
-
-    def refuse(path):
-        if str(path).endswith("deep"):
-            raise PermissionError(13, "Permission denied", str(path))
-        return scan(path)
-
-    monkeypatch.setattr(os, "scandir", refuse)
-    code, facts, err = batch("in/", "in/a.npy")
-    assert code == 1 and f"Failed: {Path('in/deep')} cannot be read: permission denied" in err
-    assert facts["done"] == 1 and facts["failures"][0]["out"] == "deep/*.ply"
 
 
 # The report
@@ -386,18 +377,12 @@ def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
     assert [row["out"] for row in rows()][-1] == "a.ply" and len(rows()) == 4  # the others first
 
 
-def start_batch(*options):
-    """Start a batch as a process, and return it when its report has some lines."""
-    words = ("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL, *options)
-    process = start_command(*words)
-    wait_for_lines(process, Path("out/report.jsonl"))
-    return process
-
-
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_a_batch_that_is_ended_or_killed_leaves_no_process_and_goes_on(number, batch):
     larger_grids(8)
-    process = start_batch()
+    words = ("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL)
+    process = start_command(*words)
+    wait_for_lines(process, Path("out/report.jsonl"))
     workers = psutil.Process(process.pid).children()
     process.send_signal(number)
     err = process.communicate(timeout=PATIENCE)[1].strip()
@@ -412,16 +397,15 @@ def test_a_batch_that_is_ended_or_killed_leaves_no_process_and_goes_on(number, b
     assert len(rows()) >= 12 and finished >= 2 and not Path("out/.super-sdf-parts").exists()
 
 
-def recorded():
-    """Return how many lines the record has."""
-    record = Path("out/report.jsonl")
-    return record.read_bytes().count(b"\n") if record.exists() else 0
-
-
 def test_after_kills_at_random_moments_nothing_is_lost_and_nothing_made_twice():
     """Workers and batches are killed; afterwards each mesh is as its only row says."""
+
+    def recorded():
+        return report.read_bytes().count(b"\n") if report.exists() else 0
+
     larger_grids(30)
-    chance, words = random.Random(0), ("batch", "in", "--out", "out", "--jobs", 2, *SMALL)
+    chance, report = random.Random(0), Path("out/report.jsonl")
+    words = ("batch", "in", "--out", "out", "--jobs", 2, *SMALL)
     for _ in range(4):
         before, process = recorded(), start_command(*words)
         while process.poll() is None and recorded() == before:  # a fast machine may be through

@@ -81,6 +81,7 @@ def test_version_help_info_and_usage_errors(command):
     assert code == 0 and out.startswith(f"super-sdf: {super_sdf.__version__}\n")
     assert "models: base" in out and "devices: cpu" in out
     assert json.loads(command("info", "--json")[1])["models"]["base"]["format_version"] == 1
+    assert "an even number from 2 to 16" in command("upsample", "--help")[1]
     assert command("upsample")[0] == 2
     none = "Error: there is no command"
     assert command("upsampel") == (2, "", f"{none} 'upsampel': did you mean upsample?\n")
@@ -135,8 +136,8 @@ WRONG = {
     "in.npy --scale 0": "--scale is 0: give a number greater than 0",
     "in.npy --simplify -1": "--simplify is -1: give a number greater than 0",
     "in.npy --factor 18": f"--factor is 18: {FACTOR}",
-    "in.npy --factor four": "--factor is 'four': give a whole number",
-    "in.npy --spacing 1,2": "--spacing is '1,2': give one number, or three, separated by commas",
+    "in.npy --factor four": f"--factor is 'four': {FACTOR}",
+    "in.npy --spacing 1,2": "--spacing is '1,2': give one number, or three",
     "in.npy --spacing 1,nan,1": "--spacing is nan: give a finite number",
     "in.npy --level 1.5 --label 2": "--label 2 and --level 1.5: give only one of them",
     "in.npy --max-memory much": "--max-memory is 'much': give a number of bytes",

@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +16,11 @@ from batches import CONSTANT, FAST, PLAIN, rows
 from distributed import Client
 from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines, wait_until
 
-from super_sdf import Mesh, SdfGrid, __version__, load_network
+from super_sdf import __version__
 from super_sdf.batch import cluster
 from super_sdf.batch.cluster import completed, connect
 from super_sdf.batch.work import Death
-from super_sdf.errors import ClusterError, MeshError
-from super_sdf.options import Options
-from super_sdf.pipeline import mesh_grid
+from super_sdf.errors import ClusterError
 
 pytestmark = pytest.mark.usefixtures("grid_folder")
 LOCAL = ("--cluster", "local")
@@ -172,28 +169,11 @@ def test_a_task_that_kills_workers_is_the_only_one_that_fails(monkeypatch):
 
 
 def test_one_grid_in_tiles_on_a_cluster_is_that_of_one_machine(command):
-    np.save("torus.npy", torus_values())
+    x, y, z = np.indices((64, 64, 64)) - 31.5
+    np.save("torus.npy", (np.hypot(np.hypot(x, y) - 18, z) - 7).astype(np.float32))
     words = ("upsample", "torus.npy", "a.off", "--spacing", 1, "--factor", 2, *FAST)
     assert command(*words)[0] == 0
     code, out, _ = command(*words, "--force", *LOCAL, "--jobs", 1, "--json")
     tiles, one = json.loads(out), trimesh.load("a.off", process=False)
     assert code == 0 and tiles["closed"] and tiles["tiles"] > 1
     assert len(one.faces) == tiles["triangles"] and one.is_watertight
-
-
-def test_a_tampered_tile_is_an_error_that_names_tiles_and_workers():
-    def map_tiles(make, tasks):
-        for number, part in enumerate(map(make, tasks)):
-            faces = part.mesh.faces[(number == 1) :]  # of one tile a triangle is missing
-            mesh = Mesh(part.mesh.vertices, faces)
-            yield replace(part, mesh=mesh, worker=f"tcp://worker:{number}")
-
-    grid, network = SdfGrid.trusted(torus_values(), 1.0), load_network("fast")
-    with pytest.raises(MeshError, match=r"torn.*3 edges.*\(tcp://worker:1\)"):
-        mesh_grid(grid, network, Options(factor=2), map_tiles=map_tiles, least_tiles=2)
-
-
-def torus_values():
-    """Return distances to a torus, spacing 1."""
-    x, y, z = np.indices((64, 64, 64)) - 31.5
-    return (np.hypot(np.hypot(x, y) - 18, z) - 7).astype(np.float32)

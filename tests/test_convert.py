@@ -1,4 +1,4 @@
-"""Conversion of one file: the mesh, the report, and no file after a failure."""
+"""Conversion of one file: options, the report, and two files that appear together."""
 
 import os
 
@@ -8,7 +8,7 @@ import trimesh
 from conftest import ball, trilinear
 
 from super_sdf.convert import convert
-from super_sdf.errors import FileError, GridError
+from super_sdf.errors import GridError
 from super_sdf.options import Options
 
 
@@ -36,17 +36,6 @@ def test_options_take_effect_and_the_result_is_reported():
     assert steps == sorted(steps) and steps[-1] == (1000, 1000)
 
 
-def test_a_failure_writes_nothing_and_a_file_is_replaced_only_by_force():
-    np.save("flat.npy", np.ones((4, 4, 4)))
-    with pytest.raises(GridError, match=r"^every value is 1: a constant field has no surface$"):
-        convert("flat.npy", "out.ply", trilinear, Options())
-    assert sorted(os.listdir()) == ["flat.npy", "in.npy"]
-    convert("in.npy", "out.ply", trilinear, Options(2))
-    with pytest.raises(FileError, match=r"^out.ply exists: remove it or use force=True$"):
-        convert("in.npy", "out.ply", trilinear, Options(2))
-    convert("in.npy", "out.ply", trilinear, Options(4), force=True)
-
-
 def test_mesh_and_field_appear_together_or_not_at_all(monkeypatch):
     def refuse(path, *, force):
         raise GridError("no")
@@ -59,11 +48,3 @@ def test_mesh_and_field_appear_together_or_not_at_all(monkeypatch):
     done = convert("in.npy", "out.ply", trilinear, Options(2), **told)
     assert sorted(os.listdir()) == ["in.npy", "out.npz", "out.ply"]
     assert done.saved_field["shape"] == [33, 33, 33]
-
-
-def test_a_surface_may_stay_open_and_is_then_warned_of():
-    np.save("cut.npy", ball(16, 4.0).values[:9])
-    done = convert("cut.npy", "open.ply", trilinear, Options(2, cap=False))
-    assert not done.closed and not done.capped and "is open there" in done.warnings[-1]
-    done = convert("cut.npy", "closed.ply", trilinear, Options(2))
-    assert done.closed and done.capped and "closed along the border" in done.remarks()[0]

@@ -86,7 +86,9 @@ def test_meshes_are_closed_and_share_their_walls(name, factor):
 
 
 def test_what_does_not_fit_in_memory_is_refused():
-    with pytest.raises(OutOfMemoryError, match=r"^8 labels in 210 samples, .* \(max_memory=\)$"):
+    with pytest.raises(
+        OutOfMemoryError, match=r"^meshing 8 labels in 210 samples, .* \(max_memory=\)$"
+    ):
         reconstruct_labels(IMAGES["no ground"], network=trilinear, spacing=1, max_memory=10**6)
 
 

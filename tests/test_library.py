@@ -1,10 +1,11 @@
 """The library says what the command says: what it refuses, in one line, and what it takes."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ball, trilinear
+from conftest import ball, refusal, trilinear
 
 from super_sdf import (
     SdfGrid,
@@ -34,16 +35,12 @@ def test_values_of_the_other_sign_are_refused():
     assert reconstruct(make_grid(-VALUES, spacing=1), trilinear, 2).volume() > 0
 
 
-@pytest.mark.parametrize("make", [SdfGrid, lambda v, h: make_grid(v, spacing=h)])
-@pytest.mark.parametrize("unit, spacing", [(1.5, 1.0), (40, 1.0)])
-def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
-    for values in (VALUES, np.abs(np.indices((20, 20, 20)) - 9.3).max(0) - 5.1):
-        with pytest.raises(GridError) as caught:
-            make(values * unit, spacing)
-        want = "distances need the unit of the spacing: multiply the values, scale="
-        advice, scale = str(caught.value).rsplit("=", 1)
-        assert advice.endswith(want.strip("="))
-        assert make(values * unit * float(scale), spacing).notes[:-1] == ()
+@pytest.mark.parametrize("unit", [1.5, 40])
+def test_a_spacing_that_the_values_contradict_is_refused(unit):
+    said = refusal(GridError, make_grid, VALUES * unit, spacing=1.0)
+    (scale,) = re.findall(r": multiply the values, scale=([\d.]+)", said)
+    assert make_grid(VALUES * unit * float(scale), spacing=1.0).notes[:-1] == ()
+    assert "spacing is 1: give distances" in refusal(GridError, SdfGrid, VALUES * unit, 1.0)
 
 
 @pytest.mark.parametrize("make", [make_grid, lambda values: SdfGrid(values, 1.0)])
@@ -53,7 +50,7 @@ def test_a_spacing_that_the_values_contradict_is_refused(make, unit, spacing):
         ([[1.0], [1.0, 2.0]], "are [[1.0], [1.0, 2.0]]: give an array of three axes"),
         (None, "have dtype object: give floating-point or integer numbers"),
         ("part.npy", "have dtype <U8: give floating-point or integer numbers"),
-        (np.full((3, 3, 3), np.longdouble("1e400")), "[0, 0, 0] is 1e+400: every sample"),
+        (np.full((3, 3, 3), np.longdouble("1e400")), "every value is inf: a constant field"),
     ],
 )
 def test_what_is_no_array_of_samples_is_refused(make, values, message):
@@ -63,6 +60,8 @@ def test_what_is_no_array_of_samples_is_refused(make, values, message):
 
 
 GRID = ball(12, 3.0)
+EVEN = "give an even number from 2 to 16 (an odd one has no node on the samples)"
+BYTES = "give a number of bytes greater than 0, such as 1500M or 4G"
 BOOLEAN = "give True or False, in JSON true or false"
 MAKE_ONE = "make one with make_grid(values, spacing=...) or read_grid(path)"
 # of the wrong type, and of the right type with a wrong value
@@ -70,22 +69,20 @@ OF_OTHER_TYPES = {
     f"grid is an array of shape (20, 20, 20): {MAKE_ONE}": {"grid": VALUES},
     f"grid is 'part.npz': {MAKE_ONE}": {"grid": "part.npz"},
     "network is 'fast': give one from load_network()": {"network": "fast"},
-    "factor is '4': give a whole number": {"factor": "4"},
-    "factor is True: give a whole number": {"factor": True},
-    "offset is '1': give a number, in world units": {"offset": "1"},
+    f"factor is '4': {EVEN}": {"factor": "4"},
+    f"factor is True: {EVEN}": {"factor": True},
+    "offset is '1': give a finite number, in world units": {"offset": "1"},
     f"cap is 'no': {BOOLEAN}": {"cap": "no"},
     f"cap is 1: {BOOLEAN}": {"cap": 1},
     "mesher is None: give one of auto, marching, sharp": {"mesher": None},
-    "max_memory is 1.5: give a whole number of bytes": {"max_memory": 1.5},
+    f"max_memory is 1.5: {BYTES}": {"max_memory": 1.5},
     "progress is True: give a function of (done, total), in thousandths": {"progress": True},
 }
 WRONG = {
-    "factor is 0: give an even number from 2 to 16 (an odd one has no node on the samples)": {
-        "factor": np.int64(0)
-    },
+    f"factor is 0: {EVEN}": {"factor": np.int64(0)},
     "offset is -inf: give a finite number, in world units": {"offset": -np.inf},
     "mesher is 'dual': give one of auto, marching, sharp": {"mesher": "dual"},
-    "max_memory is -5: give a number of bytes greater than 0": {"max_memory": -5},
+    f"max_memory is -5: {BYTES}": {"max_memory": -5},
 }
 
 
@@ -142,3 +139,19 @@ def test_mesh_and_field_say_what_they_are_in_a_line():
     assert repr(network) == said.replace("field 5", f"field {network.receptive_field}")
     for thing in (GRID, field, mesh, network):
         assert "\n" not in repr(thing) and len(repr(thing)) < 160
+
+
+SAID = {
+    "give a --level, such as --level -4 --inside negative": "give a level=, such as level=-4, "
+    "inside='negative'",
+    "--labels has 'lung': choose fewer (--labels 1,2)": "labels has 'lung': choose fewer "
+    "(labels=(1,2))",
+    "end it there (--open), or use --force": "end it there (cap=False), or use force=True",
+    "pip install --force-reinstall onnxruntime": "pip install --force-reinstall onnxruntime",
+}
+
+
+@pytest.mark.parametrize("flagged", SAID)
+def test_an_error_names_flags_on_the_command_line_and_keywords_in_python(flagged):
+    assert str(OptionError(flagged)) == SAID[flagged]
+    assert OptionError(flagged).flagged == flagged

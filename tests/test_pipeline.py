@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
 from super_sdf.errors import GridError
-from super_sdf.refine import survey
+from super_sdf.refine import band
 from super_sdf.refine.band import find_band
 from super_sdf.refine.nodes import block_ijk
 from super_sdf.surface.mesh import CLEARANCE
@@ -51,7 +51,7 @@ def values_at_samples(field):
 def test_coarse_samples_are_kept(network):
     grid = ball()
     field = upsample(grid, network)
-    assert field.counts["noisy_voxels"] == 0
+    assert field.count()["noisy_voxels"] == 0
     samples = grid.values[tuple(field.voxel_ijk.T)]
     np.testing.assert_allclose(values_at_samples(field), samples, rtol=1e-6)
     grid.values[np.abs(grid.values) < 0.02] = 0
@@ -64,7 +64,7 @@ def test_noisy_samples_are_corrected(network):
     clean = ball(24, 8.0)
     noise = np.random.default_rng(0).uniform(-0.4, 0.4, clean.shape)
     field = upsample(SdfGrid.trusted(clean.values + noise, clean.spacing), network)
-    assert field.counts["noisy_voxels"] > 0.5 * field.counts["band_voxels"]
+    assert field.count()["noisy_voxels"] > 0.5 * field.count()["band_voxels"]
     before, after = noise[tuple(field.voxel_ijk.T)], values_at_samples(field)
     wanted = clean.values[tuple(field.voxel_ijk.T)]
     near = np.abs(wanted) < 0.5
@@ -118,9 +118,9 @@ def test_decoding_only_what_can_hold_the_surface_loses_nothing(noise, monkeypatc
     noisy = SdfGrid.trusted(values, grid.spacing)
     some = upsample(noisy, trilinear)
     part = reconstruct(noisy, trilinear)
-    monkeypatch.setattr(survey, "DECODE_LIMIT", np.inf)
+    monkeypatch.setattr(band, "DECODE_LIMIT", np.inf)
     whole = reconstruct(noisy, trilinear)
-    assert some.counts["pinned_nodes"] == 0
+    assert some.count()["pinned_nodes"] == 0
     assert len(part.faces) == len(whole.faces)
     assert cKDTree(part.vertices).query(whole.vertices)[0].max() < 1e-5  # sums in another order
 

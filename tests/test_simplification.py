@@ -180,13 +180,12 @@ def test_what_does_not_fit_in_memory_is_refused():
 
 
 WRONG = {
-    "give error or triangles": {},
-    "error 0.1 and triangles 5: give only one of them": {"error": 0.1, "triangles": 5},
+    "give error or triangles, and only one of them": {"error": 0.1, "triangles": 5},
     "error is 0: give a number greater than 0": {"error": 0},
     "error is nan: give a number greater than 0": {"error": float("nan")},
-    "triangles is 3: give 4 or more, as a closed mesh has": {"triangles": 3},
+    "triangles is 3: give a whole number, 4 or more, as a closed mesh has": {"triangles": 3},
     "error is '1': give a number greater than 0": {"error": "1"},
-    "triangles is 4.5: give a whole number": {"triangles": 4.5},
+    "triangles is 4.5: give a whole number, 4 or more, as a closed mesh has": {"triangles": 4.5},
 }
 
 

@@ -5,11 +5,10 @@ import pytest
 from conftest import ball, trilinear
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct
-from super_sdf.refine.band import neighbour_table
+from super_sdf.refine.band import neighbour_table, survey
 from super_sdf.refine.bounds import keep_within_bounds
 from super_sdf.refine.nodes import VoxelIndex, average_shared, block_ijk, share_parts
 from super_sdf.refine.spheres import fit_to_spheres, spheres_of_band
-from super_sdf.refine.survey import survey
 
 MIDDLE = 10 - 0.37  # of the ball
 

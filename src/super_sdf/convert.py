@@ -20,7 +20,7 @@ from .pipeline import mesh_grid
 from .threads import TOTAL, Progress, Stopwatch, part_of
 
 if TYPE_CHECKING:
-    from .network.decoder import Decoder
+    from .network.contract import Decoder
     from .options import Options
     from .simplify.simplify import Simplified
     from .surface.mesh import Mesh
@@ -43,13 +43,9 @@ class Conversion:
     capped: bool  # the solid runs out of the grid, and was closed along the border
     warnings: tuple[str, ...]  # on what may be wrong with the result
     simplified: dict[str, Any] | None  # ``Simplified.report``; distances in voxels
-    notes: tuple[str, ...] = ()  # on what was inferred
+    notes: tuple[str, ...] = ()  # on what was inferred, and what the samples do not show
     seconds: dict[str, float] = field(default_factory=dict)  # per stage
     saved_field: dict[str, Any] | None = None  # its path; shape, spacing, origin of the lattice
-
-    def remarks(self) -> list[str]:
-        """Return sentences on what the mesh has that the samples do not show."""
-        return [CAPPED] * self.capped
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -92,13 +88,7 @@ def convert(
     watch, files = Stopwatch(), files_of(source)
     check_target(target, force=force, unit=options.unit)
     check_apart(target, files)
-    saving: Any = nullcontext()
-    if save_field is not None:
-        from .files.fields import saving_field
-
-        check_apart(save_field, files)
-        saving = saving_field(save_field, force=force)
-    with saving as file:
+    with _saving(save_field, files, force=force) as file:
         grid = read_grid(source, **options.reading())
         if options.keep_volume:
             from .labels.volumes import check_has_volume  # imported here, as few need it
@@ -126,7 +116,8 @@ def convert(
         watch.lap("write")
     is_open = made.open_edges > 0
     warnings = find_warnings(grid, options.offset, made.counts, is_open=is_open)
-    notes = [*lattice.notes, *off]
+    capped = options.cap and made.leaves
+    notes = [*lattice.notes, *off, *[CAPPED] * capped]
     if options.mesher == "sharp" and not lattice.field.has_exact:
         why = f"{lattice.field.kind} values show no edges"
         notes.append(f"{why}: the mesh is that of marching cubes")
@@ -136,13 +127,23 @@ def convert(
         mesh,
         {**made.counts, **sizes},
         closed=simplified.mesh.is_closed() if simplified else not is_open,
-        capped=options.cap and made.leaves,
+        capped=capped,
         warnings=(*warnings, *(simplified.warnings if simplified else ())),
         simplified=simplified.report(grid.voxel_size) if simplified else None,
         notes=tuple(notes),
         seconds=watch.seconds,
         saved_field=file.report if file else None,
     )
+
+
+def _saving(path: str | Path | None, others: list[Path], *, force: bool) -> Any:
+    """Return the context of a file for the refined field, apart from others; None if unwanted."""
+    if path is None:
+        return nullcontext()
+    from .files.fields import saving_field
+
+    check_apart(path, others)
+    return saving_field(path, force=force)
 
 
 def reworked(

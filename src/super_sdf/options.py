@@ -59,44 +59,33 @@ EXCLUSIVE = (GOALS, ("label", "level"), ("model", "quality"))
 class Kind(NamedTuple):
     """What the values of an option are."""
 
+    give: str  # what to give instead of a wrong value
     check: Callable[[Any, str], Any]  # returns the value; OptionError, by a name, if it is wrong
-    parse: Callable[[str], Any] = str  # makes a value of text; ValueError says what to give instead
+    parse: Callable[[str], Any] = str  # makes a value of text; ValueError if it can be none
     choices: tuple[str, ...] = ()  # all values, if there are only some
 
 
-def number(
-    kind: str = "a number",
-    give: str = "a finite number",
-    *,
-    above: float = -inf,
-    most: float = inf,
-    step: int | None = None,
-    text: str = "",
-) -> Kind:
-    """Return the kind of numbers in a range, or of multiples of a step.
+def wrong(value: Any, name: str, give: str, is_type: bool = False) -> OptionError:
+    """Return the error for a value, which may be of a wrong type."""
+    shown = f"{value:g}" if isinstance(value, float) else seen(value)
+    return (OptionTypeError if is_type else OptionError)(f"{name} is {shown}: give {give}")
 
-    Messages say to give ``kind`` instead of what is no such number, ``give`` for one that is out of
-    range, and ``text`` for text that is no number.
-    """
+
+def number(give: str, above: float = -inf, most: float = inf, step: int | None = None) -> Kind:
+    """Return the kind of numbers in a range, or of multiples of a step."""
     of: Any = Integral if step else Real
     make: Any = int if step else float
 
     def check(value: Any, name: str) -> Any:
         if not isinstance(value, of) or isinstance(value, bool):
-            raise OptionTypeError(f"{name} is {seen(value)}: give {kind}")
+            raise wrong(value, name, give, is_type=True)
         with suppress(OverflowError):  # a whole number beyond 1.8e308
             found = make(value)
             if isfinite(found) and above < found <= most and not (step and found % step):
                 return found
-        shown = f"{value:g}" if isinstance(value, float) else seen(int(value) if step else value)
-        raise OptionError(f"{name} is {shown}: give {give}")
+        raise wrong(int(value) if step else value, name, give)
 
-    def parse(given: str) -> Any:
-        with suppress(ValueError):
-            return make(given)
-        raise ValueError(f"give {text or kind}")
-
-    return Kind(check, parse)
+    return Kind(give, check, make)
 
 
 def numbers(counts: tuple[int, ...], give: str) -> Kind:
@@ -106,36 +95,35 @@ def numbers(counts: tuple[int, ...], give: str) -> Kind:
         several = isinstance(value, Iterable) and not isinstance(value, str)
         found = tuple(value) if several else (value,)
         if len(found) not in counts:
-            raise OptionError(f"{name} is {seen(value)}: give {give}")
-        return tuple(number().check(each, name) for each in found)
+            raise wrong(value, name, give)
+        return tuple(number("a finite number").check(each, name) for each in found)
 
     def parse(text: str) -> tuple[float, ...]:
-        with suppress(ValueError):
-            if len(found := tuple(map(float, text.split(",")))) in counts:
-                return found
-        raise ValueError(f"give {give}, separated by commas")
+        if len(found := tuple(map(float, text.split(",")))) not in counts:
+            raise ValueError(text)
+        return found
 
-    return Kind(check, parse)
+    return Kind(give, check, parse)
 
 
 def one_of(names: Iterable[str], others: Mapping[str, str] | None = None) -> Kind:
     """Return the kind of some names; messages name those for ``others``."""
     choices = tuple(names)
+    give = f"one of {', '.join(choices)}"
 
     def check(value: Any, name: str) -> str:
         if isinstance(value, str) and value in choices:
             return value
-        wrong = OptionError if isinstance(value, str) else OptionTypeError
-        if isinstance(value, str) and value in (others or {}):
-            raise wrong(f"{name} is {seen(value)}: give {(others or {})[value]}")
-        raise wrong(f"{name} is {seen(value)}: give one of {', '.join(choices)}")
+        is_text = isinstance(value, str)
+        instead = (others or {}).get(value, give) if is_text else give
+        raise wrong(value, name, instead, is_type=not is_text)
 
-    return Kind(check, choices=choices)
+    return Kind(give, check, choices=choices)
 
 
 def _flag(value: Any, name: str) -> bool:
     if not isinstance(value, bool) and type(value).__name__ not in ("bool_", "bool"):  # NumPy's
-        raise OptionTypeError(f"{name} is {seen(value)}: give True or False, in JSON true or false")
+        raise wrong(value, name, "True or False, in JSON true or false", is_type=True)
     return bool(value)
 
 
@@ -143,7 +131,7 @@ def check_label(label: Any, name: str = "--label") -> int:
     """Return a label; OptionError if no integer of 64 bits, signed or not, can be it."""
     is_whole = isinstance(label, Real) and not isinstance(label, bool) and isfinite(label)
     if not (is_whole and int(label) == label and -(2**63) <= int(label) < 2**64):
-        raise OptionError(f"{name} is {seen(label)}: give a whole number, -2^63 to 2^64 - 1")
+        raise wrong(label, name, "a whole number, -2^63 to 2^64 - 1")
     return int(label)
 
 
@@ -152,7 +140,7 @@ def check_labels(labels: Any, name: str = "--labels") -> str | tuple[int | str, 
     if isinstance(labels, str) and labels == ALL:
         return ALL
     if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
-        raise OptionError(f"{name} is {seen(labels)}: give all, or some labels such as 1,2,3")
+        raise wrong(labels, name, "all, or some labels such as 1,2,3")
     return tuple(each if isinstance(each, str) else check_label(each, name) for each in labels)
 
 
@@ -168,22 +156,18 @@ def _parse_labels(text: str) -> str | tuple[int | str, ...]:
 def parse_size(text: str) -> int:
     """Parse a number of bytes, such as "1500M" or "4G"; the units are powers of ten."""
     amount, unit = (text, "") if text[-1:].isdigit() else (text[:-1], text[-1:].upper())
-    with suppress(KeyError, ValueError, OverflowError):
-        if (size := int(float(amount) * {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}[unit])) > 0:
-            return size
-    raise ValueError("give a number of bytes such as 1500M or 4G")
+    with suppress(KeyError, OverflowError):
+        return int(float(amount) * {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}[unit])
+    raise ValueError(text)
 
 
 # fmt: off
-WHOLE, ABOVE_0 = "a whole number", "a number greater than 0"
-FLAG, POINT = Kind(_flag), numbers((1, 3), "one number, or three")
-FACTOR = number(WHOLE, "an even number from 2 to 16 (an odd one has no node on the samples)",
+ABOVE_0, POINT = number("a number greater than 0", above=0), numbers((1, 3), "one number, or three")
+FACTOR = number("an even number from 2 to 16 (an odd one has no node on the samples)",
     above=0, most=16, step=2)
-VOXELS = number(ABOVE_0, ABOVE_0, above=0, text="a number of voxels; --tolerance takes world units")
-WORLD = number(ABOVE_0, ABOVE_0, above=0, text="a number without a unit; it is in world units")
-MEMORY = number("a whole number of bytes", "a number of bytes greater than 0", above=0, step=1)
-THREADS = number("a whole number, 0 for one per core", "1 or more, or 0 for one per core",
-    above=-1, step=1)
+VOXELS = number("a number greater than 0, in voxels (--tolerance takes world units)", above=0)
+MEMORY = number("a number of bytes greater than 0, such as 1500M or 4G", above=0, step=1)
+FLAG = Kind("", _flag)
 # fmt: on
 
 
@@ -207,11 +191,10 @@ class Option(NamedTuple):
     def parse(self, text: str) -> Any:
         """Return the value that a text on the command line stands for."""
         try:
-            return self.check(self.kind.parse(text))
-        except ValueError as error:
-            if isinstance(error, OptionError):
-                raise
-            raise OptionError(f"{flag(self.name)} is {text!r}: {error}") from error
+            value = self.kind.parse(text)
+        except ValueError:
+            raise wrong(text, flag(self.name), self.kind.give) from None
+        return self.check(value)
 
 
 def _option(default: Any, group: str, shows: str, kind: Kind, text: str, **more: Any) -> Any:
@@ -244,7 +227,7 @@ class Options:
 
     # fmt: off
     factor: int = _option(4, MESH, "list labels", FACTOR,
-        "Refinement per axis: 2, 4, 8 or 16 times finer than the grid.", metavar="K")
+        "How many times finer than the grid per axis: an even number from 2 to 16.", metavar="K")
     _: KW_ONLY
     spacing: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
         "World distance between neighbouring samples: one number, or X,Y,Z. Default: from the "
@@ -265,22 +248,22 @@ class Options:
     field: FieldKind = _option(AUTO, VALUES, "read list", one_of(FIELDS, OTHER_FIELDS),
         "What the values are: distances, distances with noise, a mask or its transform, or a "
         "smooth field, which has the surface of its own cubic spline; auto goes by the samples.")
-    label: int | None = _option(None, VALUES, "read list", Kind(check_label, _parse_label),
+    label: int | None = _option(None, VALUES, "read list", Kind("", check_label, _parse_label),
         "Mesh the samples with the value N of a label image.", metavar="N")
     labels: str | tuple[int | str, ...] | None = _option(None, VALUES, "list labels",
-        Kind(check_labels, _parse_labels),
+        Kind("", check_labels, _parse_labels),
         "Mesh all labels of a label image but 0, or those listed, with shared walls: as parts of "
         "a .glb or .3mf, else each in its own file, NAME-N.ply.", metavar="all|N,N")
-    level: float | None = _option(None, VALUES, "read list", number(),
+    level: float | None = _option(None, VALUES, "read list", number("a finite number"),
         "Mesh the surface at the value L of densities; above L is inside, unless --inside is "
         "negative.", metavar="L")
-    scale: float | None = _option(None, VALUES, "read list", number(ABOVE_0, ABOVE_0, above=0),
+    scale: float | None = _option(None, VALUES, "read list", ABOVE_0,
         "World units per unit of the values, if they have another unit than the spacing.",
         metavar="S")
-    unknown: float | None = _option(None, VALUES, "read list", number(),
+    unknown: float | None = _option(None, VALUES, "read list", number("a finite number"),
         "Samples with the value V are unknown, as those that are NaN.", metavar="V")
     offset: float = _option(0.0, MESH, "list",
-        number("a number, in world units", "a finite number, in world units"),
+        number("a finite number, in world units"),
         "Mesh the offset surface at distance D, in world units; a positive D grows the solid.",
         metavar="D")
     cap: bool = _option(True, MESH, "list", FLAG,
@@ -292,10 +275,11 @@ class Options:
     simplify: float | None = _option(None, MESH, "list", VOXELS,
         "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
         "Needs the extra simplify.", metavar="ERROR")
-    tolerance: float | None = _option(None, MESH, "list", WORLD,
+    tolerance: float | None = _option(None, MESH, "list",
+        number("a number greater than 0, in world units", above=0),
         "Simplify as with --simplify, but within D in world units.", metavar="D")
     triangles: int | None = _option(None, MESH, "list",
-        number(WHOLE, "4 or more, as a closed mesh has", above=3, step=1),
+        number("a whole number, 4 or more, as a closed mesh has", above=3, step=1),
         "Simplify the mesh to at most N triangles, instead of --simplify.", metavar="N")
     keep_volume: bool = _option(False, MESH, "list labels", FLAG,
         "Of masks and labels: move each surface by a small part of a voxel until its volume is "
@@ -307,14 +291,15 @@ class Options:
         "Network: fast is quicker than base, the default; best averages base over 4 turns of the "
         "grid, and takes 4 times as long.")
     model: str | None = _option(None, WORK, "labels",
-        Kind(lambda value, name: str(check_path(value, name))),
+        Kind("", lambda value, name: str(check_path(value, name))),
         "Use the network in this ONNX file instead of --quality.", metavar="FILE")
     precision: Precision = _option(AUTO, WORK, "labels", one_of(PRECISIONS),
         "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "
         "it, else float32.")
     device: Device = _option(AUTO, WORK, "labels", one_of(get_args(Device)),
         "Where the network runs; auto uses CUDA if it works here, else the CPU.")
-    threads: int = _option(0, WORK, "labels", THREADS,
+    threads: int = _option(0, WORK, "labels",
+        number("1 or more, or 0 for one per core", above=-1, step=1),
         "CPU threads; 0 means one per core.", metavar="N")
     max_memory: int | None = _option(None, WORK, "labels", MEMORY._replace(parse=parse_size),
         "Memory limit of the process, such as 4G. Default: 60 % of the free memory. Larger grids "
@@ -380,24 +365,22 @@ def check_alone(given: Mapping[str, Any]) -> None:
 def check_path(path: Any, name: str) -> Path:
     """Return an argument as a path; OptionTypeError if it is neither a string nor a path."""
     if not isinstance(path, (str, PathLike)):
-        raise OptionTypeError(f"{name} is {seen(path)}: give the path of a file")
+        raise wrong(path, name, "the path of a file", is_type=True)
     return Path(path)
 
 
 def check_called(network: Any, progress: Any) -> None:
     """Raise OptionTypeError if a network, or a progress that is not None, cannot be called."""
     if not callable(network):
-        raise OptionTypeError(f"network is {seen(network)}: give one from load_network()")
+        raise wrong(network, "network", "one from load_network()", is_type=True)
     if progress is not None and not callable(progress):
-        give = "give a function of (done, total), in thousandths"
-        raise OptionTypeError(f"progress is {seen(progress)}: {give}")
+        give = "a function of (done, total), in thousandths"
+        raise wrong(progress, "progress", give, is_type=True)
 
 
 def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:
     """Return to what a mesh is simplified, an error or a number; OptionError unless it is one."""
-    if error is None and triangles is None:
-        raise OptionError("give error or triangles")
-    if error is not None and triangles is not None:
-        given = f"error {seen(error)} and triangles {seen(triangles)}"
-        raise OptionError(f"{given}: give only one of them")
-    return OPTIONS["simplify"].check(error, "error"), OPTIONS["triangles"].check(triangles)
+    if (error is None) == (triangles is None):
+        raise OptionError("give error or triangles, and only one of them")
+    found = None if error is None else ABOVE_0.check(error, "error")
+    return found, OPTIONS["triangles"].check(triangles)

@@ -20,18 +20,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import options
+from .arrays import CENTRE
 from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
-from .network.decoder import Adapter, Decoder, adapt
+from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
 from .options import MesherName, Options
 from .refine import nodes
-from .refine.band import neighbour_table
+from .refine.band import (
+    Band,
+    BandSummary,
+    BandTooLargeError,
+    neighbour_table,
+    no_surface,
+    summarise,
+    survey,
+)
 from .refine.bounds import keep_within_bounds
 from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres, spheres_of_band
-from .refine.survey import Band, BandSummary, BandTooLargeError, no_surface, summarise, survey
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
@@ -84,16 +92,11 @@ def refine_band(
         parts,
         grid,
         band.offset,
-        SampleSpheres.of(grid.shape, band.voxel_ijk[band.exact], patches[band.exact]),
+        SampleSpheres(grid.shape, band.voxel_ijk[band.exact], patches[band.exact, CENTRE]),
         band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
-        counts={
-            "band_voxels": len(patches),
-            "noisy_voxels": band.count_noisy(),
-            "decoded_voxels": len(voxels),
-            "nodes": parts.count_nodes(factor),
-            "pinned_nodes": pinned,
-        },
+        found=(len(patches), band.count_noisy()),
+        pinned=pinned,
     )
 
 
@@ -291,7 +294,7 @@ class Result:
 
     mesh: Mesh
     open_edges: int
-    counts: dict[str, int]  # see ``FineField``; in tiles, a pinned node may count twice
+    counts: dict[str, int]  # see ``FineField``
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
     seconds: dict[str, float]  # by step
     tiles: int
@@ -399,11 +402,7 @@ def make_tile(
     is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
     how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": task.threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
-    counts = dict(field.counts)
-    if task.whole:
-        own = tile.owns(field.voxel_ijk + np.array(tile.low))
-        counts["decoded_voxels"] = int(np.count_nonzero(own))
-        counts["nodes"] = field.parts.count_nodes(factor, own)
+    counts = field.count(tile.owns(field.voxel_ijk + np.array(tile.low)))
     more = {"counts": counts, "leaves": field.leaves, "is_cut": is_cut}
     del field
     return own_part(mesh, keys, tile, task.shape, factor, **more)

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from .errors import MeshError, OptionError, OutOfMemoryError
 from .refine import bounds, prediction, spheres
+from .refine.band import BandSummary
 from .refine.prediction import AT_ONCE
-from .refine.survey import BandSummary
 from .surface.extract import KEYS_PER_NODE, reach_in_voxels
 from .surface.mesh import Mesh
 from .threads import check_count, held_memory, in_words, memory_bound

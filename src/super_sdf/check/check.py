@@ -25,9 +25,8 @@ from ..files.meshes import write_coloured_ply
 from ..files.output import check_free
 from ..grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from ..options import LENGTHS, Options
-from ..refine.band import plane_blocks, rescale
+from ..refine.band import Band, no_surface, plane_blocks, rescale, survey
 from ..refine.nodes import VoxelIndex
-from ..refine.survey import Band, no_surface, survey
 from ..surface.mesh import Mesh
 from ..threads import check_bound, chunks_of, give_back, useful_threads
 from ..truth.solid import Points, Solid, merged, read_mesh

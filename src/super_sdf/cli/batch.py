@@ -108,7 +108,6 @@ def planned(
     options, page, items = main.chosen_options(given), given["report"], None
     from ..batch.inputs import find_jobs
     from ..batch.work import Settings
-    from ..files.formats import files_of
     from ..labels.files import check_options, read_names
 
     names = read_names(given["names"]) if given["names"] else None
@@ -123,8 +122,8 @@ def planned(
         from ..pages.html import is_page
         from ..pages.items import items_folder
 
-        files = (path for job in jobs for path in (*files_of(job.source), folder / job.target))
-        main.check_page("--report", page, files, force=given["force"] or is_page(page))
+        sources, meshes = zip(*((job.source, folder / job.target) for job in jobs))
+        main.check_page("--report", page, sources, meshes, force=given["force"] or is_page(page))
         items = items_folder(page)
         if items.exists() and not items.is_dir():
             raise WriteError(f"{items}, for the meshes of the page, is no folder: move it")
@@ -175,7 +174,7 @@ def remarks(batch: Batch) -> list[str]:
     checks = [row["check"] for row in rows if "check" in row]
     means = [check["residual"]["mean"] for check in checks if check.get("residual")]
     counts = {
-        "Note: {} have notes": sum(bool(r["inferred"] or r.get("missing")) for r in rows),
+        "Note: {} have notes": sum(bool(row["inferred"]) for row in rows),
         "Warning: {} have warnings": sum(bool(r["warnings"] or r.get("beside")) for r in rows),
         "Warning: {} have no residual": len(checks) - len(means),
         f"Check: mean residual {max(means, default=0):.4f} voxels at most, of {{}}": len(means),

@@ -167,14 +167,22 @@ def check_names(given: dict[str, Any], labels: Any) -> None:
         raise OptionError(f"--names {given['names']} is for --labels: give that, too")
 
 
-def check_page(word: str, page: Path, others: Iterable[str | Path], *, force: bool) -> None:
-    """Raise if a page cannot be written, or is one of the others, the inputs and outputs."""
+def check_page(
+    word: str,
+    page: Path,
+    sources: Iterable[str | Path],
+    others: Iterable[str | Path] = (),
+    *,
+    force: bool,
+) -> None:
+    """Raise if a page cannot be written, is a file that a source is read from, or an output."""
+    from ..files.formats import files_of
     from ..files.output import check_apart, check_free
 
     if page.suffix.lower() not in (".html", ".htm"):
         raise OptionError(f"{page} is not a page: give {word} a file .html or .htm")
     check_free(page, force=force)
-    check_apart(page, others)
+    check_apart(page, [*(file for source in sources for file in files_of(source)), *others])
 
 
 @contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from contextlib import ExitStack
 from typing import Any
 
@@ -12,6 +11,7 @@ from .. import __version__
 from ..errors import SuperSdfError
 from ..files.formats import NAMED, list_formats
 from ..options import MESH_FORMATS, OPTIONS, Options
+from ..threads import Stopwatch
 from . import main
 from .main import SHARED, option, table_option
 
@@ -51,27 +51,17 @@ TAKES = (
 @main.make_command("Refine a grid and write its surface as a mesh.", HELP, *TAKES)
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
-    options, page, seconds = main.chosen_options(given), given["report"], dict[str, float]()
+    options, page, watch = main.chosen_options(given), given["report"], Stopwatch()
     main.check_names(given, options.labels)
-    clock = time.perf_counter()
-
-    def lap(stage: str) -> None:
-        nonlocal clock
-        clock, start = time.perf_counter(), clock
-        seconds[stage] = clock - start
-
     if page:
-        from ..files.formats import files_of
-
-        others = [*files_of(source), target, *[given["save_field"]] * bool(given["save_field"])]
-        main.check_page("--report", page, others, force=given["force"])
+        others = [name for name in (target, given["save_field"]) if name]
+        main.check_page("--report", page, [source], others, force=given["force"])
     from ..network.network import load_network
 
     network = load_network(**options.network())
-    lap("load network")
-    done = converted(source, target, network, options, given)
-    seconds |= done.seconds
-    clock, certificate = time.perf_counter(), None
+    watch.lap("load network")
+    done, certificate = converted(source, target, network, options, given), None
+    watch.take(done.seconds)
     report = {
         "input": source,
         "output": target,
@@ -93,33 +83,24 @@ def command(source: str, target: str, **given: Any) -> None:
         try:
             certificate = check_mesh(*read_for_check(target, source, options, done), options)
         except SuperSdfError as error:
-            said = f"{error.flagged}; {target} is written, but not checked"
-            raise type(error)(said) from error
+            why = f"{error.flagged}; {target} is written, but not checked"
+            raise type(error)(why) from error
         report["check"] = certificate.report()
-        lap("check")
-    notes = [*done.remarks(), *network.notes]
+        watch.lap("check")
     if page:
         from ..pages.html import page_of_conversion, write_page
 
-        facts = {**report, "seconds": seconds, "notes": notes}
+        facts = {**report, "seconds": watch.seconds, "notes": network.notes}
         text = page_of_conversion(facts, options, done, certificate)
         write_page(text, page, force=given["force"])
-        lap("page")
-    report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
+        watch.lap("page")
+    report["seconds"] = {stage: round(spent, 4) for stage, spent in watch.seconds.items()}
     if given["as_json"]:
         main.print_stdout(report, f"{target} is written")
-    if given["quiet"]:
-        return
-    lines = [f"Note: {note}" for note in (*done.notes, *notes)]
-    lines += [f"Warning: {warning}" for warning in done.warnings]
-    if given["verbose"]:
-        keys = ("shape", "spacing", "origin", "device", "band_voxels", "nodes")
-        lines += [f"{key.replace('_', ' ')}: {report[key]}" for key in keys if key in report]
-        lines += [f"{stage}: {spent:.3f} s" for stage, spent in seconds.items()]
-    describe = describe_mesh if options.labels is None else describe_labels
-    lines += describe(report, f"{sum(seconds.values()):.1f} s")
-    lines += [f"Check: {certificate.summary()}"] if certificate else []
-    main.print_stderr(*lines, *[f"Report: {page}"] * bool(page))
+    if not given["quiet"]:
+        lines = lines_of(report, [*done.notes, *network.notes], given["verbose"])
+        lines += [f"Check: {certificate.summary()}"] if certificate else []
+        main.print_stderr(*lines, *[f"Report: {page}"] * bool(page))
 
 
 def converted(
@@ -148,6 +129,27 @@ def converted(
         return convert(source, target, network, options, **how, **both)
 
 
+def lines_of(report: dict[str, Any], notes: list[str], is_verbose: bool) -> list[str]:
+    """Return lines on a result: notes and warnings, counts and times if asked for, and meshes."""
+    lines = [f"Note: {note}" for note in notes]
+    lines += [f"Warning: {warning}" for warning in report.get("warnings", ())]
+    if is_verbose:
+        keys = ("shape", "spacing", "origin", "device", "band_voxels", "nodes")
+        lines += [f"{key.replace('_', ' ')}: {report[key]}" for key in keys if key in report]
+        lines += [f"{stage}: {spent:.3f} s" for stage, spent in report["seconds"].items()]
+    seconds = f"{sum(report['seconds'].values()):.1f} s"
+    for row in report.get("labels", ()):
+        plural = "s" * (row["components"] != 1)
+        lines.append(
+            f"{row['output']}: {row['name']}, {row['triangles']:,} triangles, "
+            f"{row['components']:,} closed component{plural}, volume {row['volume']:.6g}, of its "
+            f"samples {row['sample_volume']:.6g}"
+        )
+    if "labels" in report:
+        return [*lines, f"{len(report['labels'])} labels, {seconds}"]
+    return lines + describe_mesh(report, seconds)
+
+
 def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:
     """Return lines on a mesh, its field and how it was simplified."""
     few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
@@ -173,14 +175,3 @@ def describe_mesh(report: dict[str, Any], seconds: str) -> list[str]:
             f"at most {largest:.4g} {unit}"
         )
     return lines
-
-
-def describe_labels(report: dict[str, Any], seconds: str) -> list[str]:
-    """Return a line on the mesh of each label."""
-    lines = [
-        f"{row['output']}: {row['name']}, {row['triangles']:,} triangles, {row['components']:,} "
-        f"closed component{'s' * (row['components'] != 1)}, volume {row['volume']:.6g}, of its "
-        f"samples {row['sample_volume']:.6g}"
-        for row in report["labels"]
-    ]
-    return [*lines, f"{len(lines)} labels, {seconds}"]

@@ -25,7 +25,7 @@ from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, wr
 from ..files.output import check_apart
 from ..files.readers import PLACE
 from ..grid.sdf_grid import SdfGrid, describe_place, mean_spacing
-from ..network.decoder import Decoder
+from ..network.contract import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..surface.mesh import Mesh
 from ..threads import Progress, Stopwatch
@@ -59,11 +59,6 @@ class LabelConversion:
     seconds: dict[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     closed: bool = True
-
-    def remarks(self) -> list[str]:
-        """Return a note on the labels that the image lacks, if there are some."""
-        names = ", ".join(row["name"] for row in self.missing)
-        return [f"no sample has a label that was asked for: {names}"] * bool(names)
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
@@ -132,6 +127,9 @@ def convert_labels(
     watch.lap("write")
     lacking = names_of(image.missing, known)
     missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
+    if missing:
+        listed = ", ".join(entry.name for entry in lacking.values())
+        off.append(f"no sample has a label that was asked for: {listed}")
     return LabelConversion(grid, rows, missing, (*grid.notes, *off), watch.seconds)
 
 

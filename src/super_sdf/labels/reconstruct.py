@@ -16,31 +16,23 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import options
-from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray
-from ..errors import GridError, OptionError, OutOfMemoryError, seen
+from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
+from ..errors import GridError, OptionError, seen
 from ..files.grids import read_array
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
 from ..grid.interpret import as_sample, labelled, mask_field
 from ..grid.look import named
 from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
-from ..network.decoder import Adapter, Decoder, adapt
+from ..network.contract import Adapter, Decoder, adapt
 from ..network.network import load_network, network_for
 from ..pipeline import refine_band
+from ..refine.band import survey
+from ..refine.field import FineField
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
-from ..refine.survey import survey
 from ..surface.marching import strides
 from ..surface.mesh import Mesh, vertex_type
-from ..threads import (
-    Progress,
-    StepCounter,
-    check_count,
-    held_memory,
-    in_words,
-    memory_bound,
-    part_of,
-    useful_threads,
-)
+from ..threads import Progress, StepCounter, check_bound, check_count, part_of, useful_threads
 from .volumes import keep_volumes
 from .walls import Labelled, extract_walls
 
@@ -214,7 +206,7 @@ def label_meshes(
     """Return the meshes of an image's labels; OutOfMemoryError if they do not fit in memory."""
     options.check_called(network, progress)
     factor, grid = options.OPTIONS["factor"].check(factor), image.grid
-    bound = memory_bound(options.OPTIONS["max_memory"].check(bound))
+    bound = options.OPTIONS["max_memory"].check(bound)
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
     chosen = adapt(network_for(network, options.MASK))
     places, faces, sides = extract_walls(label_fields(image, chosen, factor, bound, progress))
@@ -232,6 +224,14 @@ def label_meshes(
     return meshes
 
 
+def _check_room(image: LabelImage, voxels: int, nodes: int, bound: int | None) -> None:
+    """Raise OutOfMemoryError unless the fields in some voxels at walls fit in memory."""
+    labels, samples = len(image.labels), image.numbers.size
+    need = SAMPLE_BYTES * samples + voxels * (VOXEL_BYTES + NODE_BYTES * nodes)
+    what = f"meshing {labels} labels in {samples:,} samples, {voxels:,} of them at walls,"
+    check_bound(need, what, bound, "choose fewer (--labels), a smaller factor, cut the image, or ")
+
+
 def label_fields(
     image: LabelImage, network: Adapter, factor: int, bound: int | None, progress: Progress | None
 ) -> Labelled:
@@ -241,23 +241,13 @@ def label_fields(
     """
     grid, numbers = image.grid, image.numbers
     count, nodes = len(image.labels) + 1, (factor + 1) ** 3
-
-    def check_room(voxels: int) -> None:
-        need = SAMPLE_BYTES * numbers.size + voxels * (VOXEL_BYTES + NODE_BYTES * nodes)
-        if bound is not None and need + (held_memory() or 0) > bound:
-            raise OutOfMemoryError(
-                f"{count - 1} labels in {numbers.size:,} samples, {voxels:,} of them at walls, "
-                f"need {in_words(need)} of memory, {in_words(bound)} may be held: choose fewer "
-                "(--labels) or a smaller factor, cut the image, or allow more (--max-memory)"
-            )
-
-    check_room(0)
+    _check_room(image, 0, nodes, bound)
     padded, shape = np.pad(numbers, 1), np.array(grid.shape)  # beyond the border there is no label
     edges = at_walls(padded)
     near = _over_three(edges, np.logical_or)
     near[1:-1, 1:-1, 1:-1] = edges[1:-1, 1:-1, 1:-1]
     places = np.argwhere(near).astype(np.int32)
-    check_room(len(places))
+    _check_room(image, len(places), nodes, bound)
     own, index, voxel_ijk = padded[tuple(places.T)], VoxelIndex(places, padded.shape), places - 1
     low, high = np.full((count, 3), shape), np.zeros((count, 3), np.intp)  # the boxes of labels
     np.minimum.at(low, own, voxel_ijk)
@@ -283,11 +273,7 @@ def label_fields(
         blocks = np.full((nodes, len(own_ijk)), np.nan, np.float32)
         distances, extremes = mask_distances(mask), extremes_of_masks(1.0)
         lattice = SdfGrid.trusted(distances, 1.0, extremes=extremes, field=grid.field)
-        threads = useful_threads(network.threads)
-        band = survey(lattice, 0.0, threads=threads)
-        wanted = VoxelIndex(some_ijk, lattice.shape).find(band.voxel_ijk) >= 0
-        if (decoded := band.decoded & wanted).any():
-            field = refine_band(replace(band, decoded=decoded), network, factor, threads, steps)
+        if field := _field_at(lattice, some_ijk, network, factor, steps):
             blocks[:, VoxelIndex(own_ijk, lattice.shape).find(field.voxel_ijk)] = field.blocks
         times[rows] += 1
         for node, part in enumerate(part_of_node(factor)[0]):  # one by one, to save memory
@@ -300,14 +286,32 @@ def label_fields(
             lowest[node, rows[lower]], holder[node, rows[lower]] = value[lower], label
             able[node, rows] = np.minimum(able_here + can, 2)  # labels that could hold it; 2: more
         fields[label] = rows, blocks
-    outer = np.flatnonzero(((voxel_ijk < 0) | (voxel_ijk >= shape)).any(1))
-    beside = np.clip(voxel_ijk[outer], 0, shape - 1)
-    row = index.find(beside + 1)
-    for nth, step in enumerate(block_ijk(factor)):  # nodes on the border are those of voxels inside
-        node = factor * (voxel_ijk[outer] - beside) + step
+    return _hold_border(Labelled(grid.shape, factor, index, voxel_ijk, holder, fields))
+
+
+def _field_at(
+    lattice: SdfGrid, voxel_ijk: IntArray, network: Adapter, factor: int, steps: StepCounter
+) -> FineField | None:
+    """Return the fine field of a mask in some voxels only; None if none can hold the surface."""
+    threads = useful_threads(network.threads)
+    band = survey(lattice, 0.0, threads=threads)
+    decoded = band.decoded & (VoxelIndex(voxel_ijk, lattice.shape).find(band.voxel_ijk) >= 0)
+    if not decoded.any():
+        return None
+    return refine_band(replace(band, decoded=decoded), network, factor, threads, steps)
+
+
+def _hold_border(found: Labelled) -> Labelled:
+    """Give the nodes on the border, of voxels beyond it, the label of the same node inside."""
+    factor, shape, holder = found.factor, np.array(found.shape), found.holder
+    outer = np.flatnonzero(((found.voxel_ijk < 0) | (found.voxel_ijk >= shape)).any(1))
+    beside = np.clip(found.voxel_ijk[outer], 0, shape - 1)
+    row = found.index.find(beside + 1)
+    for nth, step in enumerate(block_ijk(factor)):
+        node = factor * (found.voxel_ijk[outer] - beside) + step
         some = np.flatnonzero(((node >= 0) & (node <= factor)).all(1) & (row >= 0))
         holder[nth, outer[some]] = holder[node[some] @ strides(factor), row[some]]
-    return Labelled(grid.shape, factor, index, voxel_ijk, holder, fields)
+    return found
 
 
 def at_walls(values: NDArray[Any]) -> BoolArray:

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")
-COLOURS = ("touching", "pierced", "unknown", "apart", "full")
 GENERATOR = "super-sdf"
 EMPTY = {"lead": "", "alert": "", "summary": [], "notes": []}
 HEAD_BYTES = 4096  # of a page, in which its generator is looked for
@@ -59,8 +58,12 @@ def make_page(
     style = (HOME / "page.css").read_text("utf-8")
     scripts = [(HOME / name).read_text("utf-8") for name in SCRIPTS]
     own = " ".join(map(hash_of, scripts)) + (" 'self' file:" if beside else "")
-    values = check.TOUCHING, check.PIERCED, check.UNKNOWN, check.NOT_TOUCHING, check.FULL
-    colours = dict(zip(COLOURS, values))
+    colours: dict[str, Any] = {
+        "touching": check.TOUCHING,
+        "pierced": check.PIERCED,
+        "unknown": check.UNKNOWN,
+    }
+    colours |= {"apart": check.NOT_TOUCHING, "full": check.FULL}
     made = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     known = {"version": __version__, "made": made, "colours": colours}
     blocks = [  # their names are ours, never a file's
@@ -99,8 +102,7 @@ def page_of_conversion(
 ) -> str:
     """Return the page of a conversion by what ``upsample --json`` says; see ``item_of_files``."""
     item = item_of_files(report["output"], report["input"], options, made, certificate)
-    name = Path(report["output"]).name
-    entry = entry_of_report(name, report, item)
+    entry = entry_of_report(name := Path(report["output"]).name, report, item)
     shown = [row for row in entry["certificate"] if row[0] in ("mean residual", "largest residual")]
     faults = [["faults", str(len(entry["faults"]) or "none")]] if shown else []
     summary = [["result", entry["line"]], ["time", f"{entry['seconds']:.1f} s"], *shown, *faults]
@@ -164,13 +166,9 @@ def write_batch_page(
     kinds = {"failed": 0, "waiting": 1, "doubtful": 2, "ok": 3}
     of = {e["name"]: "doubtful" if e["faults"] or e["warnings"] else e["status"] for e in entries}
     entries.sort(key=lambda entry: (kinds[of[entry["name"]]], entry["name"]))
-    counts = {"files": len(entries)}
-    for words, key in (
-        ("failed", "reason"),
-        ("with faults", "faults"),
-        ("with warnings", "warnings"),
-    ):
-        counts[words] = sum(bool(entry[key]) for entry in entries)
+    counts = {"files": len(entries), "failed": sum(bool(entry["reason"]) for entry in entries)}
+    for key in ("faults", "warnings"):
+        counts[f"with {key}"] = sum(bool(entry[key]) for entry in entries)
     summary = [[words, f"{count:,}"] for words, count in counts.items() if count]
     page = make_page({**facts, "summary": summary, "files": entries}, beside=True)
     write_page(page, path, force=force or is_page(path))

@@ -80,13 +80,12 @@ def item_of_files(
         shown, samples = read_for_check(mesh, grid, options, made)
     except SuperSdfError as error:
         return Item(certificate={"error": error.flagged}, remarks=[f"not shown: {error.flagged}"])
-    item = Item()
     try:
         check_modules("a check of the mesh, with residuals,", "report", ("igl",))
         certificate = certificate or check_mesh(shown, samples, options)
-        item.certificate = certificate.report()
+        item = Item(certificate=certificate.report())
     except SuperSdfError as error:
-        item.certificate = {"error": error.flagged}
+        item = Item(certificate={"error": error.flagged})
     item.show(RESULT, shown, certificate)
     lattice = cubic_grid(samples, options.offset)
     known = lattice.field.unseen is None  # beside what is unknown, a coarse surface is made up
@@ -215,10 +214,12 @@ def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
         facts["above 0.1 voxel"] = f"{residual['share_above_tenth']:.2%} of the samples"
     else:
         facts["residual"] = "unknown, since no sample is exact"
-    facts["surface"] = ", ".join(("" if surface[kind] else "not ") + kind for kind in kinds)
-    facts["self-intersections"] = "not counted" if pairs is None else f"{pairs:,}"
-    facts["components"] = f"{surface['components']:,}"
-    facts["volume, area"] = f"{surface['volume']:.6g}, {surface['area']:.6g}"
+    facts |= {
+        "surface": ", ".join(("" if surface[kind] else "not ") + kind for kind in kinds),
+        "self-intersections": "not counted" if pairs is None else f"{pairs:,}",
+        "components": f"{surface['components']:,}",
+        "volume, area": f"{surface['volume']:.6g}, {surface['area']:.6g}",
+    }
     return list(map(list, facts.items()))
 
 

@@ -1,19 +1,27 @@
-"""The band of voxels near the surface: which they are, their patches, and what these tell.
+"""The band of voxels near the surface: which are decoded, and which of their samples are exact.
 
 Everything here is in index space with values in half voxels: a voxel has side 2, a distance of
 one spacing h is 2, and the band is ``abs(value) < 3`` (Eqs. 2 and 4).
+
+A sample of the band is taken as an exact distance if it contradicts no neighbour, is near the
+surface, and was not cut off. If too many contradict others, the field is noisy, and none is exact.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
-from ..grid.sdf_grid import SdfGrid
-from ..threads import chunks_of
+from ..errors import GridError, NoSurfaceError
+from ..grid.samples import let_go, planes_at_once
+from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
+from ..threads import chunks_of, over_threads
+from .bounds import FARTHEST, TrustedSamples
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
 # Patch values are clipped to this (3 h): samples that are farther from the surface do not matter to
@@ -24,9 +32,9 @@ PATCH_LIMIT = 6.0
 DECODE_LIMIT = 3**0.5 + 0.5
 # Two distances differ by no more than their samples are apart (Lipschitz); slack for rounding.
 LIPSCHITZ_SLACK = 0.1
-JUMP = 0.2  # by which values differ more than noise makes distances differ
 MAX_DISTANCE = 2.8  # of exact samples: those near the band's edge, 3, may have been truncated there
 MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
+MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
 # Planes are worked on in blocks of about this many samples, but of a few planes at least, since a
 # block also reads one plane more on either side.
 BLOCK_SAMPLES, BLOCK_PLANES = 1 << 18, 4
@@ -34,6 +42,221 @@ BLOCK_SAMPLES, BLOCK_PLANES = 1 << 18, 4
 # each place of its patch, (27,).
 MAX_STEP = 2 + LIPSCHITZ_SLACK
 MAX_DIFFERENCE = (2 * np.linalg.norm(NEIGHBOURHOOD, axis=1) + LIPSCHITZ_SLACK).astype(np.float32)
+FAR = 1e30  # half voxels: no sample of the band is there
+CELLS = 64  # along the longest axis, of the counts by which a large grid is cut
+ROUNDING = 1e-3  # so that the offset that an error suggests works
+
+
+@dataclass(frozen=True, eq=False)
+class BandSummary:
+    """What the band of a whole grid says, whichever part of the grid is worked on."""
+
+    told: int  # voxels whose samples tell whether the field is noisy
+    noisy: int  # those of them round which samples differ by more than distances can
+    low: float  # the lowest and the highest sample, in half voxels
+    high: float
+    leaves: bool  # whether a sample on the border of the grid is inside: the solid leaves it
+    cells: NDArray[np.int64]  # (a, b, c), voxels of the band in cubes of ``side`` samples
+    side: int = 1
+
+    @property
+    def is_noisy(self) -> bool:
+        """Whether no sample can be taken as exact."""
+        return not self.told or self.noisy / self.told > MAX_NOISY_SHARE
+
+
+class BandTooLargeError(Exception):
+    """A band has more voxels than fit in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """The active voxels of a grid (Eq. 2), their samples, and what these can be used for."""
+
+    grid: SdfGrid
+    offset: float  # world units: at this distance is the surface
+    voxel_ijk: IntArray  # (V, 3), the voxels, in C order
+    patches: FloatArray  # (V, 27), the samples round each voxel, in half voxels
+    lipschitz: BoolArray  # (V,), which patches can be distances
+    sampled: BoolArray  # (V,), which own values are samples, not interpolated by resampling
+    decoded: BoolArray  # (V,), which voxels can hold the surface, and so are decoded
+    exact: BoolArray  # (V,), which own samples can be taken as exact distances
+    # samples beyond the band may be exact distances if they lie between these, in half voxels
+    limits: tuple[float, float]
+    trusted: TrustedSamples  # the samples whose spheres can be trusted, in the band and beyond
+    leaves: bool  # see ``BandSummary``
+
+    def count_noisy(self) -> int:
+        """Count the voxels whose own samples differ from others by more than distances can."""
+        return int(np.count_nonzero(~self.lipschitz & self.sampled))
+
+
+class _Found(NamedTuple):
+    """What is found in some planes of a grid."""
+
+    voxel_ijk: IntArray  # this and the next four: as in ``Band``
+    patches: FloatArray
+    lipschitz: BoolArray
+    sampled: BoolArray
+    decoded: BoolArray
+    number: NDArray[np.int64]  # (n,), of samples beyond the band that may be exact, in C order
+    value: FloatArray  # (n,), of these
+    figures: NDArray[np.float64]  # (1, 5), as in ``BandSummary``
+
+
+def survey(
+    grid: SdfGrid,
+    offset: float = 0.0,
+    *,
+    threads: int = 1,
+    whole: BandSummary | None = None,
+    most: float = np.inf,
+) -> Band:
+    """Read a cubic grid once and return its band.
+
+    With ``whole`` the grid is a part of another one, of which that is the summary.
+    BandTooLargeError is raised as soon as there are more than ``most`` voxels.
+    """
+    low, high = ((limit - offset) * 2 / grid.voxel_size for limit in grid.field.exact)
+    limits = 0.0, 0.0  # what is interpolated beyond the band promises little
+    if grid.on_sample is None:
+        ends = [(end - offset) * 2 / grid.voxel_size for end in (grid.low, grid.high)]
+        lowest, highest = map(float, np.clip(ends, -FAR, FAR).astype(np.float32))
+        limits = max(low, lowest), min(high, highest)  # at its ends a field may be cut off
+    parts, count = list[_Found](), 0
+    for found in _found(grid, offset, threads, limits, is_checked=whole is None):
+        parts.append(found)
+        count += len(found.voxel_ijk)
+        if count > most:
+            raise BandTooLargeError
+    every = _Found(*map(np.concatenate, zip(*parts)))
+    del parts, found
+    rows, patches = every[:5], every.patches
+    whole = whole or _summary(every.figures, np.zeros((0, 0, 0), np.int64))
+    sample, exact = patches[:, CENTRE], np.zeros(len(patches), bool)
+    if not whole.is_noisy:
+        exact = exact_samples(patches, every.lipschitz, (whole.low, whole.high))
+        exact &= (sample > low) & (sample < high)
+    number, value = every.number[:0], every.value[:0]
+    if exact.any() and sees_beyond(limits):  # all trusted samples, in C order
+        own = np.ravel_multi_index(tuple(every.voxel_ijk[exact].T), grid.shape)
+        number, value = np.append(own, every.number), np.append(sample[exact], every.value)
+        order = np.argsort(number, kind="stable")
+        number, value = number[order], value[order]
+    trusted = TrustedSamples(np.array(np.unravel_index(number, grid.shape), np.int32), value)
+    return Band(grid, offset, *rows, exact, limits, trusted, whole.leaves)
+
+
+def summarise(grid: SdfGrid, offset: float = 0.0, threads: int = 1) -> BandSummary:
+    """Return what the band of a cubic grid says, without keeping it; the grid is read once."""
+    side = -(-max(grid.shape) // CELLS)
+    cells, figures = np.zeros([-(-n // side) for n in grid.shape], np.int64), []
+    for found in _found(grid, offset, threads):
+        np.add.at(cells, tuple((found.voxel_ijk // side).T), 1)
+        figures.append(found.figures)
+    return _summary(np.concatenate(figures), cells, side)
+
+
+def _summary(figures: NDArray[np.float64], cells: NDArray[np.int64], side: int = 1) -> BandSummary:
+    """Return the summary of planes that have these figures, (n, 5)."""
+    told, noisy, low, high, leaves = figures.T
+    ends = float(low.min()), float(high.max())
+    return BandSummary(int(told.sum()), int(noisy.sum()), *ends, bool(leaves.any()), cells, side)
+
+
+def sees_beyond(limits: tuple[float, float]) -> bool:
+    """Return whether samples beyond the band can be exact: the same for all parts of a grid."""
+    return limits[0] < -HALF_BAND or limits[1] > HALF_BAND
+
+
+def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
+    """Return the error for a grid without a surface at an offset."""
+    return NoSurfaceError(
+        f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
+    )
+
+
+def _found(
+    grid: SdfGrid,
+    offset: float,
+    threads: int,
+    limits: tuple[float, float] = (0.0, 0.0),
+    *,
+    is_checked: bool = True,
+) -> Iterator[_Found]:
+    """Yield what is found in the planes of a grid, in order.
+
+    An offset ``is_checked``: distances must not be cut off near it. At 0 no other one is better.
+    """
+    unseen, count = grid.field.unseen, grid.shape[0]
+    is_spline = grid.field.network is None
+
+    def look(planes: tuple[int, int]) -> _Found:
+        first, last = planes
+        low = max(first - 1, 0)
+        rescaled = rescale(grid, offset, low, min(last + 1, count))
+        let_go(grid.samples)
+        own = slice(first - low, last - low)
+        inner, active = rescaled[own], (is_near if is_spline else is_active)(rescaled)[own]
+        if unseen is not None:
+            hidden = np.asarray(unseen[first:last])
+            inner, active = np.where(hidden, np.float32(FAR), inner), active & ~hidden
+        ijk = np.argwhere(active).astype(np.int32) + np.array([own.start, 0, 0], np.int32)
+        patches = np.empty((0, 27), np.float32)
+        if len(ijk):
+            start, stop = np.maximum(ijk.min(0) - 1, 0), ijk.max(0) + 2  # the rest is far away
+            patches = gather_patches(rescaled[tuple(map(slice, start, stop))], ijk - start)
+        voxel_ijk, centre = ijk + np.array([low, 0, 0], np.int32), patches[:, CENTRE]
+        if is_checked and offset:
+            _check_offset(grid, offset, patches)
+
+        # Samples of a resampled grid are judged by samples alone: interpolated values do not tell
+        # whether these are noisy. Interpolated values that contradict no others count as exact,
+        # since thin parts need them (docs/guides/formats.md).
+        lipschitz, sampled = is_lipschitz(patches), on_samples(grid, voxel_ijk)
+        if grid.on_sample is not None:
+            lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
+        if is_spline:
+            decoded = np.ones(len(patches), bool)
+        elif grid.field.sides_only:
+            decoded = has_both_sides(patches)
+        else:
+            # only a patch that can be distances proves, by a sample far from the surface, that
+            # the voxel holds none
+            decoded = (np.abs(centre) <= DECODE_LIMIT) | ~lipschitz
+
+        faces = [rescaled[own, [0, -1]], rescaled[own, :, [0, -1]]]
+        faces += [rescaled[0]] * (first == 0) + [rescaled[-1]] * (last == count)
+        told, noisy = sampled.sum(), (sampled & ~lipschitz).sum()
+        ends = centre.min(initial=np.inf), centre.max(initial=-np.inf)
+        figures = np.array([[told, noisy, *ends, any((face <= 0).any() for face in faces)]], float)
+        number, value = np.zeros(0, np.int64), np.zeros(0, np.float32)
+        if sees_beyond(limits):
+            lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
+            found = (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
+            number, value = np.flatnonzero(found) + first * inner[0].size, inner[found]
+        return _Found(voxel_ijk, patches, lipschitz, sampled, decoded, number, value, figures)
+
+    blocks = list(plane_blocks(grid.shape, planes_at_once(grid.samples)))
+    yield from over_threads(look, blocks, threads)
+
+
+def _check_offset(grid: SdfGrid, offset: float, patches: FloatArray) -> None:
+    """Raise GridError if distances are cut off within the band of an offset.
+
+    A sample that is cut off is equal to all round it, which a distance never is.
+    """
+    centre = patches[:, CENTRE]
+    cut_off = (patches == centre[:, None]).all(1) & (np.abs(centre) < HALF_BAND - ROUNDING)
+    if cut_off.any():
+        end = offset + float(centre[cut_off][0]) * grid.voxel_size / 2
+        room = HALF_BAND / 2 * grid.voxel_size
+        limit, which = (end - room, "largest") if end > 0 else (end + room, "smallest")
+        works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"
+        raise GridError(
+            f"offset {offset:g} needs distances {HALF_BAND / 2:g} spacings ({room:.6g}) to either "
+            f"side of it, but they end at {end:.6g}: {works}"
+        )
 
 
 def rescale(
@@ -141,8 +364,7 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
     for first, last in plane_blocks(shape):
         ends = [first - 1, first, last, last + 1]
         start, low, high, stop = np.searchsorted(voxel_ijk[:, 0], ends)
-        around = voxel_ijk[start:stop] - np.array([first, 0, 0], np.int32)
-        at, steps = _flat_steps(around, shape)
+        at, steps = _flat_steps(voxel_ijk[start:stop] - np.array([first, 0, 0], np.int32), shape)
         row_at = np.full((last - first + 2) * (shape[1] + 2) * (shape[2] + 2), -1, np.int32)
         row_at[at] = np.arange(start, stop, dtype=np.int32)
         for column, step in enumerate(steps):
@@ -179,28 +401,8 @@ def is_lipschitz(patches: FloatArray, places: Iterable[int] = range(27)) -> Bool
 
 def has_both_sides(patches: FloatArray) -> BoolArray:
     """Return in which patches (V, 27) samples lie on both sides of 0, (V,)."""
-    outside = patches[:, CENTRE] > 0
-    found = np.zeros(len(patches), bool)
-    for column in range(27):
-        found |= (patches[:, column] > 0) != outside
-    return found
-
-
-def is_filled_in(patches: FloatArray) -> BoolArray:
-    """Return which samples were filled in, as by padding with a constant, (V,) bool.
-
-    They are small, so that the surface should be near, but the field falls to none of the samples
-    around, and rises to one by more than distances and noise do.
-    """
-    found = np.zeros(len(patches), bool)
-    for rows in chunks_of(len(patches), 27):
-        size = np.abs(patches[rows])
-        size -= size[:, CENTRE, None].copy()
-        at = np.flatnonzero((size > MAX_DIFFERENCE + JUMP).any(1))
-        if len(at):
-            some = (size[at] > -JUMP / 2).all(1) & ~has_both_sides(patches[rows][at])
-            found[rows.start + at] = some
-    return found
+    outside = patches > 0
+    return np.asarray(outside.any(1) & ~outside.all(1))
 
 
 def exact_samples(
@@ -216,8 +418,6 @@ def exact_samples(
     exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE)
     low, high = map(np.float32, limits)
     at_limit = np.flatnonzero(exact & (sample == np.where(sample > 0, high, low)))
-    for rows in chunks_of(len(at_limit), 27):
-        some = at_limit[rows]
-        slope = np.abs(patches[some] - sample[some, None]) / np.maximum(MAX_DIFFERENCE, 1)
-        exact[some] = slope.max(1) >= MIN_SLOPE
+    slope = np.abs(patches[at_limit] - sample[at_limit, None]) / np.maximum(MAX_DIFFERENCE, 1)
+    exact[at_limit] = slope.max(1) >= MIN_SLOPE
     return exact

@@ -16,11 +16,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import count as count_up
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, STRIDES, FloatArray, IntArray
+from ..arrays import CENTRE, STRIDES, BoolArray, FloatArray, IntArray
 from ..threads import CHUNK, chunks_of, map_chunks
 from .nodes import SharedParts, average_shared, block_ijk, block_offsets
 
@@ -39,25 +40,23 @@ MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
 # Blocks that are worked on with one box of samples, and the largest box: of far fewer blocks, if
 # they lie along a diagonal.
 BOX_ROWS, BOX_SAMPLES = 4096, 1 << 21
-TEMPORARIES = 512  # numbers of each block in a chunk: four spheres at its nodes
+TEMPORARIES, PAIRS = 1024, 4096  # numbers of each block in a chunk; spheres and blocks at a time
 
 
 @dataclass(frozen=True, eq=False)
 class TrustedSamples:
     """All samples whose spheres can be trusted: exact ones of the band, and some beyond it."""
 
-    shape: tuple[int, int, int]  # samples of the grid along each axis
-    number: NDArray[np.int64]  # (n,), of each sample, in C order of the grid, ascending
+    ijk: IntArray  # (3, n), the samples, in C order
     value: FloatArray  # (n,)
 
     def box(self, low: IntArray, high: IntArray) -> FloatArray:
         """Return the samples from index ``low`` (3,) to before ``high``, NaN where none is."""
         box = np.full(high - low, np.nan, np.float32)
-        ends = np.array([low[0], high[0]], np.int64) * self.shape[1] * self.shape[2]
-        rows = slice(*np.searchsorted(self.number, ends))
-        at = np.stack(np.unravel_index(self.number[rows], self.shape), 1) - low
-        within = np.asarray(((at >= 0) & (at < box.shape)).all(1))
-        box[tuple(at[within].T)] = self.value[rows][within]
+        rows = slice(*np.searchsorted(self.ijk[0], [low[0], high[0]]))
+        i, j, k = self.ijk[:, rows] - low[:, None]
+        within = (j >= 0) & (j < box.shape[1]) & (k >= 0) & (k < box.shape[2])
+        box[i[within], j[within], k[within]] = self.value[rows][within]
         return box
 
 
@@ -75,10 +74,9 @@ def keep_within_bounds(
     that they share with others, which are averaged again. ``blocks`` (Q, D + 1) of voxels (D, 3),
     in C order, are changed in place; the last column is 0.
     """
-    if factor < LEAST_FACTOR or not len(samples.number):
+    if factor < LEAST_FACTOR or not len(samples.value):
         return
-    thin = np.zeros(blocks.shape[1], bool)
-    steps, _ = sample_places()
+    thin, steps = np.zeros(blocks.shape[1], bool), sample_places()[0]
 
     def work(rows: slice) -> list[tuple[NDArray[np.intp], FloatArray]]:
         moves = []
@@ -88,14 +86,14 @@ def keep_within_bounds(
             strides = np.array([box.shape[1] * box.shape[2], box.shape[2], 1])
             start, around = (voxel_ijk[group] - low) @ strides, steps @ strides
             for some in chunks_of(len(start), max(4 * len(blocks), TEMPORARIES)):
-                here = slice(group.start + some.start, group.start + some.stop)
-                values = np.ascontiguousarray(blocks[:, here].T)
-                moved = _bounded(values, factor, box.take(start[some, None] + around))
-                changed = np.flatnonzero((moved != values).any(1))
-                inside, moved = values[changed] <= 0, moved[changed]
-                lost = (inside & (moved > 0)).sum(1) > MOST_LOST * inside.sum(1)
-                thin[here.start + changed] = lost
-                moves.append((here.start + changed, moved))
+                first = group.start + some.start
+                values = np.ascontiguousarray(blocks[:, first : group.start + some.stop].T)
+                row, moved = _bounded(values, factor, box.take(start[some, None] + around))
+                before = values[row]
+                lost = np.count_nonzero((before <= 0) & (moved > 0), axis=1)
+                inside = np.count_nonzero(before <= 0, axis=1)
+                thin[first + row] = lost > MOST_LOST * inside
+                moves.append((first + row, moved))
         return moves
 
     every = map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
@@ -107,7 +105,7 @@ def keep_within_bounds(
         free = ~kept[rows]
         blocks[:, rows[free]] = moved[free].T
         touched[parts.table[:, rows[free]]] = True
-    average_shared(blocks, parts, factor, threads, np.flatnonzero(touched[:-1]))
+    average_shared(blocks, parts, factor, threads, touched[:-1])
 
 
 def _cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
@@ -121,45 +119,59 @@ def _cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
         yield from _cut_to_boxes(voxel_ijk, slice(middle, rows.stop))
 
 
-def _bounded(values: FloatArray, factor: int, around: FloatArray) -> FloatArray:
-    """Return the values of blocks, (n, Q) float32, moved into their bounds.
+def _bounded(
+    values: FloatArray, factor: int, around: FloatArray
+) -> tuple[NDArray[np.intp], FloatArray]:
+    """Return which of n blocks exceed their bounds, (m,), and their values within these, (m, Q).
 
-    ``around``, (n, m) float32, are the samples round each block in the order of ``sample_places``,
-    its own first.
+    ``values`` are (n, Q), and ``around``, (n, m), the samples round each block in the order of
+    ``sample_places``, its own first. Blocks are numbered twice in between: from n on they are
+    bounded by spheres whose centres are inside.
     """
-    own, moved = around[:, 0], values.copy()
+    count, own = len(values), around[:, 0]
     slack = sample_places()[1] - np.abs(around - own[:, None])
     close = np.flatnonzero(slack < SLACK)
+    size, block = around.ravel().take(close), close // around.shape[1]
+    place = close - block * around.shape[1]
+    block += count * (size < 0)
+    size = np.abs(size)
     to_nodes, looked_at = node_distances(factor)
-    to_looked = to_nodes[:, looked_at]
-    for side in (1, -1):  # spheres whose centres are outside, then inside
-        row, place = np.divmod(close[side * around.ravel()[close] > 0], around.shape[1])
-        size = np.abs(around[row, place])
-        # nodes that are nearer to a centre than this exceed its bound
-        reached = (np.float32(-side) * moved[:, looked_at]).take(row, 0)
-        reached += size[:, None]
-        exceeded = np.zeros(len(values), bool)
-        exceeded[row[_any_of_32(reached > (to_looked + EXCEEDED).take(place, 0))]] = True
-        near = np.flatnonzero(exceeded[row])
-        reaches = reached.take(near, 0) > (to_looked - MARGIN).take(place.take(near), 0)
-        near = near[_any_of_32(reaches)]
-        count = np.bincount(row[near], minlength=len(values))
-        first = np.cumsum(count) - count
-        tightest = (np.float32(side) * moved).astype(np.float32, copy=False)
-        for nth in range(count.max()):  # the first sphere of each block, then the second
-            blocks = np.flatnonzero(count > nth)
-            some = near[first[blocks] + nth]
-            bound = size.take(some)[:, None] - to_nodes.take(place.take(some), 0)
-            tightest[blocks] = np.maximum(tightest[blocks], bound)
-        moved = np.float32(side) * tightest
-    kept = np.isnan(own) | (slack < -CONTRADICTION).any(1)
-    moved[kept] = values[kept]
+    to_looked, looked = (array.take(looked_at, 1) for array in (to_nodes, values))
+    looked, near, exceeds = np.concatenate([-looked, looked]), [], []
+    for some in chunks_of(len(block), CHUNK // PAIRS):
+        over = looked.take(block[some], 0)
+        over -= to_looked.take(place[some], 0)  # by how much it is, less the size of the sphere
+        at = np.flatnonzero(_any_of_32(over > (-MARGIN - size[some])[:, None]))
+        near.append(some.start + at)
+        exceeds.append(_any_of_32(over.take(at, 0) > (EXCEEDED - size[near[-1]])[:, None]))
+    chosen, bounded = np.concatenate(near), np.zeros((2, count), bool)
+    block, place, size = block[chosen], place[chosen], size[chosen]
+    bounded.ravel()[block[np.concatenate(exceeds)]] = True
+    bounded[:, np.isnan(own) | (slack < -CONTRADICTION).any(1)] = False
+    chosen = np.flatnonzero(bounded.ravel()[block])
+    chosen = chosen[np.argsort(block[chosen], kind="stable")]
+    block, place, size = block[chosen], place[chosen], size[chosen]
+    spheres = np.bincount(block, minlength=2 * count)
+    most = np.argsort(-spheres, kind="stable")[: np.count_nonzero(spheres)]  # those with most first
+    first = (np.cumsum(spheres) - spheres)[most]
+    tightest = np.full((len(most), values.shape[1]), -np.inf, np.float32)
+    for end, nth in zip(np.searchsorted(-spheres[most], -np.arange(spheres.max())), count_up()):
+        number = first[:end] + nth  # the first sphere of each block, then the second
+        bound = to_nodes.take(place.take(number), 0)
+        np.subtract(size.take(number)[:, None], bound, out=bound)
+        np.maximum(tightest[:end], bound, out=tightest[:end])
+    moved, outside = values.copy(), most < count
+    row = most[outside]
+    moved[row] = np.maximum(moved[row], tightest[outside])
+    row = most[~outside] - count
+    moved[row] = np.minimum(moved[row], -tightest[~outside])
     middle = values.shape[1] // 2
     moved[:, middle] = values[:, middle]  # the block's own sample
-    return moved
+    row = np.flatnonzero(bounded.any(0))
+    return row, moved[row]
 
 
-def _any_of_32(found: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _any_of_32(found: BoolArray) -> BoolArray:
     """Return in which rows of (k, 32) any is True, (k,); eight in each number: faster than any."""
     a, b, c, d = found.view(np.uint64).T
     return np.asarray(a | b | c | d, bool)

@@ -5,14 +5,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, FloatArray, IntArray
+from ..arrays import BoolArray, FloatArray, IntArray
 from ..errors import OptionError
 from ..grid.interpret import NONE_EXACT, Field
 from ..grid.samples import SamplePlanes
@@ -41,13 +41,6 @@ class SampleSpheres:
     voxel_ijk: IntArray  # (m, 3), the samples, in C order
     distance: FloatArray  # (m,), signed, in half voxels
 
-    @classmethod
-    def of(
-        cls, shape: tuple[int, int, int], voxel_ijk: IntArray, patches: FloatArray
-    ) -> SampleSpheres:
-        """Return the spheres of voxels (m, 3), given their patches (m, 27)."""
-        return cls(shape, voxel_ijk, patches[:, CENTRE].copy())
-
     @cached_property
     def index(self) -> VoxelIndex:
         """Finds which sample lies in a voxel."""
@@ -58,8 +51,8 @@ class SampleSpheres:
 class FineField:
     """Values at the nodes of the decoded voxels' blocks.
 
-    ``positions`` and ``distances`` are the nodes in world units, each once; ``block_positions`` and
-    ``block_distances`` are those of voxels, block by block. The arrays below are in index space.
+    ``positions`` and ``distances`` are the nodes in world units, each once; ``block_distances`` are
+    block by block. The arrays below are in index space.
 
     Attributes
     ----------
@@ -89,11 +82,10 @@ class FineField:
     octants : (D,) uint8, optional
         A bit for each octant of each voxel: whether all eight samples round it are known. Where
         one is not, the surface ends. None if all are known.
-    counts : dict
-        ``band_voxels``; ``noisy_voxels``, those round which samples differ by more than distances
-        can; ``decoded_voxels``; ``nodes``; ``pinned_nodes``, whose sign had to be changed to that
-        of a voxel that holds no surface: if there are any, the input is not a distance field there,
-        or the network failed.
+    found : two ints
+        The ``band_voxels`` and ``noisy_voxels`` of ``count``.
+    pinned : (D,) int32, optional
+        How many of the ``pinned_nodes`` of ``count`` each voxel owns.
     """
 
     shape: tuple[int, int, int]
@@ -107,12 +99,24 @@ class FineField:
     leaves: bool = True
     border_inside: IntArray | None = None
     octants: NDArray[np.uint8] | None = None
-    counts: dict[str, int] = field(default_factory=dict)
+    found: tuple[int, int] = (0, 0)
+    pinned: IntArray | None = None
 
     def __repr__(self) -> str:
         shape, nodes = " x ".join(map(str, self.shape)), self.parts.count_nodes(self.factor)
         voxels = f"{len(self.voxel_ijk):,} voxels of {shape}"
         return f"FineField(factor {self.factor}, {nodes:,} nodes of {voxels})"
+
+    def count(self, own: slice | BoolArray = slice(None)) -> dict[str, int]:
+        """Return counts by name; of decoded voxels and nodes, those of some voxels.
+
+        ``noisy_voxels`` are those of the band round which samples differ by more than distances
+        can. The sign of ``pinned_nodes`` had to be changed to that of a voxel that holds no
+        surface: if there are any, the input is not a distance field there, or the network failed.
+        """
+        counts = self.found[0], self.found[1], len(self.voxel_ijk[own])
+        pinned = 0 if self.pinned is None else int(self.pinned[own].sum())
+        return dict(zip(COUNTS, (*counts, self.parts.count_nodes(self.factor, own), pinned)))
 
     @cached_property
     def numbers(self) -> IntArray:
@@ -135,7 +139,7 @@ class FineField:
     def node_ijk(self) -> IntArray:
         """The indices of all nodes in the fine lattice, in the order of ``values``, (n, 3)."""
         ijk = np.empty((self.parts.count_nodes(self.factor), 3), np.int32)
-        ijk[self.numbers] = self._block_node_ijk(slice(None))
+        ijk[self.numbers] = self.factor * self.voxel_ijk[:, None] + block_ijk(self.factor)
         return ijk
 
     def positions(self) -> NDArray[np.float64]:
@@ -149,12 +153,8 @@ class FineField:
         """Return the signed distances at ``positions``, (n,), in world units, negative inside."""
         return self.in_world_units(self.values)
 
-    def block_positions(self, rows: slice = slice(None)) -> NDArray[np.float64]:
-        """Return the world positions of the nodes of voxels' blocks, (m, Q, 3)."""
-        return self.placed.to_world(self._block_node_ijk(rows) / self.factor - 0.5)
-
     def block_distances(self, rows: slice = slice(None)) -> NDArray[np.float64]:
-        """Return the signed distances at ``block_positions``, (m, Q), in world units."""
+        """Return the distances at the nodes of voxels' blocks, (m, Q), in world units."""
         return self.in_world_units(self.blocks[:, rows].T)
 
     def in_world_units(self, values: FloatArray) -> NDArray[np.float64]:
@@ -172,10 +172,6 @@ class FineField:
     def has_surface(self) -> bool:
         """Whether nodes have both signs; 0 counts as inside."""
         return bool(self.blocks.size and self.blocks.min() <= 0 < self.blocks.max())
-
-    def _block_node_ijk(self, rows: slice) -> IntArray:
-        """Return the indices of the nodes of voxels' blocks in the fine lattice, (m, Q, 3)."""
-        return self.factor * self.voxel_ijk[rows][:, None] + block_ijk(self.factor)
 
 
 def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> bool:
@@ -216,24 +212,23 @@ class FineLattice(SamplePlanes):
     def read(self, first: int, last: int) -> FloatArray:
         """Return planes ``first`` to before ``last`` of nodes, (last - first, ny, nz) float32."""
         field, factor, grid = self.field, self.field.factor, self.field.placed
-        planes = np.empty((last - first, *self.shape[1:]), np.float32)
         if first == last:
-            return planes
-        low, share, voxel = _places_of_nodes(np.arange(first, last), factor, grid.shape[0])
-        across = [_places_of_nodes(np.arange(self.shape[n]), factor, grid.shape[n]) for n in (1, 2)]
-        start = int(low[0])
-        samples = rescale(grid, field.offset, start, int(low[-1]) + 2)
-        for plane, before, beyond, nearest in zip(planes, low - start, share, voxel - start):
-            values = samples[before] * (1 - beyond) + samples[before + 1] * beyond
-            outside = samples[nearest] > 0
-            for axis, (lower, upper, inner) in enumerate(across):
-                part = upper[:, None] if axis == 0 else upper
-                refined = values.take(lower, axis) * (1 - part)
-                refined += values.take(lower + 1, axis) * part
-                values, outside = refined, outside.take(inner, axis)
-            plane[...] = values
-            np.maximum(plane, BARELY_OUTSIDE, out=plane, where=outside)
-            np.minimum(plane, BARELY_INSIDE, out=plane, where=~outside)
+            return np.empty((0, *self.shape[1:]), np.float32)
+        start = max((first - 1) // factor - 1, 0)  # coarse planes on which those of nodes depend
+        planes = rescale(grid, field.offset, start, min((last - 1) // factor + 2, grid.shape[0]))
+        outside = planes > 0
+        for axis, count in enumerate(grid.shape):
+            node = np.arange(first, last) if axis == 0 else np.arange(self.shape[axis])
+            place, shift = node / factor - 0.5, start if axis == 0 else 0
+            # the sample before each node and how far beyond it, 0 to 1 spacing, or -1/2 to 3/2 in
+            # the half voxels beyond the outermost samples; a node on a face is in the second voxel
+            low = np.clip(np.floor(place), 0, count - 2).astype(np.int64)
+            share = (place - low).astype(np.float32).reshape(-1, *(1,) * (2 - axis))
+            below = planes.take(low - shift, axis) * (1 - share)
+            planes = below + planes.take(low - shift + 1, axis) * share
+            outside = outside.take(np.minimum(node // factor, count - 1) - shift, axis)
+        np.maximum(planes, BARELY_OUTSIDE, out=planes, where=outside)
+        np.minimum(planes, BARELY_INSIDE, out=planes, where=~outside)
 
         ends = (first - 1) // factor, (last - 1) // factor + 1  # of the voxels with nodes there
         rows = slice(*np.searchsorted(field.voxel_ijk[:, 0], ends).tolist())
@@ -248,19 +243,6 @@ class FineLattice(SamplePlanes):
             flat[corner + face[:, None]] = values[:, here]
         scale = grid.voxel_size / 2
         return np.multiply(planes, scale, out=planes, dtype=np.float64, casting="same_kind")
-
-
-def _places_of_nodes(
-    node: NDArray[np.int64], factor: int, samples: int
-) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
-    """Return for nodes of an axis the sample before each, how far beyond it, and its voxel.
-
-    That is 0 to 1 spacing, or -1/2 to 3/2 in the half voxels beyond the outermost samples. A node
-    on a face lies in the second voxel.
-    """
-    place = node / factor - 0.5
-    low = np.clip(np.floor(place), 0, samples - 2).astype(np.int64)
-    return low, (place - low).astype(np.float32), np.minimum(node // factor, samples - 1)
 
 
 def lattice_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, int]:

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -142,52 +141,35 @@ def average_shared(
     parts: SharedParts,
     factor: int,
     threads: int = 1,
-    rows: NDArray[np.intp] | None = None,
+    which: BoolArray | None = None,
 ) -> None:
     """Set each copy of a shared node to the mean of the copies (Eq. 7), in ``blocks`` (Q, D + 1).
 
-    Given ``rows``, only those of their blocks are set. Sums are taken in the order of the voxels
-    and in double precision (of two numbers in single), so that all copies get the same bits.
+    Only nodes owned by the voxels ``which`` (D,), if given. Sums are taken in the order of the
+    voxels and in double precision (of two numbers in single), so that all copies are equal.
     """
-    some = slice(0, blocks.shape[1] - 1) if rows is None else rows
+    nodes = nodes_of_part(factor)
 
-    def average(axes: tuple[bool, ...]) -> None:
-        """Average the nodes at the block's ends along ``axes`` and inside along the others."""
-        places, nodes_at = _nodes_of_group(factor, axes)
-        kind = np.float32 if len(places) == 2 else np.float64
-        means = []
-        for own in places:
-            total: NDArray[Any] = np.zeros((len(nodes_at[0]), len(parts.table[0, some])), kind)
-            times: NDArray[Any] = np.zeros(total.shape[1], kind)
-            for other, nodes in zip(places, nodes_at):
-                voxel = parts.table[CENTRE + int((own - other) @ STRIDES), some].astype(np.intp)
-                times += voxel >= 0
-                for row, node in enumerate(nodes):
-                    total[row] += blocks[node, some] if other is own else blocks[node].take(voxel)
-            means.append((total / times).astype(np.float32))
-        for nodes, mean in zip(nodes_at, means):
-            for node, values in zip(nodes, mean):
-                blocks[node, some] = values
+    def average(part: int) -> None:
+        """Average the nodes of one part in the blocks of the voxels that own it."""
+        owned = parts.owner[part] == CENTRE
+        own = np.flatnonzero(owned if which is None else owned & which)
+        later = SHARING[part][SHARING[part] > CENTRE]  # those that also have it
+        voxels = [parts.table[place].take(own) for place in later]
+        there = [np.flatnonzero(voxel >= 0) for voxel in voxels]
+        kind = np.float32 if len(SHARING[part]) == 2 else np.float64
+        times = 1 + np.sum([voxel >= 0 for voxel in voxels], 0, kind)
+        for copies in zip(nodes[part], *(nodes[seen_from(part, place)] for place in later)):
+            total = blocks[copies[0]].take(own).astype(kind, copy=False)
+            for node, voxel in zip(copies[1:], voxels):
+                total += blocks[node].take(voxel)  # 0 where there is none
+            mean = (total / times).astype(np.float32)
+            blocks[copies[0], own] = mean
+            for node, voxel, some in zip(copies[1:], voxels, there):
+                blocks[node, voxel[some]] = mean[some]
 
-    groups = [axes for axes in product((False, True), repeat=3) if any(axes)]
-    map_threads(average, groups, worthwhile_threads(blocks.size, threads))
-
-
-@lru_cache
-def _nodes_of_group(
-    factor: int, axes: tuple[bool, ...]
-) -> tuple[list[IntArray], list[NDArray[np.intp]]]:
-    """Return the places that a shared node can have in a block, and the block's nodes there.
-
-    A place is (3,) int32: 1 at the block's high end of an axis, 0 at its low end and along axes
-    that are not shared. Places come in the order of the voxels that see the node there.
-    """
-    block = block_ijk(factor)
-    inner = (block > 0) & (block < factor)
-    ends = [(1, 0) if shared else (0,) for shared in axes]
-    places = [np.array(place, np.int32) for place in product(*ends)]
-    at_ends = (np.where(axes, block == factor * place, inner).all(1) for place in places)
-    return places, [np.flatnonzero(nodes) for nodes in at_ends]
+    shared = [part for part in range(27) if part != CENTRE and SHARING[part][-1] > CENTRE]
+    map_threads(average, shared, worthwhile_threads(blocks.size, threads))
 
 
 def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: IntArray) -> None:
@@ -213,13 +195,14 @@ def pin_to_skipped(
     patches: FloatArray,
     voxels: IntArray,
     shape: tuple[int, int, int],
-) -> int:
+) -> IntArray:
     """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
 
     A skipped voxel was not decoded, so it holds no surface, and all its nodes have the sign of its
     sample. Once they do, no sign change reaches the boundary of the decoded voxels, and the
     isosurface has no hole there. The decoded voxels (D, 3) are the rows ``voxels`` of the band,
-    with the samples ``patches`` (V, 27). Returned is how many nodes were changed.
+    with the samples ``patches`` (V, 27). Returned is how many nodes were changed that
+    each voxel owns, (D,).
     """
     # the sign of each neighbour, 0 of decoded ones
     skipped: NDArray[np.int8] = np.zeros(parts.table.shape, np.int8)
@@ -231,7 +214,7 @@ def pin_to_skipped(
                 is_skipped &= along[way > 0]
         at = np.flatnonzero(is_skipped)
         skipped[place, at] = np.where(patches[voxels.take(at), place] > 0, 1, -1)
-    changed = 0
+    changed = np.zeros(len(voxels), np.int32)
     for part, nodes in enumerate(nodes_of_part(factor)):
         sign = np.zeros(skipped.shape[1], np.int8)
         for signs in skipped[SHARING[part]]:
@@ -241,5 +224,5 @@ def pin_to_skipped(
             wrong = known & ((blocks[node] > 0) != outside)
             if wrong.any():
                 blocks[node, wrong] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
-                changed += int(np.count_nonzero(wrong & (parts.owner[part] == CENTRE)))
+                changed += wrong & (parts.owner[part] == CENTRE)
     return changed

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
 from ..grid.samples import cropped, in_spacings
-from ..network.decoder import Adapter, decode
+from ..network.contract import Adapter, decode
 from ..threads import chunks_of
+from .band import Band
 from .nodes import block_offsets
-from .survey import Band
 
 AT_ONCE = 500_000  # voxels that the network sees at a time, about: they take 1.7 kB each
 POLE = 3**0.5 - 2

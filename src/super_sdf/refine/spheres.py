@@ -19,16 +19,15 @@ not depend on how many are worked on together.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
+from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, FloatArray, IntArray
 from ..threads import chunks_of, map_chunks
-from .band import MAX_DISTANCE, MIN_SLOPE
+from .band import MAX_DISTANCE, MIN_SLOPE, Band
 from .nodes import SharedParts, VoxelIndex, number_parts
-from .survey import Band
 
 BEYOND = 2.0  # samples this much farther than MAX_DISTANCE have spheres, too
 APART = np.maximum(2 * np.linalg.norm(NEIGHBOURHOOD, axis=1), 1).astype(np.float32)  # of samples
@@ -55,31 +54,47 @@ CELLS = 1, 2, 2  # along a block, of the lattice on which errors are averaged, e
 SAMPLE_TO_FOOT = 2  # (MAX_DISTANCE + BEYOND) / 2, rounded
 REACH_IN_VOXELS = len(CELLS) + 2 * SAMPLE_TO_FOOT + 1
 
-CELL = np.indices((2, 2, 2)).reshape(3, 8).T
-"""The corners of a cell, (8, 3)."""
 
+class Spheres(NamedTuple):
+    """The spheres of n exact samples."""
 
-@dataclass(frozen=True, eq=False)
-class Spheres:
-    """The spheres of exact samples."""
-
-    centre: IntArray  # (n, 3), the samples
+    centre: IntArray  # (3, n), the samples
     distance: FloatArray  # (n,), signed
     direction: FloatArray  # (3, n), about the gradient of the field there, of length 1
 
-    def __len__(self) -> int:
-        return len(self.distance)
 
-    def some(self, rows: slice | NDArray[np.signedinteger] | BoolArray) -> Spheres:
-        """Return some of the spheres."""
-        return Spheres(self.centre[rows], self.distance[rows], self.direction[:, rows])
+class FootPoints(NamedTuple):
+    """Foot points of samples, and the field's value there."""
+
+    rows: IntArray  # (n,), the block that each lies in
+    place: FloatArray  # (3, n), the position in the block, 0 to 1 along each axis
+    values: FloatArray  # (n,), the field there: the error, since it should be 0
+    weights: FloatArray  # (n,), how far to trust it, 0 to 1
 
 
-def _joined(parts: Sequence[Spheres]) -> Spheres:
-    """Return the spheres of all parts."""
-    every = zip(*((part.centre.T, part.distance, part.direction) for part in parts))
-    centre, distance, direction = (np.concatenate(each, -1) for each in every)
-    return Spheres(np.ascontiguousarray(centre.T), distance, direction)
+class Look(NamedTuple):
+    """The field at a place on each of n spheres."""
+
+    direction: FloatArray  # (3, n), from the place to the sample, or back for a sample inside
+    aside: FloatArray  # (3, n), whole voxels from the sample to the block that the place lies in
+    rows: IntArray  # (n,), that block, -1 if it was not decoded
+    place: FloatArray  # (3, n), the position in it, 0 to 1 along each axis
+    value: FloatArray  # (n,), the field
+    normal: FloatArray  # (3, n), its gradient, of length 1
+    clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
+
+
+Columns = TypeVar("Columns", Spheres, FootPoints, Look)
+
+
+def _some(columns: Columns, which: NDArray[Any] | slice) -> Columns:
+    arrays: Any = [array[..., which] for array in columns]
+    return type(columns)(*arrays)
+
+
+def _joined(parts: Sequence[Columns]) -> Columns:
+    arrays: Any = [np.concatenate(each, -1) for each in zip(*parts)]
+    return type(parts[0])(*arrays)
 
 
 def fit_to_spheres(
@@ -96,7 +111,7 @@ def fit_to_spheres(
     ``blocks`` (Q, D + 1), in half voxels, are changed in place; the last column is 0. ``parts`` and
     ``index`` are of the D voxels.
     """
-    if not len(spheres):  # in a noisy field, for example
+    if not len(spheres.distance):  # in a noisy field, for example
         return
     feet = find_foot_points(blocks, factor, spheres, index, threads)
     correction = find_correction(feet, parts)
@@ -105,8 +120,8 @@ def fit_to_spheres(
         blocks[:, rows] -= prolong(correction[:, rows], 2, factor)
 
     map_chunks(subtract, correction.shape[1], len(blocks), threads)
-    own = spheres.some(np.abs(spheres.distance) < MAX_DISTANCE)
-    rows = index.find(own.centre)
+    own = _some(spheres, np.abs(spheres.distance) < MAX_DISTANCE)
+    rows = index.find(own.centre.T)
     blocks[len(blocks) // 2, rows[rows >= 0]] = own.distance[rows >= 0]
 
 
@@ -117,41 +132,31 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
     is that of the exact sample beside it from which it rises most steeply, about by 1 along the
     gradient; one that was cut off does not rise as distances do.
     """
-    exact, shape, (low, high) = np.flatnonzero(band.exact), band.grid.shape, band.limits
+    exact, (low, high) = np.flatnonzero(band.exact), band.limits
 
     def gather(rows: slice) -> tuple[Spheres, Spheres, FloatArray]:
         patch = band.patches[exact[rows]]  # (n, 27)
         gradient = _unit((patch[:, CENTRE + STRIDES] - patch[:, CENTRE - STRIDES]).T)
-        own = Spheres(band.voxel_ijk[exact[rows]], patch[:, CENTRE].copy(), gradient)
+        centre = np.ascontiguousarray(band.voxel_ijk[exact[rows]].T)
+        own = Spheres(centre, patch[:, CENTRE].copy(), gradient)
         size, sign = np.abs(patch), np.copysign(np.float32(1), own.distance)
         slope = (sign[:, None] * patch - np.abs(own.distance)[:, None]) / APART
         found = np.asarray((size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND))
         found &= (slope >= MIN_SLOPE) & (patch > low) & (patch < high)
         row, step = np.nonzero(found)
-        centre = own.centre[row] + NEIGHBOURHOOD[step]
-        in_grid = ((centre >= 0) & (centre < shape)).all(1)
+        centre = own.centre[:, row] + NEIGHBOURHOOD[step].T
+        in_grid = ((centre.T >= 0) & (band.grid.shape > centre.T)).all(1)
         row, step = row[in_grid], step[in_grid]
-        beyond = Spheres(centre[in_grid], patch[row, step], own.direction[:, row])
+        beyond = Spheres(centre[:, in_grid], patch[row, step], own.direction[:, row])
         return own, beyond, slope[row, step]
 
-    parts = map_chunks(gather, len(exact), 4 * TEMPORARIES, threads)
-    if not parts:
-        return Spheres(band.voxel_ijk[:0], band.patches[:0, 0], band.patches[:0, :3].T)
-    own, others, slope = zip(*parts)
-    beyond = _joined(others)
-    keys = VoxelIndex(beyond.centre, shape).keys
-    order = np.lexsort((-np.concatenate(slope), keys))  # of equal samples the steepest
-    return _joined([*own, beyond.some(order[np.diff(keys[order], prepend=-1) > 0])])
-
-
-@dataclass(frozen=True, eq=False)
-class FootPoints:
-    """Foot points of samples, and the field's value there."""
-
-    rows: IntArray  # (n,), the block that each lies in
-    place: FloatArray  # (3, n), the position in the block, 0 to 1 along each axis
-    values: FloatArray  # (n,), the field there: the error, since it should be 0
-    weights: FloatArray  # (n,), how far to trust it, 0 to 1
+    parts = map_chunks(gather, len(exact), 4 * TEMPORARIES, threads) or [gather(slice(0))]
+    beyond = _joined([part[1] for part in parts])
+    slope = np.concatenate([part[2] for part in parts])
+    keys = VoxelIndex(beyond.centre.T, band.grid.shape).keys
+    order = np.lexsort((-slope, keys))  # of equal samples the steepest
+    beyond = _some(beyond, order[np.diff(keys[order], prepend=-1) > 0])
+    return _joined([*(part[0] for part in parts), beyond])
 
 
 def find_foot_points(
@@ -165,8 +170,8 @@ def find_foot_points(
     touch edges, which linear cells cut off: that they are clear of them is no error.
     """
 
-    def search(rows: slice) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-        some = spheres.some(rows)
+    def search(rows: slice) -> FootPoints:
+        some = _some(spheres, rows)
         found, size = _touch(blocks, factor, some, index), np.abs(some.distance)
         clear = (size >= MAX_DISTANCE) & (found.clearance > 0)
         unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
@@ -176,24 +181,11 @@ def find_foot_points(
         farther: FloatArray = np.maximum(size - np.float32(MAX_DISTANCE), 0)
         penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
         weights = aligned / penalty
+        values = np.clip(found.value, -MAX_ERROR, MAX_ERROR)
         kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
-        values = np.clip(found.value[kept], -MAX_ERROR, MAX_ERROR)
-        return found.rows[kept], found.place[:, kept], values, weights[kept]
+        return _some(FootPoints(found.rows, found.place, values, weights), kept)
 
-    parts = map_chunks(search, len(spheres), TEMPORARIES, threads)
-    return FootPoints(*(np.concatenate(each, -1) for each in zip(*parts)))
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """The field at a place on each of n spheres."""
-
-    direction: FloatArray  # (3, n), from the place to the sample, or back for a sample inside
-    rows: IntArray  # (n,), the block that the place lies in, -1 if it was not decoded
-    place: FloatArray  # (3, n), the position in it, 0 to 1 along each axis
-    value: FloatArray  # (n,), the field
-    normal: FloatArray  # (3, n), its gradient, of length 1
-    clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
+    return _joined(map_chunks(search, len(spheres.distance), TEMPORARIES, threads))
 
 
 def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Look:
@@ -205,19 +197,26 @@ def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex)
     that gains nothing is taken back, and the next one is smaller.
     """
 
-    def look(some: Spheres, direction: FloatArray) -> Look:
-        """Return what the field is where directions (3, n) meet spheres."""
-        half = some.distance * direction * np.float32(-0.5)
+    def look(which: NDArray[Any] | slice, direction: FloatArray, before: Look | None) -> Look:
+        """Return what the field is where directions (3, n) meet some spheres."""
+        distance = spheres.distance[which]
+        half = distance * direction * np.float32(-0.5)
         aside = np.rint(half)
-        rows = index.find(some.centre + aside.T.astype(np.int32)).astype(np.int32)
+        if before is None:
+            rows = index.find((spheres.centre + aside.astype(np.int32)).T).astype(np.int32)
+        else:  # most places stay in their block
+            rows = before.rows[which]
+            other = np.flatnonzero((aside != before.aside[:, which]).any(0))
+            voxel = spheres.centre[:, which][:, other] + aside[:, other].astype(np.int32)
+            rows[other] = index.find(voxel.T)
         place = np.clip(half - aside + np.float32(0.5), 0, 1)
         value, gradient = sample_trilinear(blocks, rows, place, factor)
-        outwards = np.copysign(np.float32(1), some.distance) * value
+        outwards = np.copysign(np.float32(1), distance) * value
         clearance = np.where(rows >= 0, outwards, np.float32(np.inf))
-        return Look(direction.copy(), rows, place, value, _unit(gradient), clearance)
+        return Look(direction, aside, rows, place, value, _unit(gradient), clearance)
 
-    found = look(spheres, spheres.direction)
-    turn = np.full(len(spheres), FIRST_TURN, np.float32)
+    found = look(slice(None), spheres.direction.copy(), None)
+    turn = np.full(len(spheres.distance), FIRST_TURN, np.float32)
     for _ in range(LOOKS - 1):
         cosine = _dot(found.direction, found.normal)
         rest = np.flatnonzero((found.rows >= 0) & (cosine < SETTLED))
@@ -225,12 +224,13 @@ def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex)
             break
         direction, share = found.direction[:, rest], turn[rest]
         direction = _unit(direction + share * (found.normal[:, rest] - direction))
-        new = look(spheres.some(rest), direction)
+        new = look(rest, direction, found)
         better = new.clearance < found.clearance[rest]
         nearer, farther = np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
         turn[rest] = np.where(better, nearer, farther)
-        for mine, its in zip(vars(found).values(), vars(new).values()):
-            mine[..., rest[better]] = its[..., better]
+        gained = np.flatnonzero(better)
+        for mine, its in zip(found, new):
+            mine[..., rest[gained]] = its[..., gained]
     return found
 
 
@@ -256,7 +256,7 @@ def sample_trilinear(
     """
     low, (x, y, z) = _find_cell(place, factor)
     side, width = factor + 1, blocks.shape[1]
-    steps = (CELL @ np.array([side * side, side, 1])) * width
+    steps = (CORNERS @ np.array([side * side, side, 1])) * width
     first = ((low[0] * side + low[1]) * side + low[2]) * np.int64(width) + rows % width
     corner = blocks.ravel().take(first + steps[:, None])  # (8, n)
     along_z = corner[1::2] - corner[::2]
@@ -292,9 +292,10 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
         """Return the 8 nodes round foot points, (8, n), and their trilinear weights there."""
         low, within = _find_cell(feet.place[:, rows], cells)
         step = STRIDES * (2 // cells)
-        at = (step @ low + (CELL @ step)[:, None]) * voxels + feet.rows[rows]
+        at = (step @ low + (CORNERS @ step)[:, None]) * voxels + feet.rows[rows]
         upper = np.stack([1 - within, within])  # (2, 3, n)
-        shares: FloatArray = upper[CELL[:, 0], 0] * upper[CELL[:, 1], 1] * upper[CELL[:, 2], 2]
+        x, y, z = CORNERS.T
+        shares: FloatArray = upper[x, 0] * upper[y, 1] * upper[z, 2]
         return numbers.ravel().take(at).astype(np.intp), shares
 
     def mean(some: slice) -> FloatArray:
@@ -311,11 +312,12 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
             if cells_before:
                 at, shares = nodes_round(rows, cells_before)
                 left[rows] -= (means.take(at) * shares).sum(0)
-            at, shares = nodes_round(rows, cells)
-            weight = (shares * feet.weights[rows]).astype(np.float64)
+            if cells != cells_before:
+                at, shares = nodes_round(rows, cells)
+            place, weight = at.T.ravel(), (shares * feet.weights[rows]).T.astype(np.float64)
             for total in sums:
-                np.add.at(total, at.T.ravel(), weight.T.ravel())
-                weight *= left[rows]
+                np.add.at(total, place, weight.ravel())
+                weight *= left[rows, None]
         cells_before, means = cells, np.concatenate([left[:0], *map_chunks(mean, count, 8)])
         own = CORNER_PARTS if cells == 1 else slice(None)
         for rows in chunks_of(voxels, 4 * len(correction)):
@@ -330,6 +332,8 @@ def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
     ((cells + 1)^3, n) become ((finer + 1)^3, n). If the copies of shared nodes were equal before,
     they are equal, bit for bit.
     """
+    if cells == finer:
+        return values
     block = values.reshape(*(cells + 1,) * 3, -1)
     for axis in range(3):
         source = np.moveaxis(block, axis, 0)
