@@ -18,7 +18,7 @@ from scipy import ndimage
 from super_sdf.arrays import FloatArray
 from super_sdf.errors import GridError
 from super_sdf.grid.sdf_grid import make_grid
-from super_sdf.network.decoder import Decoder
+from super_sdf.network.contract import Decoder
 from super_sdf.options import AUTO, SMOOTH
 from super_sdf.pipeline import reconstruct
 

@@ -15,7 +15,7 @@ import numpy as np
 
 import super_sdf
 from super_sdf.errors import SuperSdfError
-from super_sdf.network.decoder import Decoder
+from super_sdf.network.contract import Decoder
 from super_sdf.network.network import (
     KIND_MODELS,
     find_model,

@@ -18,7 +18,7 @@ from scipy import ndimage
 from super_sdf.arrays import FloatArray
 from super_sdf.errors import NoSurfaceError, OptionError
 from super_sdf.grid.sdf_grid import SdfGrid
-from super_sdf.network.decoder import Decoder, adapt
+from super_sdf.network.contract import Decoder, adapt
 from super_sdf.options import AUTO, MARCHING, SHARP
 from super_sdf.pipeline import extract_mesh, reconstruct, refine_band
 from super_sdf.refine.band import neighbour_table, survey

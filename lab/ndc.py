@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from super_sdf.errors import OptionError
-from super_sdf.network.decoder import Decoder
+from super_sdf.network.contract import Decoder
 from super_sdf.surface.mesh import Mesh
 
 from .shapes import Case

@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from super_sdf import load_network, make_grid, reconstruct
 from super_sdf.errors import SuperSdfError
-from super_sdf.network.decoder import Decoder
+from super_sdf.network.contract import Decoder
 
 from . import parser_of
 from .kinds import without_unknown

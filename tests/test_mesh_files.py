@@ -12,7 +12,7 @@ from conftest import ball, refusal, trilinear
 
 from super_sdf import Mesh, reconstruct, write_mesh
 from super_sdf.convert import convert
-from super_sdf.errors import FileError, GridError, OptionError
+from super_sdf.errors import FileError, GridError, MeshError, OptionError
 from super_sdf.files import meshes, scenes
 from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
 from super_sdf.options import Options
@@ -129,6 +129,29 @@ def test_a_mesh_that_its_format_would_flatten_is_refused(mesh):
         said = refusal(FileError, write_mesh, bad, f"bad{suffix}")
         assert said.endswith("a vertex of the mesh is not finite")
     assert os.listdir() == ["out.glb"]
+
+
+NO_MESHES = {
+    "a face of the mesh names vertex 9 of 3: repair it": (np.eye(3), [[0, 1, 9]]),
+    "a face of the mesh names vertex -1 of 3: repair it": (np.eye(3), [[0, 1, -1]]),
+    "the faces of the mesh are float64 of shape (1, 3): give rows of three indices": (
+        np.eye(3),
+        [[0.0, 1, 2]],
+    ),
+    "the vertices of the mesh are float64 of shape (3, 2): give rows of three floats": (
+        np.eye(3)[:, :2],
+        [[0, 1, 2]],
+    ),
+}
+
+
+@pytest.mark.parametrize("said", NO_MESHES)
+def test_arrays_that_are_no_mesh_are_refused(said):
+    vertices, faces = NO_MESHES[said]
+    for suffix in MESH_SUFFIXES:
+        bad = Mesh(vertices, np.array(faces))
+        assert refusal(MeshError, write_mesh, bad, f"a{suffix}") == said
+    assert os.listdir() == []
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".3mf"])

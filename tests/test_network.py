@@ -14,7 +14,7 @@ from onnx_files import DOUBLE, FLOAT, metadata, write_network
 
 from super_sdf import load_network, reconstruct
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
-from super_sdf.network.decoder import decode
+from super_sdf.network.contract import decode
 from super_sdf.network.network import KIND_MODELS, shipped_models
 from super_sdf.options import QUALITIES
 from super_sdf.refine.band import find_band, gather_patches, neighbour_table, rescale

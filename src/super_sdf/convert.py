@@ -20,7 +20,7 @@ from .pipeline import mesh_grid
 from .threads import TOTAL, Progress, Stopwatch, part_of
 
 if TYPE_CHECKING:
-    from .network.decoder import Decoder
+    from .network.contract import Decoder
     from .options import Options
     from .simplify.simplify import Simplified
     from .surface.mesh import Mesh

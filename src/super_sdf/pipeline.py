@@ -23,7 +23,7 @@ from . import options
 from .arrays import CENTRE
 from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
-from .network.decoder import Adapter, Decoder, adapt
+from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
 from .options import MesherName, Options
 from .refine import nodes

@@ -75,8 +75,7 @@ def over_threads(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
 ) -> Iterator[Result]:
     """Yield ``work(piece)`` for each piece, in order, with up to ``threads`` threads."""
-    threads = min(threads, len(pieces))
-    if threads < 2:
+    if min(threads, len(pieces)) < 2:
         yield from map(work, pieces)
         return
     from concurrent.futures import ThreadPoolExecutor  # imported here, as small grids need none

@@ -140,8 +140,8 @@ def open_volume(
             warnings.simplefilter("ignore")
             logging.disable(logging.CRITICAL)  # what matters is raised
             readers = import_module(f".readers.{format_.module}", __package__)
-            asked = (file, member or None, numbers, order, files, left, describes, bool(axes))
-            request = Request(*asked)
+            about = member or None, numbers, order, files, left, describes, bool(axes)
+            request = Request(file, *about)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
         if str(file) in error.flagged:

@@ -122,8 +122,8 @@ def write_mesh(
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     check_target(path, force=force, unit=world.unit)
 
-    tell = before_rename and (lambda complete: before_rename(complete[path]))
-    write_meshes({path: {"": mesh}}, force=force, world=world, before_rename=tell)
+    then: Any = before_rename and (lambda complete: before_rename(complete[path]))
+    write_meshes({path: {"": mesh}}, force=force, world=world, before_rename=then)
 
 
 def write_meshes(

@@ -22,7 +22,7 @@ from ..options import AUTO, MesherName, Options, Quality, Values
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-    from ..network.decoder import Decoder
+    from ..network.contract import Decoder
     from ..threads import Progress
 
 if not hasattr(pyvista, "register_dataset_accessor"):

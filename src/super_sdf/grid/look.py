@@ -378,7 +378,7 @@ def which_label(samples: SampleArray) -> str:
     best = distinct[at[counts[at].argmax()]] if len(at) else distinct[0]
     return (
         f"they look like labels ({named(distinct.tolist())}): choose one with "
-        f"--label {int(np.rint(best))}, or mesh all with --labels all"
+        f"--label {round(best.item())}, or mesh all with --labels all"
     )
 
 

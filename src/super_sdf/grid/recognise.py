@@ -74,14 +74,18 @@ THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin
 # 6. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
 # samples of all.
 NOISE = 0.05  # uniform noise of .05 to .5 voxel and Gaussian to .033; logits .087, networks .096
+NOISES = 2.5  # times its deviation, by which noise may make two samples differ
 SPREAD = 0.34  # of fourth differences, lowest quarter over median: noise from .39, fused to .29
 SMOOTH_SHARE = 0.06  # noise of .05 voxel to .03; fields of other slopes from .10
 # 7. Densities: range over the smallest step; median of the sizes over the largest, with more
-# surface at 0 than at the level that parts them best; valleys per sample of a face.
+# surface at 0 than at the level that parts them best; valleys per sample of a face. Distances may
+# be rounded, to this part of the spacing.
+ROUNDED = 1.0
 IMAGE = 1 << 17  # 16 bits have 65,535, floats 1e6 and more
 ALIKE = 0.05  # by which ends differ between which distances were cut off: .004, images .2 to 1
 CENTRED = 0.13  # maps of density and statistics to .11, fields from .15
 AREA = 1.0  # fields to 1.11 and d^3 1.02 with centres from .15, maps from 1.14
+RISING = 0.1  # of steps between neighbours, median over steepest: images to .03, distances from .3
 VALLEY = 0.2, 1.5  # unsigned distances .3 to .6; densities .05, noise 3
 ENOUGH = 20  # samples from which a share is evidence
 
@@ -383,7 +387,7 @@ def _contradictions(look: Look, steps: Floats, digit: float, noise: float = 0.0)
     h = float(steps.max())
     boxes = look.boxes.reshape(len(look.boxes), -1) / h
     apart = np.sqrt(((LENGTHS * steps / h) ** 2).sum(1))
-    allowed = max(EXACT, min(digit / h, MOST_DIGIT), 2.5 * noise)
+    allowed = max(EXACT, min(digit / h, MOST_DIGIT), NOISES * noise)
     beyond = np.abs(boxes - boxes[:, 62:63]) > apart + allowed
     beyond &= np.abs(boxes) < MATTERS
     return float((np.count_nonzero(beyond, axis=1) >= 2).mean())
@@ -476,7 +480,14 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
     values = np.unique(np.concatenate([look.all_pairs.ravel(), look.boxes[:, 2, 2, 2]]))
     values = values[np.isfinite(values)]
     is_tsdf = facts["cut"] and abs(look.low + look.high) < ALIKE * look.high
-    if not is_tsdf and np.ptp(values) < IMAGE * np.diff(values).min():
+    digit = float(np.diff(values).min())
+    has_few_digits = np.ptp(values) < IMAGE * digit
+    steps = _before_rounding(look, digit, given) if has_few_digits else None
+    if steps is not None:
+        facts["noise"] = digit / float(steps.max()) / 12**0.5  # standard deviation
+        why = f"distances rounded to {digit * look.scale:.3g}"
+        return Answer("noisy", why, facts | {"spacing": steps * look.scale})
+    if not is_tsdf and has_few_digits:
         why = "values of few digits with no slope of distances"
         return Answer("density", why, facts, which_level(look, signed=True))
     if given is not None and _is_noise(look, given / look.scale, facts):
@@ -492,6 +503,21 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
             why = "most values are near 0"
             return Answer("density", why, facts, which_level(look, signed=True))
     return Answer("smooth", "the slope is not that of a distance everywhere", facts)
+
+
+def _before_rounding(look: Look, digit: float, given: Floats | None) -> Floats | None:
+    """Return the steps of distances that were rounded to a digit; None if these are none."""
+    steps = (np.ones(3) if given is None else given) / look.scale
+    slope = typical_slope(look, steps * look.scale)
+    if given is None:
+        steps = steps * slope * look.scale
+    elif not abs(slope - 1) < SLOPE_OFF:
+        return None
+    if not digit <= ROUNDED * steps.max():
+        return None
+    # both of two values may be half a digit off
+    off = _contradictions(look, steps, 0.0, noise=1.01 * digit / steps.max() / NOISES)
+    return steps if off <= CONTRADICTIONS else None
 
 
 def _is_noise(look: Look, steps: Floats, facts: dict[str, Any]) -> bool:
@@ -521,7 +547,10 @@ def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
     share = sum(slab.planes[slab.own].size for slab in look.slabs) / np.prod(look.shape)
     nearest = look.low if sign > 0 else look.high
     found /= share * float(np.prod(look.shape)) ** (2 / 3)
-    if nearest not in facts["cut"] and VALLEY[0] < found < VALLEY[1]:
+    # steps between plateaus, with noise on them, make valleys, too
+    facts["rising"] = float(np.median(np.abs(pairs[0] - pairs[1]))) * look.scale / steep
+    is_unsigned = nearest not in facts["cut"] and facts["rising"] > RISING
+    if is_unsigned and VALLEY[0] < found < VALLEY[1]:
         inside = "negative" if sign > 0 else "positive"
         said = (
             "unsigned distances have no inside: mesh the shell round the surface with "

@@ -25,7 +25,7 @@ from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, wr
 from ..files.output import check_apart
 from ..files.readers import PLACE
 from ..grid.sdf_grid import SdfGrid, describe_place, mean_spacing
-from ..network.decoder import Decoder
+from ..network.contract import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..surface.mesh import Mesh
 from ..threads import Progress, Stopwatch

@@ -24,7 +24,7 @@ from ..grid.interpret import as_sample, labelled, mask_field
 from ..grid.look import named
 from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
-from ..network.decoder import Adapter, Decoder, adapt
+from ..network.contract import Adapter, Decoder, adapt
 from ..network.network import load_network, network_for
 from ..pipeline import refine_band
 from ..refine.band import survey

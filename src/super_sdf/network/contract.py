@@ -5,17 +5,23 @@ output is ``values`` (D, Q). Distances and offsets are in half voxels. The metad
 holds the receptive field, the training factors, data and accuracy. Its entry ``inputs`` is what the
 network was trained on: ``EXACT_DISTANCES``, hardly any of them noisy; or ``MASKS``; without the
 entry, distances of which some were noisy.
+
+Any function with these inputs and output can stand in for a network: see ``Decoder``.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..arrays import FloatArray, IntArray
 from ..errors import ModelError, seen
+from ..threads import map_chunks
 
 FORMAT_VERSION = 1
 EXACT_DISTANCES, MASKS = "exact distances", "masks"
@@ -35,6 +41,11 @@ TRIAL: dict[str, Any] = {  # one voxel, and two offsets to notice an output with
     "voxels": np.zeros(1, np.int32),
     "offsets": np.zeros((2, 3), np.float32),
 }
+MAX_VALUE = np.float32(1e15)  # half voxels; sums of squares are still finite in single precision
+Decoder = Callable[[FloatArray, IntArray, IntArray, FloatArray], FloatArray]
+"""A network, or any function, that returns values (D, Q) of patches (V, 27), neighbour table
+(V, 27), voxels (D,) and offsets (Q, 3). It may have the attributes of ``Adapter``.
+"""
 
 
 def read_card(session: Any, path: Path) -> dict[str, Any]:
@@ -66,3 +77,66 @@ def read_card(session: Any, path: Path) -> dict[str, Any]:
             must = f"it must be a whole number of {unit} from 1 to {most}"
             raise ModelError(f"{path}: its {key} is {seen(value)}; {must}: {again}")
     return card
+
+
+@dataclass(frozen=True, eq=False)
+class Adapter:
+    """A network, or any function, with all that the pipeline asks of it."""
+
+    run: Callable[..., FloatArray]
+    receptive_field: int | None = None  # voxels to each side; None: it must see the whole band
+    memory_bytes: tuple[float, float] = (680.0, 8.0)  # per voxel that it sees, and per value
+    threads: int = 0  # of the CPU, also for the other steps; 0 for one per core
+
+    def __call__(self, *inputs: Any) -> FloatArray:
+        """Return what the network does."""
+        return self.run(*inputs)
+
+
+def adapt(network: Decoder) -> Adapter:
+    """Return a network with the attributes that it has, and defaults for the others."""
+    if isinstance(network, Adapter):
+        return network
+    names = "receptive_field", "memory_bytes", "threads"
+    return Adapter(network, **{n: getattr(network, n) for n in names if hasattr(network, n)})
+
+
+def decode(
+    network: Decoder,
+    inputs: tuple[FloatArray, IntArray, IntArray],
+    offsets: FloatArray,
+    threads: int = 1,
+) -> FloatArray:
+    """Run a network once, and return its values as blocks, (Q, D + 1) float32.
+
+    ``inputs`` are patches (V, 27), neighbour table (V, 27) and voxels (D,); ``offsets``, (Q, 3),
+    are in half voxels, and so are the values: a row per offset, a column per voxel, and a last
+    column of zeros, see ``refine.nodes``. ModelError if they have another shape or type, or are not
+    finite: later steps do not check.
+    """
+    count, width = len(inputs[2]), len(offsets)
+    values: Any = network(*inputs, offsets)
+    kind = getattr(values, "dtype", np.dtype(object)).kind
+    if kind != "f" or values.shape != (count, width):
+        raise ModelError(
+            f"the network gave {getattr(values, 'dtype', type(values).__name__)} of shape "
+            f"{np.shape(values)} instead of float32 of shape {(count, width)}, (voxels, offsets)"
+        )
+    blocks = np.empty((width, count + 1), np.float32)
+    blocks[:, count] = 0
+
+    def transpose_and_check(rows: slice) -> int:
+        with np.errstate(over="ignore"):  # values that are too large are counted
+            some = values[rows].astype(np.float32, copy=False)
+        blocks[:, rows] = some.T
+        if some.min() >= -MAX_VALUE and some.max() <= MAX_VALUE:  # both are False for NaN
+            return 0
+        return int(np.count_nonzero(~(np.abs(some) <= MAX_VALUE)))
+
+    bad = sum(map_chunks(transpose_and_check, count, 4 * width, threads))
+    if bad:
+        raise ModelError(
+            f"{bad:,} of the {values.size:,} values that the network gave are NaN, infinite or "
+            "beyond 1e15: it cannot be used for this grid; use another --model"
+        )
+    return blocks

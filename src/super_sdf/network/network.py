@@ -19,8 +19,7 @@ from ..arrays import NEIGHBOURHOOD, STRIDES, FloatArray, IntArray
 from ..errors import DeviceError, FileError, ModelError, OptionError
 from ..options import AUTO, FLOAT32, INT8, OPTIONS, QUALITIES
 from ..threads import cores_of_system, useful_threads
-from .contract import EXACT_DISTANCES, INPUTS, MASKS, TRIAL, read_card
-from .decoder import Decoder
+from .contract import EXACT_DISTANCES, INPUTS, MASKS, TRIAL, Decoder, read_card
 from .onnx import has_driver, open_session, run
 
 MODELS = Path(__file__).parent.parent / "models"
@@ -77,8 +76,8 @@ class Network:
     ) -> FloatArray:
         """Return the values (D, Q) of voxels at query offsets: signed distances in half voxels.
 
-        Inputs are those of a ``decoder.Decoder``. DeviceError if onnxruntime fails, for example for
-        lack of memory on a GPU.
+        Inputs are those of a ``Decoder``. DeviceError if onnxruntime fails, for example for lack of
+        memory on a GPU.
 
         A turned distance field is the distance field of the turned surface, but a network
         reproduces this only approximately. The mean of its values for several turned fields, each

@@ -32,7 +32,6 @@ PATCH_LIMIT = 6.0
 DECODE_LIMIT = 3**0.5 + 0.5
 # Two distances differ by no more than their samples are apart (Lipschitz); slack for rounding.
 LIPSCHITZ_SLACK = 0.1
-JUMP = 0.2  # by which values differ more than noise makes distances differ
 MAX_DISTANCE = 2.8  # of exact samples: those near the band's edge, 3, may have been truncated there
 MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
 MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
@@ -207,8 +206,6 @@ def _found(
         if len(ijk):
             start, stop = np.maximum(ijk.min(0) - 1, 0), ijk.max(0) + 2  # the rest is far away
             patches = gather_patches(rescaled[tuple(map(slice, start, stop))], ijk - start)
-            if not is_spline and (filled := is_filled_in(patches)).any():
-                ijk, patches = ijk[~filled], patches[~filled]
         voxel_ijk, centre = ijk + np.array([low, 0, 0], np.int32), patches[:, CENTRE]
         if is_checked and offset:
             _check_offset(grid, offset, patches)
@@ -406,22 +403,6 @@ def has_both_sides(patches: FloatArray) -> BoolArray:
     """Return in which patches (V, 27) samples lie on both sides of 0, (V,)."""
     outside = patches > 0
     return np.asarray(outside.any(1) & ~outside.all(1))
-
-
-def is_filled_in(patches: FloatArray) -> BoolArray:
-    """Return which samples were filled in, as by padding with a constant, (V,) bool.
-
-    They are small, so that the surface should be near, but the field falls to none of the samples
-    around, and rises to one by more than distances and noise do.
-    """
-    found = np.zeros(len(patches), bool)
-    for rows in chunks_of(len(patches), 27):
-        size = np.abs(patches[rows])
-        size -= size[:, CENTRE, None].copy()
-        at = np.flatnonzero((size > MAX_DIFFERENCE + JUMP).any(1))
-        some = (size[at] > -JUMP / 2).all(1) & ~has_both_sides(patches[rows][at])
-        found[rows.start + at] = some
-    return found
 
 
 def exact_samples(

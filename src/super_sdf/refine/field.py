@@ -212,24 +212,23 @@ class FineLattice(SamplePlanes):
     def read(self, first: int, last: int) -> FloatArray:
         """Return planes ``first`` to before ``last`` of nodes, (last - first, ny, nz) float32."""
         field, factor, grid = self.field, self.field.factor, self.field.placed
-        planes = np.empty((last - first, *self.shape[1:]), np.float32)
         if first == last:
-            return planes
-        low, share, voxel = _places_of_nodes(np.arange(first, last), factor, grid.shape[0])
-        across = [_places_of_nodes(np.arange(self.shape[n]), factor, grid.shape[n]) for n in (1, 2)]
-        start = int(low[0])
-        samples = rescale(grid, field.offset, start, int(low[-1]) + 2)
-        for plane, before, beyond, nearest in zip(planes, low - start, share, voxel - start):
-            values = samples[before] * (1 - beyond) + samples[before + 1] * beyond
-            outside = samples[nearest] > 0
-            for axis, (lower, upper, inner) in enumerate(across):
-                part = upper[:, None] if axis == 0 else upper
-                refined = values.take(lower, axis) * (1 - part)
-                refined += values.take(lower + 1, axis) * part
-                values, outside = refined, outside.take(inner, axis)
-            plane[...] = values
-            np.maximum(plane, BARELY_OUTSIDE, out=plane, where=outside)
-            np.minimum(plane, BARELY_INSIDE, out=plane, where=~outside)
+            return np.empty((0, *self.shape[1:]), np.float32)
+        start = max((first - 1) // factor - 1, 0)  # coarse planes on which those of nodes depend
+        planes = rescale(grid, field.offset, start, min((last - 1) // factor + 2, grid.shape[0]))
+        outside = planes > 0
+        for axis, count in enumerate(grid.shape):
+            node = np.arange(first, last) if axis == 0 else np.arange(self.shape[axis])
+            place, shift = node / factor - 0.5, start if axis == 0 else 0
+            # the sample before each node and how far beyond it, 0 to 1 spacing, or -1/2 to 3/2 in
+            # the half voxels beyond the outermost samples; a node on a face is in the second voxel
+            low = np.clip(np.floor(place), 0, count - 2).astype(np.int64)
+            share = (place - low).astype(np.float32).reshape(-1, *(1,) * (2 - axis))
+            below = planes.take(low - shift, axis) * (1 - share)
+            planes = below + planes.take(low - shift + 1, axis) * share
+            outside = outside.take(np.minimum(node // factor, count - 1) - shift, axis)
+        np.maximum(planes, BARELY_OUTSIDE, out=planes, where=outside)
+        np.minimum(planes, BARELY_INSIDE, out=planes, where=~outside)
 
         ends = (first - 1) // factor, (last - 1) // factor + 1  # of the voxels with nodes there
         rows = slice(*np.searchsorted(field.voxel_ijk[:, 0], ends).tolist())
@@ -244,19 +243,6 @@ class FineLattice(SamplePlanes):
             flat[corner + face[:, None]] = values[:, here]
         scale = grid.voxel_size / 2
         return np.multiply(planes, scale, out=planes, dtype=np.float64, casting="same_kind")
-
-
-def _places_of_nodes(
-    node: NDArray[np.int64], factor: int, samples: int
-) -> tuple[NDArray[np.int64], FloatArray, NDArray[np.int64]]:
-    """Return for nodes of an axis the sample before each, how far beyond it, and its voxel.
-
-    That is 0 to 1 spacing, or -1/2 to 3/2 in the half voxels beyond the outermost samples. A node
-    on a face lies in the second voxel.
-    """
-    place = node / factor - 0.5
-    low = np.clip(np.floor(place), 0, samples - 2).astype(np.int64)
-    return low, (place - low).astype(np.float32), np.minimum(node // factor, samples - 1)
 
 
 def lattice_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, int]:

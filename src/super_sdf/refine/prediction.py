@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
 from ..grid.samples import cropped, in_spacings
-from ..network.decoder import Adapter, decode
+from ..network.contract import Adapter, decode
 from ..threads import chunks_of
 from .band import Band
 from .nodes import block_offsets

@@ -54,9 +54,8 @@ def measured(name: str, places: Any, about: dict[str, Any]) -> Axis:
         said.decode() if isinstance(said, bytes) else str(said)
         for said in (about.get(key, "") for key in ("units", "axis", "positive"))
     )
-    is_down = positive.lower() == "down"
-    sign = -1 if is_down else 1
-    return Axis(name, unit, sign * step, sign * start, alias, is_down)
+    sign = -1 if positive.lower() == "down" else 1
+    return Axis(name, unit, sign * step, sign * start, alias, sign < 0)
 
 
 def placed(
@@ -116,10 +115,8 @@ def placed(
     if beside is not None and spacing is None:
         unread = {n: each for n, each in {**beside, **attributes}.items() if SIZES.search(n)}
         listed = ", ".join(f"{n} {seen(_plain(x))}" for n, x in unread.items() if n not in STATED)
-        said = (
-            f"it states {listed}, which is not read: give --spacing and --origin if that is meant"
-        )
-        told += (said,) * bool(listed)
+        note = f"it states {listed}, which is not read (give --spacing and --origin)"
+        told += (note,) * bool(listed)
     return {
         "spacing": spacing,
         "origin": _stated(attributes, "origin", starts),

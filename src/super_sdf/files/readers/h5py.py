@@ -46,8 +46,7 @@ def read_hdf5(request: Request) -> Volume:
         }
         return _volume_of(image["VoxelData"], place)
     values = file[request.choose_array(shapes, "3D dataset")]
-    beside = dict(file[IMARIS].attrs) if IMARIS in file else {}
-    about = dict(values.attrs)
+    about, beside = dict(values.attrs), dict(file[IMARIS].attrs) if IMARIS in file else {}
     return _volume_of(values, placed(request, _axes(values), about, values.shape, beside=beside))
 
 

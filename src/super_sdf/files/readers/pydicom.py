@@ -41,14 +41,6 @@ class _Slice(NamedTuple):
     scale: tuple[float, float]
     segment: int
 
-    def read(self) -> NDArray[Any]:
-        from pydicom.pixels.utils import pixel_array
-
-        try:
-            return np.asarray(pixel_array(self.path, index=self.frame))
-        except Exception as error:
-            raise FileError(f"{self.path} is damaged: {str(error).splitlines()[0]}") from error
-
 
 def read_dicom(request: Request) -> Volume:
     """Read ``FOLDER``, a file of several frames, or ``FOLDER:NAME``.
@@ -104,6 +96,16 @@ def _images_in(path: Path) -> tuple[dict[str, list[Image]], tuple[str, ...]]:
     return series, (f"folders in it are not read: {listed}",) * bool(inner)
 
 
+def _pixels(path: Path, frame: int | None = None) -> NDArray[Any]:
+    """Return the values of a frame, or of all: FileError names a damaged file."""
+    from pydicom.pixels.utils import pixel_array
+
+    try:
+        return np.asarray(pixel_array(path, index=frame))
+    except Exception as error:
+        raise FileError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
+
+
 def _of_slices(slices: list[_Slice], notes: tuple[str, ...]) -> Volume:
     """Return slices of one size, spacing and direction, which lie in even steps, as a volume."""
     first = slices[0]
@@ -128,12 +130,17 @@ def _of_slices(slices: list[_Slice], notes: tuple[str, ...]) -> Volume:
         )
     scales = np.array([each.scale for each in slices])
     is_plain, is_whole = (scales == (1, 0)).all(), (scales == np.rint(scales)).all()
-    dtype = slices[0].read().dtype if is_plain else np.dtype(np.int32 if is_whole else np.float32)
+    dtype = (
+        _pixels(first.path, first.frame).dtype
+        if is_plain
+        else np.dtype(np.int32 if is_whole else np.float32)
+    )
 
     def load(index: Index) -> NDArray[Any]:
         planes = np.empty((len(slices), *first.shape), dtype)
         for plane, each in zip(planes, slices):
-            plane[:] = each.read() if is_plain else each.read() * each.scale[0] + each.scale[1]
+            values = _pixels(each.path, each.frame)
+            plane[:] = values if is_plain else values * each.scale[0] + each.scale[1]
         return planes.T
 
     direction = np.column_stack([*first.across, shift / step])
@@ -171,14 +178,15 @@ def _of_segments(
 
     def load(index: Index) -> NDArray[Any]:
         planes = np.zeros(shape, kind)
-        for number, each in zip(numbers + BEYOND, frames):
+        pixels = _pixels(path).reshape(-1, *first.shape)  # frames need not be whole bytes
+        for number, each, values in zip(numbers + BEYOND, frames, pixels):
             plane = planes[number]
             if is_map:
-                plane[:] = np.isin(each.read(), chosen) if chosen else each.read()
+                plane[:] = np.isin(values, chosen) if chosen else values
             elif is_fraction and each.segment in chosen:
-                plane[:] = each.read() / most
+                plane[:] = values / most
             elif not chosen or each.segment in chosen:
-                inside = each.read() > (most or 1) / 2
+                inside = values > (most or 1) / 2
                 if plane[inside].any():
                     label = labels[each.segment]
                     raise GridError(f"its segments overlap: give one of them, {path}:{label}")

@@ -56,11 +56,11 @@ def read_vtk(request: Request) -> Volume:
         if len(text[start.start() if start else 0 :].split()) < promised:
             raise FileError(f"it is truncated: fewer values follow than the {promised:,} promised")
     # what has several numbers a sample, and VTK's own marks, is read only if it is named
-    plain = [
-        name
-        for name, (array, _) in arrays.items()
-        if name == request.member or (array.GetNumberOfComponents() == 1 and name not in MARKS)
-    ]
+    plain = []
+    for name, (array, _) in arrays.items():
+        is_mark = name.removeprefix("CellData/") in MARKS
+        if name == request.member or (array.GetNumberOfComponents() == 1 and not is_mark):
+            plain.append(name)
     name = request.choose(plain or list(arrays), "array of points or cells")
     return _volume_of(image, *arrays[name], f"its array {name!r}")
 

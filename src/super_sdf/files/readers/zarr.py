@@ -90,7 +90,7 @@ def _nodes_of(request: Request) -> dict[str, Document]:
 
 def _images(nodes: dict[str, Document], path: str) -> list[Document]:
     """Return the images that the metadata of a group describes, as OME-NGFF has it."""
-    attributes = nodes.get(path, {}).get("attributes") or {}
+    attributes: Document = nodes.get(path, {}).get("attributes") or {}
     images: list[Document] = attributes.get("ome", attributes).get("multiscales") or []
     return images
 
