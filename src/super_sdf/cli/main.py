@@ -109,9 +109,8 @@ def table_option(name: str, text: str = "") -> Decorator:
     more: dict[str, Any] = {"help": text or row.help, "group": row.group, "default": row.default}
     if isinstance(row.default, bool):
         return option(f"{word}/--{row.off}" if row.off else word, is_flag=True, **more)
-    more |= {"show_default": row.default is not None, "metavar": row.metavar}
-    if row.kind.choices:
-        return option(word, type=click.Choice(row.kind.choices), **more)
+    choices = f"[{'|'.join(row.kind.choices)}]" if row.kind.choices else None
+    more |= {"show_default": row.default is not None, "metavar": row.metavar or choices}
 
     def parse(context: click.Context, param: click.Parameter, value: Any) -> Any:
         return row.parse(value) if isinstance(value, str) else value
