@@ -35,7 +35,7 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together: they may shrink only; the design's figure beside
-    TOP: 1575,  # 1,250
+    TOP: 1574,  # 1,250
     "grid": 3650,  # 1,800, once what a grid is is decided on one page
     "network": 540,  # 500: CUDA's missing library is named
     "refine": 1635,  # 1,300
@@ -47,7 +47,7 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     "simplify check truth": 1240,  # 1,100
     "batch": 938,  # 900
     "pages": 414,  # 400
-    "cli": 1056,  # 800
+    "cli": 1055,  # 800
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 96, 48, 110  # 95, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 18_000, 38_300  # 17,800 and 36,000

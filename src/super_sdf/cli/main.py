@@ -30,6 +30,7 @@ PIPE_CLOSED = 141  # exit code of programs whose reader has ended: 128 and SIGPI
 OUTPUT = "Output"
 FILE = click.Path(path_type=Path)
 
+Paths = Iterable[str | Path]
 Decorator = Callable[[Any], Any]
 """Adds options to a command."""
 
@@ -122,7 +123,7 @@ def table_option(name: str, text: str = "") -> Decorator:
 SHARED = {
     "names": option("--names", type=FILE, metavar="TABLE", group=VALUES,
         help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP "
-        "or FreeSurfer, CSV, or JSON such as nnU-Net's. --labels takes names then."),
+        "or FreeSurfer, CSV, or JSON such as nnU-Net's. --label and --labels take names then."),
     "cluster": option("--cluster", metavar="ADDRESS", group=WORK,
         help="Convert on the workers of the Dask scheduler at ADDRESS, each within --max-memory, "
         "or with 'local' on Dask workers of this machine. Needs the extra cluster."),
@@ -144,6 +145,11 @@ SHARED = {
 
 def chosen_options(given: dict[str, Any]) -> Options:
     """Return the options of a conversion, from all options of a command that may go with them."""
+    if given.get("names") and isinstance(given["label"], str):
+        from ..labels.files import read_names
+
+        numbers = {entry.name: number for number, entry in read_names(given["names"]).items()}
+        given = {**given, "label": numbers.get(given["label"], given["label"])}
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
         check_modules(flag(name), "simplify")
@@ -161,19 +167,12 @@ def chosen_options(given: dict[str, Any]) -> Options:
 
 
 def check_names(given: dict[str, Any], labels: Any) -> None:
-    """Raise OptionError if there are names, and no labels are meshed."""
-    if given["names"] and not labels:
+    """Raise OptionError if there are names, and no labels are meshed, nor one by its name."""
+    if given["names"] and not labels and not isinstance(given["label"], str):
         raise OptionError(f"--names {given['names']} is for --labels: give that, too")
 
 
-def check_page(
-    word: str,
-    page: Path,
-    sources: Iterable[str | Path],
-    others: Iterable[str | Path] = (),
-    *,
-    force: bool,
-) -> None:
+def check_page(word: str, page: Path, sources: Paths, others: Paths, *, force: bool) -> None:
     """Raise if a page cannot be written, is a file that a source is read from, or an output."""
     from ..files.formats import files_of
     from ..files.output import check_apart, check_free
