@@ -438,7 +438,7 @@ class Outcome:
 
 NUMBER = r"-?[\d.]+(?:e[+-]?\d+)?"
 OPTION = re.compile(
-    rf"--(?:(field|inside) (\w+)|(level|scale|offset) ({NUMBER})|(label) (-?\d+)"
+    rf"--(?:(field|inside) (\w+)|(level|scale|offset|unknown) ({NUMBER})|(label) (-?\d+)"
     rf"|(spacing) ({NUMBER}(?:,{NUMBER})*|X,Y,Z))"
 )
 
@@ -454,7 +454,7 @@ def advised(message: str) -> dict[str, Any]:
     for name, word in found.items():
         if name == "spacing" and "X" not in word:
             found[name] = [*map(float, word.split(","))]
-        elif name in ("label", "level", "scale", "offset"):
+        elif name in ("label", "level", "scale", "offset", "unknown"):
             found[name] = int(word) if name == "label" else float(word)
     return found
 
@@ -470,7 +470,7 @@ def call(sample: Kind, options: dict[str, Any], network: Decoder) -> Outcome:
         grid = make_grid(sample.values, **told)
         mesh = reconstruct(grid, network, FACTOR, offset=offset)
     except SuperSdfError as problem:
-        return Outcome(named, "refused", str(problem))
+        return Outcome(named, "refused", problem.flagged)
     values, form = level_set(sample, options)
     scale = steps / np.array(grid.spacing)  # an estimate is off by some per cent
     if np.abs(scale * sample.unit - 1).max() > ESTIMATE and told["spacing"] is not None:

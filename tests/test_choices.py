@@ -205,6 +205,9 @@ def test_batches_name_the_meshes_of_chosen_arrays(command):
     words = ("--out", "out", "--quality", "fast", "--field", "smooth", "--spacing", "1", "-q")
     code, _, err = command("batch", "a.npz:probabilities[1]", "a.tif[0]", *words)
     assert code == 0, err
+    Path("scans").mkdir()
+    Path("scans/slice.dcm").write_bytes(b"one of many")
+    assert "scans holds no grid (" in command("batch", "scans", *words)[2]
     assert {path.name for path in Path("out").glob("*.ply")} == {"a-probabilities-1.ply", "a-0.ply"}
 
 

@@ -4,11 +4,14 @@ import re
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import refusal, trilinear
 from scipy import ndimage
 
 from super_sdf import SdfGrid, make_grid, reconstruct
 from super_sdf.errors import GridError, OptionError
+from super_sdf.grid import look, samples
+from super_sdf.grid.sdf_grid import crop
 from super_sdf.options import FIELDS
 
 PLACE = {"spacing": 1.0, "origin": 0.0}
@@ -126,7 +129,7 @@ def test_another_unit_than_that_of_the_spacing_is_an_error(unit):
     assert scale * unit == pytest.approx(1, rel=0.005)
     told = make_grid(values, **PLACE, scale=scale)
     assert told.notes == () and np.allclose(told.values, box(), rtol=5e-3)
-    shown = float(re.search(r"spacing=(\S+),", said).group(1))
+    shown = float(re.search(r"they show (\S+)\)", said).group(1))
     assert shown == pytest.approx(unit, rel=0.005)
     if unit < 0.1:
         return
@@ -184,6 +187,8 @@ LABELS = {
     "nearly whole": ORGANS * 0.9999999998,
     "resampled": ORGANS * 0.988,
     "with gaps": np.array([0, 7, 100, 117])[ORGANS],
+    "one in the other": sum(mask.astype(np.uint8) for mask in (box() < 0, box() < -2.5, box() < 2)),
+    "of 64 bits": np.array([0, 2**60 + 1, 2**60 + 2, 2**60 + 3], np.uint64)[ORGANS],
     "small": lesions(),
     "of few slices": stack(),
 }
@@ -195,6 +200,62 @@ def test_labels_without_a_choice_are_refused(name, spacing):
     said = refusal(GridError, make_grid, LABELS[name], spacing=spacing, origin=0)
     assert said.startswith("no solid is chosen: they look like labels (0, ")
     assert re.search(r"choose one with label=\d+, or mesh all with labels='all'$", said)
+
+
+def test_the_named_label_is_one_of_64_bits():
+    assert f"label={2**60 + 1}," in refusal(GridError, make_grid, LABELS["of 64 bits"])
+
+
+def pieces(mesh) -> list:
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).split(only_watertight=False)
+
+
+@pytest.mark.parametrize("shift", [0, 0.4, 0.5])
+def test_touching_solids_are_one_piece(shift):
+    at = np.moveaxis(np.indices((33, 27, 27)), 0, -1) - np.array([16 + shift, 13, 13])
+    both = [np.abs(at - np.array([side * 5.6, 0, 0])) - 5.6 for side in (-1, 1)]
+    cubes = [np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) for q in both]
+    mesh = reconstruct(make_grid(np.minimum(*cubes), **PLACE), trilinear)
+    assert mesh.is_closed() and len(pieces(mesh)) == 1
+    assert mesh.volume() == pytest.approx(2 * 11.2**3, rel=0.02)
+
+
+def test_no_piece_of_a_spline_is_where_no_sample_is_inside():
+    ijk = np.stack(np.indices((32,) * 3), -1)
+    noise = ndimage.gaussian_filter(np.random.default_rng(3).normal(size=(32,) * 3), 1.2)
+    values = np.exp(-((ijk - 16) ** 2).sum(-1) / 32) + 0.1 * noise / noise.std()
+    mesh = reconstruct(make_grid(values, **PLACE, level=0.5), trilinear)
+    inside = np.argwhere(values > 0.5)
+    for piece in pieces(mesh):
+        assert ((inside > piece.bounds[0]) & (inside < piece.bounds[1])).all(1).any()
+
+
+class Stored(samples.SamplePlanes):
+    """An array that is read by planes."""
+
+    def __init__(self, values):
+        self.values, self.shape, self.dtype = values, values.shape, values.dtype
+
+    def read(self, first, last):
+        return self.values[first:last].copy()
+
+
+PARTS = ("a box", "cut off at 1", "noise", "a smooth union", "truth", "transform: both sides")
+
+
+@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("whole", [0, 1 << 30])
+def test_planes_and_parts_are_taken_as_the_whole_array_is(name, whole, monkeypatch):
+    monkeypatch.setattr(look, "WHOLE", whole)
+    monkeypatch.setattr(samples, "WORKING_BYTES", 1)
+    values, kind = KINDS[name]
+    want, grid = (make_grid(array, **PLACE) for array in (values, Stored(values)))
+    assert grid.field.kind == kind and grid.notes == want.notes
+    assert grid.field.report() == want.field.report()
+    np.testing.assert_array_equal(grid.values, want.values)
+    part = crop(grid, (3, 9, 14), (21, 24, 32))
+    np.testing.assert_array_equal(part.values, want.values[3:21, 9:24, 14:32])
+    assert part.origin == (3, 9, 14) and (part.low, part.high) == (want.low, want.high)
 
 
 LARGEST = 2**64 - 1

@@ -38,8 +38,8 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     TOP: 1574,  # 1,250
     "grid": 3650,  # 1,800, once what a grid is is decided on one page
     "network": 540,  # 500: CUDA's missing library is named
-    "refine": 1635,  # 1,300
-    "surface": 2200,
+    "refine": 1625,  # 1,300
+    "surface": 2192,
     "tiles": 300,
     "files": 3650,  # 2,700: .vdb in and out and the text of meshes are own code, 700 lines
     "functions": 600,

@@ -96,7 +96,7 @@ def _expand(argument: str, suffix: str, options: Options) -> list[Job]:
         for at, folders, files in os.walk(path, onerror=unread.append):
             stores = [name for name in folders if is_store(Path(at, name))]
             folders[:] = [name for name in folders if name not in stores]
-            paths += [Path(at, name) for name in (*stores, *files)]
+            paths += [Path(at, n) for n in (*stores, *files) if not n.lower().endswith(".dcm")]
     elif is_grid(path) and os.path.lexists(split_member(path)[0]):
         root, paths = split_member(path)[0].parent, [path]
     elif glob.has_magic(argument):
@@ -112,7 +112,7 @@ def _expand(argument: str, suffix: str, options: Options) -> list[Job]:
             give = "give grids, folders, patterns or a list"
             said = f"{argument or repr(argument)} does not exist: {give}"
         raise OptionError(said)
-    # Anything with a grid's suffix counts. If it is no regular file, its job fails and names it.
+    # Anything with a grid's suffix counts, but slices. What is no regular file fails and is named.
     grids = sorted({p for p in paths if is_grid(p) and (is_store(p) or not p.is_dir())})
     if not grids:
         if unread:

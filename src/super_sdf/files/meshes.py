@@ -122,7 +122,7 @@ def write_mesh(
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     check_target(path, force=force, unit=world.unit)
 
-    then: Any = before_rename and (lambda complete: before_rename(complete[path]))
+    then = (lambda complete: before_rename(complete[path])) if before_rename else None
     write_meshes({path: {"": mesh}}, force=force, world=world, before_rename=then)
 
 

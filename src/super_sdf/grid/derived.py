@@ -113,6 +113,25 @@ def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> Der
     return DerivedPlanes(values, make, beside)
 
 
+def without_inner_faces(values: SampleArray, inside: int, h: float) -> DerivedPlanes:
+    """Return distances of which those inside, with none outside round them, are h at least.
+
+    ``inside`` is their sign. Where parts of a solid touch, distances to its faces inside are less.
+    """
+
+    def make(planes: NDArray[Any]) -> Floats:
+        near = planes * inside < 0
+        for axis in range(3):
+            source, grown = np.moveaxis(near, axis, 0), np.moveaxis(near.copy(), axis, 0)
+            grown[1:] |= source[:-1]
+            grown[:-1] |= source[1:]
+            near = np.moveaxis(grown, 0, axis)
+        deep = inside * np.maximum(np.abs(planes), h)
+        return np.asarray(np.where(near, planes, deep), np.float64)
+
+    return DerivedPlanes(values, make, 1)
+
+
 def _times(values: FloatArray, h: float) -> Floats:
     return np.multiply(values, h, dtype=np.float64)
 

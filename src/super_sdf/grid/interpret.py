@@ -39,6 +39,7 @@ from .samples import (
 )
 from .unknown import Known, with_known
 
+INNER = 0.25  # spacings: as deep at least samples inside are, where parts of a solid touch
 NONE_EXACT: Extremes = (0.0, 0.0)
 DENSITY = "density"  # what values with a level are
 # Voxels from the surface at which values are cut off: where the rest is filled in, and below which
@@ -66,12 +67,13 @@ class Field:
 
     @property
     def has_exact(self) -> bool:
-        """Whether some samples may be exact derived."""
+        """Whether some samples may be exact distances."""
         return self.exact[0] < self.exact[1]
 
     def report(self) -> dict[str, Any]:
         """Return kind and facts as a dictionary that can be written as JSON."""
-        facts = {name: np.round(x, 4).tolist() for name, x in self.facts.items() if x is not None}
+        known = {name: np.asarray(x, float) for name, x in self.facts.items() if x is not None}
+        facts = {name: np.round(x, 4).tolist() for name, x in known.items()}
         return {"kind": self.kind, "given": self.given, **facts}
 
 
@@ -346,7 +348,11 @@ def _of_spline(case: Case, facts: dict[str, Any], kind: str = SMOOTH) -> Taken:
     own = Field(kind, exact=NONE_EXACT, network=None, own_lattice=not cubic,
                 has_jumps=bool(facts.get("cut")) and kind == SMOOTH)  # fmt: skip
     low, high = (x / slope for x in (case.look.low, case.look.high))
-    samples = changed(case.samples, lambda values: values / slope)
+    samples: SampleArray = changed(case.samples, lambda values: values / slope)
+    if "inside" in facts:
+        samples = derived.without_inner_faces(
+            samples, facts["inside"], INNER * min(steps_of(spacing))
+        )
     return case.taken(spacing, own, facts, samples=samples, extremes=(low, high))
 
 
@@ -387,16 +393,13 @@ def _of_distances(case: Case, facts: dict[str, Any]) -> Taken:
 
 def _estimated(case: Case, facts: dict[str, Any]) -> Triple:
     """Return the spacing that the values show, with a note; GridError if they show none."""
-    look, found = case.look, facts.get("spacing")
-    if found is None and "unit" in facts:
-        found = np.ones(3) * facts["unit"] * look.scale
+    look = case.look
+    if facts.get("spacing") is None and "unit" not in facts:
+        facts = recognise(case.samples, look).facts
+    found = facts.get("spacing")
     if found is None:
-        answer = recognise(case.samples, look)
-        found = answer.facts.get("spacing")
-        if found is None and "unit" in answer.facts:
-            found = np.ones(3) * answer.facts["unit"] * look.scale
-    if found is None:
-        found = np.ones(3) * _slope_at_surface(look, np.ones(3))
+        unit = facts["unit"] * look.scale if "unit" in facts else None
+        found = np.full(3, unit or _slope_at_surface(look, np.ones(3)))
     found = np.array(found, np.float64)
     if not LEAST_SPACING <= found.min() <= found.max() <= MOST_SPACING:
         raise GridError(

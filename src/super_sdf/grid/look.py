@@ -23,12 +23,14 @@ Extremes: TypeAlias = tuple[float, float]
 
 WHOLE = 1 << 18  # samples of a grid that is one slab
 SLABS = 16
-BOXES, LINES, PAIRS = 1 << 12, 1 << 13, 1 << 15  # that are kept
+BOXES, LINES, PAIRS = 3000, 8000, 16_000  # that are kept
 ORDINARY = 1e-30, 1e30  # of the largest value: others are divided by it, so that squares are finite
 MOST_LABELS, FEW = 1000, 3  # different values that are listed; that are looked for first
 ENOUGH = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
-AS_GOOD, LEAST = 0.9, 20  # of the largest mean step over a level: as good; of so many steps
+AS_GOOD = 0.9  # of the largest mean step of neighbours over a level
+BORDER = 0.5, 0.4  # beyond half: so much of the border is on one side of a level, if of any
+SHARE, LEAST = 0.05, 20  # of the most steps over any level, and steps, that count
 MOST_NAMED = 8  # labels that a message lists
 TRIED = 4096  # samples whose different values are counted first
 
@@ -210,10 +212,11 @@ def _with_samples(look: Look) -> Look:
 
 
 def _some(places: NDArray[np.intp], most: int, random: np.random.Generator) -> NDArray[np.intp]:
-    """Return all places, or some of them by chance."""
+    """Return all places or, by chance, one in each of ``most`` parts of them."""
     if len(places) <= most:
         return places
-    return places[np.sort(random.integers(0, len(places), most))]
+    parts = np.arange(most) + random.random(most)
+    return places[(parts * (len(places) / most)).astype(np.intp)]
 
 
 def _beside_surface(planes: NDArray[Any], own: slice) -> NDArray[np.intp]:
@@ -343,10 +346,20 @@ def which_level(look: Look, *, signed: bool = False, shift: float = 0.0, unit: f
         sums += side * np.bincount(at, high - low, LEVELS + 1)
         counts += side * np.bincount(at, None, LEVELS + 1)
     total = np.cumsum(counts)[:-1]
-    steps = np.where(total >= LEAST, np.cumsum(sums)[:-1] / total.clip(1), 0)
+    steps = np.where(
+        total >= max(LEAST, SHARE * total.max()), np.cumsum(sums)[:-1] / total.clip(1), 0
+    )
+    faces = np.sort(look.faces[np.isfinite(look.faces)]) / unit + shift
+    share = np.searchsorted(faces, levels) / max(len(faces), 1)  # of the border, below a level
+    for least in BORDER:
+        if (closed := (np.abs(share - 0.5) >= least) & (steps > 0)).any():
+            steps = np.where(closed, steps, 0)
+            break
     good = levels[steps >= AS_GOOD * steps.max()]
     level = _short_number(good)
-    values = np.unique(pairs)
+    values = np.unique(np.append(pairs, [x + shift for x in (look.low, look.high)]))
+    if look.faces.dtype.kind in "iu":
+        level = float(np.floor(level)) + 0.5
     at = int(np.searchsorted(values, level))
     if at < len(values) and values[at] == level:
         beside = values[at - 1] if at else values[at + 1]

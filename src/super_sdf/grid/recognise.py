@@ -41,7 +41,8 @@ from .samples import SampleArray
 # neighbours that differ, how many by one rank; by how much labels may be off whole numbers, and
 # whole numbers off those that are stored.
 PLATEAUS = 0.45  # whole images and integer distances to .43, labels from .55
-BY_RANK = 0.99  # integer distances 1, labels to .97
+BY_RANK = 0.99  # integer distances 1, labels to .97, but where one is in the other
+AMID = 0.1  # of these the share that equal all 6: distances 0, labels inside others .3 and more
 WHOLE, FACTOR = 1e-3, 0.05
 FEW_LABELS = 8  # different values: rounded distances and images from 11, lesions and organs to 8
 # 3. Transforms: share of the samples beside the surface that equal others with the same 27 signs.
@@ -49,6 +50,7 @@ FEW_LABELS = 8  # different values: rounded distances and images from 11, lesion
 # along two axes, and many patterns of signs, or many of all. Else faces are along the axes.
 FOLLOW = 0.95  # distances to .94 (but where faces are along the axes), transforms from .957
 STAIRS = 0.2  # solids along the axes to .18, masks of others from .26
+ZEROS = 0.25  # share of samples at 0 beside the surface: sides that start at 0 have .3
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
 NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
@@ -118,9 +120,16 @@ def recognise(
     if look.is_finite and not hint and _are_labels(samples, look, facts):
         why = "whole numbers in regions of equal ones"
         return Answer("labels", why, facts, which_label(samples))
-    if not hint and _follow_from_signs(look, given, facts):
-        why = "a distance transform, so only their sign says something"
-        return Answer("mask", why, facts | _side_of_zeros(look))
+    transform = "a distance transform, so only their sign says something"
+    if not hint:
+        _follow_from_signs(look, given, facts)
+    follow = facts.get("follow", 0.0) >= FOLLOW
+    is_sure = (
+        follow and facts["stepped"] and max(facts["shape"] - FOLLOW, facts["zeros"] - ZEROS) >= 0
+    )
+    if is_sure or (follow and _jump_over_0(look)):
+        return Answer("mask", transform, facts | {"zeros": _side_of_zeros(look)})
+    signs = look
     look = _without_sentinels(look, facts)
     facts["digit"] = _last_digit(look)
     inner = np.where(
@@ -133,6 +142,8 @@ def recognise(
         facts["contradictions"] = _contradictions(look, steps, facts["digit"])
         if facts["contradictions"] <= CONTRADICTIONS:
             return _distances(look, unit, given, facts)
+    if follow and facts["stepped"]:
+        return Answer("mask", transform, facts | {"zeros": _side_of_zeros(signs)})
     if hint == "density":
         return Answer("density", "the file says so", facts, which_level(look))
     if look.is_one_sided:
@@ -164,7 +175,8 @@ def _is_plane(look: Look) -> bool:
 
 
 def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool:
-    if not _are_whole(np.unique(look.all_pairs) * look.scale):
+    some = look.all_pairs.ravel() * look.scale
+    if not (_are_whole(some[:: len(some) // 100 + 1]) and _are_whole(some)):
         return False
     found = different_values(samples)
     if found is None or not _are_whole(found[0].astype(np.float64)):
@@ -175,11 +187,11 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
     steps = np.concatenate([np.abs(one - other) for one, other in ranks])
     facts["by_rank"] = by_rank = float((steps == 1).mean()) if len(steps) else 0.0
     if len(distinct) > 3 and by_rank >= BY_RANK:
-        return False
-    if len(distinct) <= FEW_LABELS:
-        return look.low >= 0 or _plateaus(look, distinct, counts) >= PLATEAUS
-    facts["plateaus"] = _plateaus(look, distinct, counts)
-    return bool(facts["plateaus"] >= PLATEAUS)
+        facts["amid"] = _share_amid(look, distinct, counts, 6)
+        return bool(facts["amid"] >= AMID)
+    facts["plateaus"] = _share_amid(look, distinct, counts, 4)
+    few = len(distinct) <= FEW_LABELS and look.low >= 0
+    return bool(few or facts["plateaus"] >= PLATEAUS)
 
 
 def _are_whole(values: Floats) -> bool:
@@ -194,59 +206,55 @@ def _are_whole(values: Floats) -> bool:
     return bool(abs(factor - 1) <= FACTOR and off.all())
 
 
-def _plateaus(look: Look, distinct: NDArray[Any], counts: NDArray[np.int64]) -> float:
+def _share_amid(look: Look, distinct: NDArray[Any], counts: NDArray[np.int64], least: int) -> float:
+    """Return the share of samples off the background that equal so many of their neighbours."""
     background, equal, total = distinct[counts.argmax()], 0, 0
     for slab in look.slabs:
         values, neighbours = equal_neighbours(slab)
         inner = values != background
         if len(distinct) > 3:  # images are cut off at their ends
             inner &= (values != distinct[0]) & (values != distinct[-1])
-        equal += int(np.count_nonzero(neighbours[inner] >= 4))
+        equal += int(np.count_nonzero(neighbours[inner] >= least))
         total += int(np.count_nonzero(inner))
     return equal / total if total else 1.0
 
 
-def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
-    """Return whether samples beside the surface are equal wherever the 27 signs round them are."""
+def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> None:
+    """Find whether samples beside the surface are equal wherever the 27 signs round them are.
+
+    Of one shape they all have one size. So have distances to faces along the axes, which differ by
+    their steps; others may follow by chance, which is told by their slopes.
+    """
     boxes = look.boxes[:, 1:4, 1:4, 1:4]
-    most, found, is_stepped, largest = (
-        0,
-        0.0,
-        False,
-        max(abs(look.low), abs(look.high)) / look.scale,
-    )
+    facts["zeros"] = float((look.boxes[:, 2, 2, 2] == 0).mean()) if len(look.boxes) else 0.0
+    facts["follow"], most, largest = 0.0, 0, max(abs(look.low), abs(look.high)) / look.scale
     fine = np.repeat(np.ones(3, bool) if given is None else given < 1.01 * given.min(), 2)
     cut = [x / look.scale for x in facts["cut"] if x]
-    whole = np.isfinite(boxes).all((1, 2, 3))
+    whole = np.isfinite(boxes).all((1, 2, 3)) & (boxes[:, 1, 1, 1] != 0)
     for signs in (boxes > 0, boxes >= 0):  # 0 may be on either side
-        middle, other = boxes[:, 1, 1, 1], signs != signs[:, 1:2, 1:2, 1:2]
-        ring = other[(slice(None), *FACES[fine].T)].any(1) & whole
-        ring &= middle != 0
-        is_cut = np.isin(middle, cut)
-        if is_cut[ring].mean() > 0.5 if ring.any() else True:
+        along = (signs != signs[:, 1:2, 1:2, 1:2])[(slice(None), *FACES[fine].T)]
+        ring = whole & along.any(1)
+        free = ring & ~np.isin(boxes[:, 1, 1, 1], cut)
+        x = boxes[free, 1, 1, 1]
+        if len(x) < max(ENOUGH, ring.sum() / 2) or np.median(np.abs(x)) < NOTHING * largest:
             continue
-        ring &= ~is_cut
-        x = middle[ring]
-        if len(x) < ENOUGH or (typical := np.median(np.abs(x))) < NOTHING * largest:
-            continue
-        bits = np.packbits(signs[ring].reshape(-1, 27), axis=1)
+        typical = float(np.median(np.abs(x)))
+        alike = np.abs(np.abs(x) - typical) <= 0.01 * typical
+        shape = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
+        bits = np.packbits(signs[free].reshape(-1, 27), axis=1)
         key = np.ascontiguousarray(bits).view(np.uint32).ravel()
         order = np.argsort(key, kind="stable")
-        key, x = key[order], x[order]
-        alike = np.abs(np.abs(x) - typical) <= 0.01 * typical  # as most transforms are
-        shares = [min(alike[side].mean() for side in (x > 0, x < 0) if side.any())]
-        same = key[1:] == key[:-1]
+        same = np.diff(key[order]) == 0
+        share = shape
         if same.sum() >= 5 * ENOUGH:
-            shares.append((np.abs(np.diff(x)[same]) <= 0.01 * typical).mean())
-        if max(shares) > found or (max(shares) >= FOLLOW and len(x) > most):
-            most, found, patterns = len(x), float(max(shares)), int(np.count_nonzero(~same)) + 1
-            along = other[(slice(None), *FACES[fine].T)][ring].reshape(len(x), -1, 2).any(2)
-            facts["stairs"] = float((along.sum(1) > 1).mean())
-            is_many = patterns > PATTERNS or patterns > OF_ALL * len(x)
-            is_stepped = facts["stairs"] > STAIRS and is_many
-            facts["step"] = float(typical) * look.scale
-    facts["follow"] = found
-    return found >= FOLLOW and (_jump_over_0(look) or (is_stepped and len(cut) < 2))
+            equal = np.abs(np.diff(x[order])[same]) <= 0.01 * typical
+            share = max(shape, float(equal.mean()))
+        if share > facts["follow"] or (share >= FOLLOW and len(x) > most):
+            most, patterns = len(x), int(np.count_nonzero(~same)) + 1
+            stairs = float((along[free].reshape(most, -1, 2).any(2).sum(1) > 1).mean())
+            is_many = patterns > PATTERNS or patterns > OF_ALL * most
+            facts.update(follow=share, shape=shape, stairs=stairs, step=typical * look.scale)
+            facts["stepped"] = stairs > STAIRS and is_many and len(cut) < 2
 
 
 def _jump_over_0(look: Look) -> bool:
@@ -258,7 +266,7 @@ def _jump_over_0(look: Look) -> bool:
     return False
 
 
-def _side_of_zeros(look: Look) -> dict[str, Any]:
+def _side_of_zeros(look: Look) -> int:
     """Return the side of samples that are 0: that which has none of its own beside some of them.
 
     All 26 round a sample are beside it or, if that does not tell, the 6 along the axes.
@@ -275,8 +283,8 @@ def _side_of_zeros(look: Look) -> dict[str, Any]:
                     n[:-1] |= m[1:]
                 lone[nth] += int(np.count_nonzero((planes == 0)[own] & ~near[own]))
         if lone[0] != lone[1]:
-            return {"zeros": int(np.sign(lone[1] - lone[0]))}
-    return {}
+            return int(np.sign(lone[1] - lone[0]))
+    return 0
 
 
 # Question 4: unknown samples
@@ -309,8 +317,8 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
 
 def _last_digit(look: Look) -> float:
     """Return by how much values beside the surface typically differ at least."""
-    values = np.unique(look.boxes[:, 2, 2, 2].astype(np.float32))
-    values = values[np.isfinite(values)]
+    values = look.boxes[:, 2, 2, 2].astype(np.float32)
+    values = np.unique(values[np.isfinite(values)])
     return float(np.median(np.diff(values))) if len(values) > 1 else 0.0
 
 
@@ -408,7 +416,7 @@ def _distances(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any
         shown = ",".join(f"{x:.4g}" for x in np.unique(given) * unit * look.scale)
         said = (
             "they are distances in another unit than the spacing: multiply the values, --scale "
-            f"{scale:.6g} (or give --spacing {shown}, if the values are right)"
+            f"{scale:.6g} (or the spacing is wrong: they show {shown})"
         )
         return Answer("distance", "", facts, said)
     if look.is_one_sided:
@@ -418,6 +426,7 @@ def _distances(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any
     facts["seams"] = sum(n for n, _ in found) / max(sum(n for _, n in found), 1)
     if facts["seams"] > SEAMS:
         why = "distances to parts that touch or overlap, with faces of these inside"
+        facts["inside"] = -outside
         return Answer("smooth", why, facts)
     return Answer("distance", "", facts)
 

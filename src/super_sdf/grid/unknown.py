@@ -48,7 +48,8 @@ def with_known(samples: SampleArray, look: Look, value: float | None, notes: lis
     which = ""
     if value is not None:
         known = changed(samples, lambda planes: np.where(planes == value, np.nan, planes))
-        low, high = _extremes_of(known)
+        finite = [plane[np.isfinite(plane)] for plane in known]
+        low, high = (float(end(np.concatenate(finite))) for end in (np.min, np.max))
         which = f" (those that are exactly {value:g} are taken as such)"
         samples = known
     else:
@@ -110,12 +111,6 @@ def with_known(samples: SampleArray, look: Look, value: float | None, notes: lis
     )
     unseen = DerivedPlanes(samples, unseen_of, dtype=bool, numbered=True)
     return Known(filled, (low, high), total, unseen, why)
-
-
-def _extremes_of(samples: SampleArray) -> Extremes:
-    finite = [plane[np.isfinite(plane)] for plane in samples]
-    ends = [(x.min(), x.max()) for x in finite if x.size]
-    return float(min(low for low, _ in ends)), float(max(high for _, high in ends))
 
 
 def _continued(planes: NDArray[Any], limits: Extremes) -> NDArray[Any]:

@@ -143,7 +143,8 @@ def survey(
         number, value = np.append(own, every.number), np.append(sample[exact], every.value)
         order = np.argsort(number, kind="stable")
         number, value = number[order], value[order]
-    trusted = TrustedSamples(np.array(np.unravel_index(number, grid.shape), np.int32), value)
+    ijk = np.array(np.unravel_index(number, grid.shape), np.int32)
+    trusted = TrustedSamples(grid.shape, ijk, value)
     return Band(grid, offset, *rows, exact, limits, trusted, whole.leaves)
 
 
@@ -322,9 +323,8 @@ def is_near(values: FloatArray) -> BoolArray:
     for axis in range(3):
         lines, cells = np.moveaxis(values, axis, 0), np.moveaxis(sides, axis, 0)
         sides = np.moveaxis(np.bitwise_or(cells[1:], cells[:-1]), 0, axis)
-        steps = np.abs(lines[1:] - lines[:-1])
-        largest = np.concatenate([steps[:1], np.maximum(steps[1:], steps[:-1]), steps[-1:]])
-        change += np.moveaxis(largest, 0, axis)
+        steps = np.pad(np.abs(np.diff(lines, axis=0)), ((1, 1), (0, 0), (0, 0)))
+        change += np.moveaxis(np.maximum(steps[1:], steps[:-1]), 0, axis)
     mixed = sides == 3
     for axis in range(3):
         mixed = np.pad(mixed, [(int(n == axis),) * 2 for n in range(3)])

@@ -13,7 +13,6 @@ lattice, which the true distances at the nodes would lose. Lengths are in half v
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import count as count_up
@@ -37,9 +36,7 @@ EXCEEDED, MARGIN = np.float32(0.002), np.float32(0.05)
 CONTRADICTION = 0.02  # that far beyond a bound, one of two samples is no distance
 LEAST_FACTOR = 4  # in larger cells, bounds would undo what the fit to the spheres makes up for
 MOST_LOST = 0.15  # of the nodes inside a block: more are a thin wall
-# Blocks that are worked on with one box of samples, and the largest box: of far fewer blocks, if
-# they lie along a diagonal.
-BOX_ROWS, BOX_SAMPLES = 4096, 1 << 21
+BOX_ROWS = 4096  # blocks that are worked on with the same planes of samples
 TEMPORARIES, PAIRS = 1024, 4096  # numbers of each block in a chunk; spheres and blocks at a time
 
 
@@ -47,17 +44,21 @@ TEMPORARIES, PAIRS = 1024, 4096  # numbers of each block in a chunk; spheres and
 class TrustedSamples:
     """All samples whose spheres can be trusted: exact ones of the band, and some beyond it."""
 
+    shape: tuple[int, int, int]  # samples of the grid along each axis
     ijk: IntArray  # (3, n), the samples, in C order
     value: FloatArray  # (n,)
 
-    def box(self, low: IntArray, high: IntArray) -> FloatArray:
-        """Return the samples from index ``low`` (3,) to before ``high``, NaN where none is."""
-        box = np.full(high - low, np.nan, np.float32)
-        rows = slice(*np.searchsorted(self.ijk[0], [low[0], high[0]]))
-        i, j, k = self.ijk[:, rows] - low[:, None]
-        within = (j >= 0) & (j < box.shape[1]) & (k >= 0) & (k < box.shape[2])
-        box[i[within], j[within], k[within]] = self.value[rows][within]
-        return box
+    def planes(self, first: int, last: int) -> FloatArray:
+        """Return planes ``first`` to before ``last``, NaN where no sample is trusted.
+
+        Across, they reach ``REACH_OF_SAMPLES`` beyond the grid on either side.
+        """
+        ny, nz = (count + 2 * REACH_OF_SAMPLES for count in self.shape[1:])
+        planes = np.full((last - first, ny, nz), np.nan, np.float32)
+        rows = slice(*np.searchsorted(self.ijk[0], [first, last]))
+        i, j, k = self.ijk[:, rows]
+        planes[i - first, j + REACH_OF_SAMPLES, k + REACH_OF_SAMPLES] = self.value[rows]
+        return planes
 
 
 def keep_within_bounds(
@@ -80,20 +81,20 @@ def keep_within_bounds(
 
     def work(rows: slice) -> list[tuple[NDArray[np.intp], FloatArray]]:
         moves = []
-        for group in _cut_to_boxes(voxel_ijk, rows):
-            low = voxel_ijk[group].min(0) - REACH_OF_SAMPLES
-            box = samples.box(low, voxel_ijk[group].max(0) + REACH_OF_SAMPLES + 1)
-            strides = np.array([box.shape[1] * box.shape[2], box.shape[2], 1])
-            start, around = (voxel_ijk[group] - low) @ strides, steps @ strides
-            for some in chunks_of(len(start), max(4 * len(blocks), TEMPORARIES)):
-                first = group.start + some.start
-                values = np.ascontiguousarray(blocks[:, first : group.start + some.stop].T)
-                row, moved = _bounded(values, factor, box.take(start[some, None] + around))
-                before = values[row]
-                lost = np.count_nonzero((before <= 0) & (moved > 0), axis=1)
-                inside = np.count_nonzero(before <= 0, axis=1)
-                thin[first + row] = lost > MOST_LOST * inside
-                moves.append((first + row, moved))
+        first, last = voxel_ijk[[rows.start, rows.stop - 1], 0].tolist()
+        planes = samples.planes(first - REACH_OF_SAMPLES, last + REACH_OF_SAMPLES + 1)
+        strides = np.array([planes[0].size, planes.shape[2], 1])
+        start = (voxel_ijk[rows] - np.array([first, 0, 0]) + REACH_OF_SAMPLES) @ strides
+        around = steps @ strides
+        for some in chunks_of(len(start), max(4 * len(blocks), TEMPORARIES)):
+            first = rows.start + some.start
+            values = np.ascontiguousarray(blocks[:, first : rows.start + some.stop].T)
+            row, moved = _bounded(values, factor, planes.take(start[some, None] + around))
+            before = values[row]
+            lost = np.count_nonzero((before <= 0) & (moved > 0), axis=1)
+            inside = np.count_nonzero(before <= 0, axis=1)
+            thin[first + row] = lost > MOST_LOST * inside
+            moves.append((first + row, moved))
         return moves
 
     every = map_chunks(work, len(voxel_ijk), CHUNK // BOX_ROWS, threads)
@@ -106,17 +107,6 @@ def keep_within_bounds(
         blocks[:, rows[free]] = moved[free].T
         touched[parts.table[:, rows[free]]] = True
     average_shared(blocks, parts, factor, threads, touched[:-1])
-
-
-def _cut_to_boxes(voxel_ijk: IntArray, rows: slice) -> Iterator[slice]:
-    """Yield the rows of voxels (D, 3), cut in halves until a box round each part is small."""
-    size = np.ptp(voxel_ijk[rows], axis=0).astype(np.int64) + 2 * REACH_OF_SAMPLES + 1
-    if size.prod() <= BOX_SAMPLES or rows.stop - rows.start == 1:
-        yield rows
-    else:
-        middle = (rows.start + rows.stop) // 2
-        yield from _cut_to_boxes(voxel_ijk, slice(rows.start, middle))
-        yield from _cut_to_boxes(voxel_ijk, slice(middle, rows.stop))
 
 
 def _bounded(

@@ -1,7 +1,6 @@
 """The first values at the nodes of blocks: the network's, or the spline through the samples.
 
-Where a field is smooth, its cubic B-spline is nearer to it than any network that was trained on
-distances, whatever its slope. Fourth differences of the samples tell where it is smooth.
+Of a smooth field the cubic B-spline is nearer than any network that was trained on distances.
 
 Reference: Unser, Aldroubi and Eden, "B-spline signal processing", 1993. The prefilter is the
 symmetric exponential of the pole sqrt(3) - 2, cut off at ``TAIL`` samples. All sums are written
@@ -96,6 +95,12 @@ def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
             jumps = np.clip((rough - JUMPING) / (JUMPED - JUMPING), 0, 1)
             straight = np.pad(values, 2, mode="reflect", reflect_type="odd")
             found += jumps * (_evaluate(straight, ijk + 2, linear) - found)
+        cube, middle = found.reshape(factor + 1, factor + 1, factor + 1, -1), factor // 2
+        for axis in range(3):  # beyond the outermost samples the surface goes straight on
+            nodes, at = np.moveaxis(cube, axis, 0), voxel_ijk[rows, axis]
+            first, last = at == 0, at == shape[axis] - 1
+            nodes[:middle][..., first] = nodes[middle][..., first]
+            nodes[middle:][..., last] = nodes[middle][..., last]
         blocks[:, rows] = found
     blocks[:, :-1] -= np.float32(band.offset / unit)
     return blocks

@@ -228,9 +228,9 @@ def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex)
         better = new.clearance < found.clearance[rest]
         nearer, farther = np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
         turn[rest] = np.where(better, nearer, farther)
-        gained = np.flatnonzero(better)
+        at, gained = rest[better], np.flatnonzero(better)
         for mine, its in zip(found, new):
-            mine[..., rest[gained]] = its[..., gained]
+            mine[..., at] = its[..., gained]
     return found
 
 

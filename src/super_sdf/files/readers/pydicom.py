@@ -97,13 +97,15 @@ def _images_in(path: Path) -> tuple[dict[str, list[Image]], tuple[str, ...]]:
 
 
 def _pixels(path: Path, frame: int | None = None) -> NDArray[Any]:
-    """Return the values of a frame, or of all: FileError names a damaged file."""
+    """Return the values of a frame, or of all: FileError names the file that is damaged, say."""
     from pydicom.pixels.utils import pixel_array
 
     try:
         return np.asarray(pixel_array(path, index=frame))
     except Exception as error:
-        raise FileError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
+        if isinstance(error, MemoryError):
+            raise
+        raise FileError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
 
 
 def _of_slices(slices: list[_Slice], notes: tuple[str, ...]) -> Volume:
@@ -130,11 +132,8 @@ def _of_slices(slices: list[_Slice], notes: tuple[str, ...]) -> Volume:
         )
     scales = np.array([each.scale for each in slices])
     is_plain, is_whole = (scales == (1, 0)).all(), (scales == np.rint(scales)).all()
-    dtype = (
-        _pixels(first.path, first.frame).dtype
-        if is_plain
-        else np.dtype(np.int32 if is_whole else np.float32)
-    )
+    dtype = np.dtype(np.int32 if is_whole else np.float32)
+    dtype = _pixels(first.path, first.frame).dtype if is_plain else dtype
 
     def load(index: Index) -> NDArray[Any]:
         planes = np.empty((len(slices), *first.shape), dtype)
