@@ -11,6 +11,7 @@ import nrrd
 import numpy as np
 import pydicom
 import pytest
+import pyvista
 import tifffile
 import trimesh
 import xarray
@@ -265,3 +266,13 @@ WAYS_OUT = ("a.vtr", "pyvista"), ("a.vtu", "pyvista"), ("a.mnc", "nibabel"), ("a
 def test_what_is_no_grid_file_has_a_recipe(name, library):
     said = refusal(SuperSdfError, read_grid, name)
     assert f'{name} is not read: convert it by python -c "import {library} as p; ' in said
+
+
+def test_a_number_of_several_at_each_point_of_vtk():
+    image = pyvista.ImageData(dimensions=ONE.shape[::-1])
+    image["v"] = TWO.reshape(2, -1).T
+    image.save("a.vti")
+    assert np.array_equal(read("a.vti:v[1]"), TWO[1])
+    assert "has 2 numbers per sample: give an array of one, or NAME[0]" in refusal(
+        GridError, read_grid, "a.vti:v[2]"
+    )

@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import refusal, trilinear
+from scipy.ndimage import gaussian_filter
 
 from super_sdf import load_network, make_grid, reconstruct, reconstruct_labels
-from super_sdf.check.check import check_mesh
+from super_sdf.check.check import check_mesh, examine_surface, self_intersections
 from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
 from super_sdf.grid.sdf_grid import volume_of_samples
+from super_sdf.labels import fewer
 from super_sdf.labels.files import LabelName, read_names
-from super_sdf.labels.volumes import keep_volumes
+from super_sdf.labels.volumes import keep_volume
+from super_sdf.truth.solid import Solid
 
 
 @pytest.fixture(scope="module")
@@ -71,18 +74,42 @@ def corners_of(mesh):
     return found
 
 
+@pytest.mark.parametrize("more", [{}, {"tolerance": 0.1}, {"keep_volume": True}])
 @pytest.mark.parametrize("name, factor", [("noise", 4), *((name, 2) for name in IMAGES)])
-def test_meshes_are_closed_and_share_their_walls(name, factor):
+def test_meshes_are_closed_and_share_their_walls(name, factor, more):
     labels, spacing = IMAGES[name], (1.0, 0.75, 2.5)
-    meshes = reconstruct_labels(labels, network=trilinear, factor=factor, spacing=spacing)
+    meshes = reconstruct_labels(labels, "all", trilinear, factor, spacing=spacing, **more)
     assert list(meshes) == sorted(set(np.unique(labels)) - {0})
     triangles = {label: corners_of(mesh) for label, mesh in meshes.items()}
     seen = sum(triangles.values(), Counter())
     for label, mesh in meshes.items():
-        assert mesh.is_closed() and mesh.volume() > 0
+        assert examine_surface(mesh, self_intersections(mesh)).faults() == []
         assert set(triangles[label].values()) == {1}
     for a, b, c in seen:  # no two labels are on the same side of a triangle, nor three beside it
         assert seen[a, b, c] == 1
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, network):
+    noise = np.random.default_rng(seed).standard_normal((4, 8, 8, 8))
+    labels = np.stack([gaussian_filter(one, 1.0) for one in noise]).argmax(0)
+    plain = reconstruct_labels(labels, "all", network, spacing=1.0)
+    for more in ({"keep_volume": True}, {"tolerance": 0.05}):
+        made = reconstruct_labels(labels, "all", network, spacing=1.0, **more)
+        for label, mesh in made.items():
+            for some in (mesh, plain[label]):
+                assert examine_surface(some, self_intersections(some)).faults() == []
+            if "tolerance" in more:
+                assert len(mesh.faces) < 0.95 * len(plain[label].faces)
+                assert Solid(mesh).distance(plain[label].vertices).max() <= 0.05
+            else:
+                assert mesh.volume() == pytest.approx((labels == label).sum(), rel=2e-3)
+
+
+def test_without_pyfqmr_the_walls_stay_as_they_are(monkeypatch, image, command):
+    monkeypatch.setattr(fewer, "find_spec", lambda name: None)
+    code, _, err = command("upsample", image, "a.ply", "--labels", "all", "--json", *PLAIN)
+    assert code == 0 and "Note: pyfqmr is not installed: no triangles are spared\n" in err
 
 
 def test_what_does_not_fit_in_memory_is_refused():
@@ -98,10 +125,10 @@ def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
     alone = reconstruct(make_grid(labels, label=5, spacing=0.5, origin=3), network)
     mesh = reconstruct_labels(labels, network=network, spacing=0.5, origin=3)[5]
     assert mesh.vertices.dtype == alone.vertices.dtype
-    assert len(mesh.faces) == len(alone.faces)
-    ours, theirs = (np.unique(some.vertices, axis=0) for some in (mesh, alone))
-    np.testing.assert_allclose(ours, theirs, atol=1e-6)
-    assert mesh.volume() == pytest.approx(alone.volume(), rel=1e-6)
+    assert len(mesh.faces) < 0.8 * len(alone.faces)
+    for one, other in ((mesh, alone), (alone, mesh)):
+        assert Solid(one).distance(other.vertices).max() < 0.02 * 0.5
+    assert mesh.volume() == pytest.approx(alone.volume(), rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +198,7 @@ def test_the_command_writes_a_file_for_each_label(image, command):
 
 
 @pytest.mark.parametrize(("words", "name"), [
-    ("--simplify 0.1", "--simplify 0.1"), ("--mesher sharp", "--mesher 'sharp'"),
+    ("--triangles 99", "--triangles 99"), ("--mesher sharp", "--mesher 'sharp'"),
     ("--open", "--open"), ("--save-field f.npz", "--save-field"),
 ])  # fmt: skip
 def test_options_that_would_tear_the_walls_are_refused(words, name, image, command):
@@ -301,7 +328,7 @@ def test_a_mask_has_the_volume_of_its_samples():
     volume = volume_of_samples(grid)
     assert volume == MASK.sum() / 8
     assert mesh.volume() < 0.985 * volume
-    (kept,) = keep_volumes([mesh], [volume], 0.5)
+    kept = keep_volume(mesh, volume, 0.5)
     assert kept.volume() == pytest.approx(volume, rel=1e-5)
     assert check_mesh(kept, grid).surface.faults() == []
     away = np.linalg.norm(kept.vertices - mesh.vertices, axis=1)
@@ -315,13 +342,12 @@ def test_labels_have_the_volumes_of_their_samples_and_share_their_walls():
     )
     for label, mesh in kept.items():
         volume = (labels == label).sum() * np.prod(SPACING)
-        assert mesh.volume() == pytest.approx(volume, rel=1e-4)
+        assert mesh.volume() == pytest.approx(volume, rel=2e-4)
         assert abs(plain[label].volume() - volume) > 2e-3 * volume
-        np.testing.assert_array_equal(mesh.faces, plain[label].faces)
         grid = make_grid(labels, label=label, spacing=SPACING)
         assert check_mesh(mesh, grid).surface.faults() == []
     one, other = (set(map(bytes, mesh.vertices)) for mesh in kept.values())
-    assert len(one & other) > 500  # the vertices of the wall
+    assert len(one & other) > 200  # the vertices of the wall
 
 
 def test_a_volume_that_stays_off_is_noted(tmp_path, command):

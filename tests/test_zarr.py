@@ -6,21 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from conftest import ball, refusal
+from conftest import ball
 
 from super_sdf import read_grid
-from super_sdf.errors import GridError
 
 SHAPE = (30, 26, 22)  # x, y, z
 MODEL = ("--quality", "fast", "--spacing", "1", "-q")
 
 
 pytestmark = pytest.mark.usefixtures("folder")
-
-
-def said_of(path, kind=GridError, **options):
-    """Return the line with which a store is refused."""
-    return refusal(kind, read_grid, path, **options)
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +89,6 @@ def test_axes_of_time_and_channel_have_length_one(values):
     grid = read_grid("i.zarr")
     assert grid.shape == SHAPE and grid.spacing == (1, 1, 1) and grid.origin == (1, 2, 3)
     np.testing.assert_array_equal(grid.values, values)
-    two = np.stack([values.T, values.T])
-    image("j.zarr", [(two, [scale(1, 1, 1, 1)])], axes="czyx")
-    assert said_of("j.zarr") == ("j.zarr: its axis c has 2 entries: choose one, j.zarr[0], say")
 
 
 def test_info_of_a_file_prints_its_chunks(command, values):

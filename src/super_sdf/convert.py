@@ -95,8 +95,9 @@ def convert(
 
             check_has_volume(grid, options.offset, cap=options.cap)
         lattice = cubic_grid(grid, options.offset)
+        factor = options.factor_for(mask=grid.field.sides_only)
         if file:
-            file.check_fits(grid.shape, options.factor)
+            file.check_fits(grid.shape, factor)
             how["save_field"] = file.write
         watch.lap("read")
         if progress:
@@ -121,7 +122,8 @@ def convert(
     if options.mesher == "sharp" and not lattice.field.has_exact:
         why = f"{lattice.field.kind} values show no edges"
         notes.append(f"{why}: the mesh is that of marching cubes")
-    sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces), "tiles": made.tiles}
+    sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    sizes |= {"tiles": made.tiles, "factor": factor}
     return Conversion(
         grid,
         mesh,
@@ -152,9 +154,9 @@ def reworked(
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
     simplified, volume = None, volume_of_samples(grid) if options.keep_volume else None
     if volume is not None:
-        from .labels.volumes import keep_volumes, volume_notes
+        from .labels.volumes import keep_volume, volume_notes
 
-        (mesh,) = keep_volumes([mesh], [volume], mean_spacing(grid))
+        mesh = keep_volume(mesh, volume, mean_spacing(grid))
     if options.goals():
         from .simplify.simplify import simplify_mesh
 

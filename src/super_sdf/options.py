@@ -225,8 +225,9 @@ class Options:
     """
 
     # fmt: off
-    factor: int = _option(4, MESH, "list labels", FACTOR,
-        "How many times finer than the grid per axis: an even number from 2 to 16.", metavar="K")
+    factor: int | None = _option(None, MESH, "list labels", FACTOR,
+        "How many times finer than the grid per axis: an even number from 2 to 16. Default: 2 for "
+        "masks and labels, else 4.", metavar="K")
     _: KW_ONLY
     spacing: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
         "World distance between neighbouring samples: one number, or X,Y,Z. Default: from the "
@@ -272,10 +273,10 @@ class Options:
     mesher: MesherName = _option(AUTO, MESH, "list", one_of(MESHERS),
         "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
         "them; auto is sharp for distances, marching for masks and noise.")
-    simplify: float | None = _option(None, MESH, "list", VOXELS,
+    simplify: float | None = _option(None, MESH, "list labels", VOXELS,
         "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
         "Needs the extra simplify.", metavar="ERROR")
-    tolerance: float | None = _option(None, MESH, "list",
+    tolerance: float | None = _option(None, MESH, "list labels",
         number("a number greater than 0, in world units", above=0),
         "Simplify as with --simplify, but within D in world units.", metavar="D")
     triangles: int | None = _option(None, MESH, "list",
@@ -323,6 +324,10 @@ class Options:
         """Return the mesher; by itself ``sharp`` if samples are exact: else it finds no edges."""
         automatic: MesherName = SHARP if exact else MARCHING
         return automatic if self.mesher == AUTO else self.mesher
+
+    def factor_for(self, *, mask: bool) -> int:
+        """Return the factor: masks show no details for which 2 is too few."""
+        return self.factor or (2 if mask else 4)
 
     def goals(self) -> dict[str, Any]:
         """Return what says how far the mesh is to be simplified, by its name: at most one."""

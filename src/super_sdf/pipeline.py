@@ -103,7 +103,7 @@ def refine_band(
 def upsample(
     grid: SdfGrid,
     network: Decoder,
-    factor: int = 4,
+    factor: int | None = None,
     *,
     offset: float = 0.0,
     progress: Progress | None = None,
@@ -117,8 +117,9 @@ def upsample(
         axes, they are resampled to the finest first; the field has that spacing.
     network : Network
         From ``load_network``.
-    factor : int
-        How many times finer per axis, K: an even number from 2 to 16.
+    factor : int, optional
+        How many times finer per axis, K: an even number from 2 to 16; by default 2 for masks,
+        else 4.
     offset : float
         Refine the surface at this distance from the solid (world units) instead of the solid's own
         (Sec. 5.3). Positive is outwards, whichever sign the input had inside, since ``grid.values``
@@ -145,7 +146,7 @@ def upsample(
     check_grid(grid)
     options.check_called(network, progress)
     asked = Options(factor, offset=offset)  # checks them
-    factor, offset = asked.factor, asked.offset
+    factor, offset = asked.factor_for(mask=grid.field.sides_only), asked.offset
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
     lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
@@ -208,7 +209,7 @@ def extract_mesh(
 def reconstruct(
     grid: SdfGrid | None = None,
     network: Decoder | None = None,
-    factor: int = 4,
+    factor: int | None = None,
     *,
     function: Function | None = None,
     bounds: ArrayLike | None = None,
@@ -285,7 +286,7 @@ def reconstruct(
         return mesh
     from .functions.zero import put_on_zero
 
-    return put_on_zero(mesh, exact, grid, factor, offset)
+    return put_on_zero(mesh, exact, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,6 +309,7 @@ class Task:
     grid: SdfGrid  # the samples of the tile
     shape: tuple[int, int, int]  # samples of the whole grid
     options: Options
+    factor: int
     mesher: MesherName
     threads: int
     whole: BandSummary | None = None  # of a tile that is not the whole grid
@@ -335,12 +337,13 @@ def mesh_grid(
     check_grid(grid)
     options.check_called(network, progress)
     check_can_close(grid, cap=chosen.cap)
-    steps, offset, factor = StepCounter(progress), chosen.offset, chosen.factor
+    factor = chosen.factor_for(mask=grid.field.sides_only)
+    steps, offset = StepCounter(progress), chosen.offset
     lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
-    task = Task(everything, lattice, shape, chosen, mesher, threads)
+    task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room, whole = Room.of(chosen.max_memory, factor, decoder.memory_bytes), None
     most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
     try:
@@ -390,7 +393,7 @@ def make_tile(
     save_field: Callable[[FineField], None] | None = None,
 ) -> Part:
     """Return the part of the mesh that belongs to a tile, which may be the whole grid."""
-    tile, chosen, factor = task.tile, task.options, task.options.factor
+    tile, chosen, factor = task.tile, task.options, task.factor
     band = band or survey(task.grid, chosen.offset, threads=task.threads, whole=task.whole)
     if not band.decoded.any():
         return Part.without_surface(tile)

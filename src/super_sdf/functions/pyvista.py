@@ -65,7 +65,7 @@ class ImageAccessor:
 
     def contour(
         self,
-        factor: int = 4,
+        factor: int | None = None,
         *,
         scalars: str | None = None,
         quality: Quality | str | Path | None = None,

@@ -24,13 +24,13 @@ from ..files.grids import names_in
 from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, write_meshes
 from ..files.output import check_apart
 from ..files.readers import PLACE
-from ..grid.sdf_grid import SdfGrid, describe_place, mean_spacing
+from ..grid.sdf_grid import SdfGrid, describe_place
 from ..network.contract import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..surface.mesh import Mesh
 from ..threads import Progress, Stopwatch
 from .reconstruct import find_image, in_order, label_meshes
-from .volumes import keep_volumes, volume_notes
+from .volumes import volume_notes
 
 LONGEST = 80  # characters of a name
 
@@ -104,15 +104,14 @@ def convert_labels(
         check_target(path, force=force)
         check_apart(path, files_of(source))
     watch.lap("read")
-    meshes = label_meshes(image, network, options.factor, options.max_memory, progress)
+    meshes, notes, warnings = label_meshes(image, network, options, progress)
     for label, mesh in zip(called, meshes):
         if mesh.open_edges():
             raise MeshError(f"the mesh of label {label} is torn: run it again, and report it")
-    volumes, off = image.volumes, list[str]()
+    volumes = image.volumes
     if options.keep_volume:
-        meshes = keep_volumes(meshes, volumes, mean_spacing(grid))
         made = zip(called.values(), meshes, volumes)
-        off = volume_notes({entry.name: (mesh.volume(), volume) for entry, mesh, volume in made})
+        notes += volume_notes({entry.name: (mesh.volume(), volume) for entry, mesh, volume in made})
     watch.lap("mesh")
     files: dict[Path, dict[str, Mesh]] = {path: {} for path in paths}
     rows = []
@@ -129,8 +128,9 @@ def convert_labels(
     missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
     if missing:
         listed = ", ".join(entry.name for entry in lacking.values())
-        off.append(f"no sample has a label that was asked for: {listed}")
-    return LabelConversion(grid, rows, missing, (*grid.notes, *off), watch.seconds)
+        notes.append(f"no sample has a label that was asked for: {listed}")
+    said = (*grid.notes, *notes)
+    return LabelConversion(grid, rows, missing, said, watch.seconds, tuple(warnings))
 
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:

@@ -1,14 +1,13 @@
 """All labels of an image in one run: closed meshes whose shared walls coincide.
 
-Each label is refined as the mask of its samples, in a box round them, and so is what is beside all
-labels, where that meets two of them or more; ``walls`` makes the surfaces of these fields.
+``fields`` refines the labels, ``walls`` makes the surfaces of these fields, ``fewer`` spares
+triangles, and ``volumes`` makes up for what smooth surfaces lack.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from os import PathLike
 from typing import Any
 
@@ -16,43 +15,37 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import options
-from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
-from ..errors import GridError, OptionError, seen
+from ..errors import GridError, OptionError, check_modules, seen
 from ..files.grids import read_array
-from ..grid.derived import REACH, extremes_of_masks, mask_distances
+from ..grid.derived import extremes_of_masks
 from ..grid.interpret import as_sample, labelled, mask_field
 from ..grid.look import named
 from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
-from ..network.contract import Adapter, Decoder, adapt
+from ..network.contract import Decoder, adapt
 from ..network.network import load_network, network_for
-from ..pipeline import refine_band
-from ..refine.band import survey
-from ..refine.field import FineField
-from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
-from ..surface.marching import strides
 from ..surface.mesh import Mesh, vertex_type
-from ..threads import Progress, StepCounter, check_bound, check_count, part_of, useful_threads
+from ..threads import Progress
+from .fewer import meshes_of, simplified
+from .fields import label_fields
 from .volumes import keep_volumes
-from .walls import Labelled, extract_walls
+from .walls import Walls, extract_walls
 
 MOST_LABELS = 1000  # more values than these are densities
-MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
-SAMPLE_BYTES = 16  # memory for each sample of the image ...
-VOXEL_BYTES, NODE_BYTES = 1500, 22  # ... for each voxel at a wall, and for each node of its block
 
 
 def reconstruct_labels(
     values: ArrayLike | str | PathLike[str],
     labels: str | Sequence[int] = options.ALL,
     network: Decoder | None = None,
-    factor: int = 4,
+    factor: int | None = None,
     *,
     spacing: Any = None,
     origin: Any = None,
     direction: Any = None,
     axes: options.AxisOrder | None = None,
     keep_volume: bool = False,
+    tolerance: float | None = None,
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, Mesh]:
@@ -68,11 +61,15 @@ def reconstruct_labels(
     labels : "all" or sequence of ints
         The labels to mesh; all are those of the image but 0. Others count as 0.
     network, factor, max_memory, progress
-        As in ``reconstruct``; in place of a shipped network, that for masks is used.
+        As in ``reconstruct``; in place of a shipped network, that for masks is used. The factor
+        is 2 by default.
     spacing, origin, direction, axes
         Where the samples lie in the world, as in ``read_grid``; by default as the file says.
     keep_volume : bool
         Give each mesh the volume of its samples, see ``keep_volumes``.
+    tolerance : float, optional
+        Simplify the walls within this distance, in world units, both ways (extra ``simplify``). By
+        default triangles are spared within about a hundredth of a voxel.
 
     Returns
     -------
@@ -94,10 +91,9 @@ def reconstruct_labels(
     for label in image.missing:
         labelled(image.grid.samples, label)  # raises
     chosen = load_network() if network is None else network
-    meshes = label_meshes(image, chosen, factor, max_memory, progress)
-    if options.OPTIONS["keep_volume"].check(keep_volume):
-        meshes = keep_volumes(meshes, image.volumes, mean_spacing(image.grid))
-    return dict(zip(image.labels, meshes))
+    more: dict[str, Any] = {"keep_volume": keep_volume, "tolerance": tolerance}
+    asked = options.Options(factor, max_memory=max_memory, **more)
+    return dict(zip(image.labels, label_meshes(image, chosen, asked, progress)[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,130 +197,26 @@ def find_labels(
 
 
 def label_meshes(
-    image: LabelImage, network: Decoder, factor: int, bound: int | None, progress: Progress | None
-) -> list[Mesh]:
-    """Return the meshes of an image's labels; OutOfMemoryError if they do not fit in memory."""
-    options.check_called(network, progress)
-    factor, grid = options.OPTIONS["factor"].check(factor), image.grid
-    bound = options.OPTIONS["max_memory"].check(bound)
-    kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
-    chosen = adapt(network_for(network, options.MASK))
-    places, faces, sides = extract_walls(label_fields(image, chosen, factor, bound, progress))
-    world: NDArray[Any] = grid.to_world(places / factor - 0.5).astype(kind)
-    if grid.is_mirrored:
-        faces = faces[:, ::-1]
-    both, label = np.concatenate([faces, faces[:, ::-1]]), sides.T.ravel()
-    order = np.argsort(label, kind="stable")
-    ends = np.searchsorted(label[order], np.arange(1, len(image.labels) + 2))
-    meshes = []
-    for first, last in pairwise(ends.tolist()):
-        used, own = np.unique(both[order[first:last]], return_inverse=True)
-        check_count(len(used), "vertices")
-        meshes.append(Mesh(world[used], own.reshape(-1, 3).astype(np.int32)))
-    return meshes
+    image: LabelImage, network: Decoder, chosen: options.Options, progress: Progress | None
+) -> tuple[list[Mesh], list[str], list[str]]:
+    """Return the meshes of an image's labels, notes and warnings.
 
-
-def _check_room(image: LabelImage, voxels: int, nodes: int, bound: int | None) -> None:
-    """Raise OutOfMemoryError unless the fields in some voxels at walls fit in memory."""
-    labels, samples = len(image.labels), image.numbers.size
-    need = SAMPLE_BYTES * samples + voxels * (VOXEL_BYTES + NODE_BYTES * nodes)
-    what = f"meshing {labels} labels in {samples:,} samples, {voxels:,} of them at walls,"
-    check_bound(need, what, bound, "choose fewer (--labels), a smaller factor, cut the image, or ")
-
-
-def label_fields(
-    image: LabelImage, network: Adapter, factor: int, bound: int | None, progress: Progress | None
-) -> Labelled:
-    """Return the fields of all labels: label by label, what is beside all of them last.
-
-    The lowest field holds a node, the lower label in a tie.
+    OutOfMemoryError if the fields do not fit in memory.
     """
-    grid, numbers = image.grid, image.numbers
-    count, nodes = len(image.labels) + 1, (factor + 1) ** 3
-    _check_room(image, 0, nodes, bound)
-    padded, shape = np.pad(numbers, 1), np.array(grid.shape)  # beyond the border there is no label
-    edges = at_walls(padded)
-    near = _over_three(edges, np.logical_or)
-    near[1:-1, 1:-1, 1:-1] = edges[1:-1, 1:-1, 1:-1]
-    places = np.argwhere(near).astype(np.int32)
-    _check_room(image, len(places), nodes, bound)
-    own, index, voxel_ijk = padded[tuple(places.T)], VoxelIndex(places, padded.shape), places - 1
-    low, high = np.full((count, 3), shape), np.zeros((count, 3), np.intp)  # the boxes of labels
-    np.minimum.at(low, own, voxel_ijk)
-    np.maximum.at(high, own, voxel_ijk)
-    low[0], high[0] = low[1:].min(0), high[1:].max(0)
-    holder = np.repeat(own[None], nodes, axis=0)
-    lowest, able = np.full(holder.shape, np.inf, np.float32), np.zeros(holder.shape, np.int8)
-    times = np.zeros(len(own), np.int16)  # how many labels meet others in a voxel
-    fields: dict[int, tuple[NDArray[np.int64], FloatArray]] = {}
-    for turn, label in enumerate((*range(1, count), 0)):
-        start = np.maximum(low[label] - MARGIN, 0)
-        mask = numbers[tuple(map(slice, start, high[label] + MARGIN + 1))] == label
-        own_ijk = np.argwhere(at_walls(mask)).astype(np.int32)
-        if not len(own_ijk):
-            continue
-        rows, around = index.find(own_ijk + start + 1), _over_three(mask, np.logical_or)
-        around = np.pad(around, 1, constant_values=True)  # beyond the grid it may be
-        none = ~np.stack([around[tuple((own_ijk + 1 + step).T)] for step in NEIGHBOURHOOD])
-        absent = np.array([none[sharing].any(0) for sharing in SHARING])  # (27, n), by part
-        some_ijk = own_ijk if label else own_ijk[times[rows] > 1]
-        shown = part_of(progress, turn / count, (turn + 1) / count)
-        steps = StepCounter(shown, ["network", "nodes"])
-        blocks = np.full((nodes, len(own_ijk)), np.nan, np.float32)
-        distances, extremes = mask_distances(mask), extremes_of_masks(1.0)
-        lattice = SdfGrid.trusted(distances, 1.0, extremes=extremes, field=grid.field)
-        if field := _field_at(lattice, some_ijk, network, factor, steps):
-            blocks[:, VoxelIndex(own_ijk, lattice.shape).find(field.voxel_ijk)] = field.blocks
-        times[rows] += 1
-        for node, part in enumerate(part_of_node(factor)[0]):  # one by one, to save memory
-            value, able_here = blocks[node], able[node, rows]
-            if label == 0:
-                value[able_here < 2] = np.nan
-                value = np.where(np.isnan(value), -lowest[node, rows], value)
-            can = ~absent[part]
-            lower = np.flatnonzero(can & (value < lowest[node, rows]))
-            lowest[node, rows[lower]], holder[node, rows[lower]] = value[lower], label
-            able[node, rows] = np.minimum(able_here + can, 2)  # labels that could hold it; 2: more
-        fields[label] = rows, blocks
-    return _hold_border(Labelled(grid.shape, factor, index, voxel_ijk, holder, fields))
-
-
-def _field_at(
-    lattice: SdfGrid, voxel_ijk: IntArray, network: Adapter, factor: int, steps: StepCounter
-) -> FineField | None:
-    """Return the fine field of a mask in some voxels only; None if none can hold the surface."""
-    threads = useful_threads(network.threads)
-    band = survey(lattice, 0.0, threads=threads)
-    decoded = band.decoded & (VoxelIndex(voxel_ijk, lattice.shape).find(band.voxel_ijk) >= 0)
-    if not decoded.any():
-        return None
-    return refine_band(replace(band, decoded=decoded), network, factor, threads, steps)
-
-
-def _hold_border(found: Labelled) -> Labelled:
-    """Give the nodes on the border, of voxels beyond it, the label of the same node inside."""
-    factor, shape, holder = found.factor, np.array(found.shape), found.holder
-    outer = np.flatnonzero(((found.voxel_ijk < 0) | (found.voxel_ijk >= shape)).any(1))
-    beside = np.clip(found.voxel_ijk[outer], 0, shape - 1)
-    row = found.index.find(beside + 1)
-    for nth, step in enumerate(block_ijk(factor)):
-        node = factor * (found.voxel_ijk[outer] - beside) + step
-        some = np.flatnonzero(((node >= 0) & (node <= factor)).all(1) & (row >= 0))
-        holder[nth, outer[some]] = holder[node[some] @ strides(factor), row[some]]
-    return found
-
-
-def at_walls(values: NDArray[Any]) -> BoolArray:
-    """Return which samples do not have the same value as all that touch them."""
-    differ: BoolArray = _over_three(values, np.minimum) != _over_three(values, np.maximum)
-    return differ
-
-
-def _over_three(values: NDArray[Any], choose: np.ufunc) -> NDArray[Any]:
-    """Return the least, or the largest, of each sample and the 26 round it."""
-    for axis in range(3):
-        source, chosen = np.moveaxis(values, axis, 0), np.moveaxis(values.copy(), axis, 0)
-        choose(chosen[1:], source[:-1], out=chosen[1:])
-        choose(chosen[:-1], source[1:], out=chosen[:-1])
-        values = np.moveaxis(chosen, 0, axis)
-    return values
+    options.check_called(network, progress)
+    grid, factor, count = image.grid, chosen.factor_for(mask=True), len(image.labels)
+    if chosen.goals():
+        check_modules("simplifying", "simplify")
+    kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
+    adapter = adapt(network_for(network, options.MASK))
+    fields = label_fields(image.numbers, count, grid, adapter, factor, chosen.max_memory, progress)
+    walls = extract_walls(fields)
+    del fields
+    faces = walls.faces[:, ::-1] if grid.is_mirrored else walls.faces
+    walls = Walls(grid.to_world(walls.points / factor - 0.5), faces, walls.sides)
+    if chosen.keep_volume:
+        walls = keep_volumes(walls, image.volumes, mean_spacing(grid))
+    voxel = grid.voxel_size
+    walls, notes, warnings = simplified(walls, count, voxel, factor, chosen.error(voxel))
+    meshes = meshes_of(replace(walls, points=walls.points.astype(kind)), count)
+    return meshes, notes, warnings

@@ -3,28 +3,31 @@
 The smooth surface of a convex body is a little smaller than its samples, each taken as a box. So
 each label's surface moves by one distance along its normals; a wall by the difference of two.
 
-Points move by a continuous function of space, the mean of the normals near each node of a lattice
-and linear between nodes: so shared walls stay shared, and no triangles come to intersect.
+Points move by a continuous function of space: at each node of a lattice the sum of the labels'
+moves along their mean normals near it, linear between nodes. No node moves by more than a quarter
+of a cell, so moves differ by less than points are apart: walls that are apart stay so.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CORNERS, Vectors, dot, face_normals, length, sums_at
+from ..arrays import CORNERS, Numbers, Vectors, dot, face_normals, length, sums_at
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..surface.mesh import Mesh
+from .fewer import Rows, faults, of_labels
+from .walls import Walls
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
-ROUNDS = 8
+ROUNDS, TURNS = 12, 6
 GOOD, NOTED = 1e-6, 1e-3  # of a volume
-Rows = NDArray[np.intp]
 
 
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
@@ -47,60 +50,107 @@ def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
     return [f"volumes that are off those of the samples: {', '.join(far)}"] * bool(far)
 
 
-def keep_volumes(meshes: Sequence[Mesh], volumes: Sequence[float], spacing: float) -> list[Mesh]:
-    """Return closed meshes moved along their normals until they have the given volumes.
+def keep_volume(mesh: Mesh, volume: float, spacing: float) -> Mesh:
+    """Return a closed mesh moved along its normals until it has the given volume."""
+    sides = np.tile(np.array([1, 0], np.int16), (len(mesh.faces), 1))
+    walls = Walls(mesh.vertices.astype(np.float64), mesh.faces, sides)
+    moved = keep_volumes(walls, [volume], spacing)
+    return Mesh(moved.points.astype(mesh.vertices.dtype), mesh.faces)
 
-    Meshes have the same vertices where they touch; triangles stay as they are. No surface moves by
-    more than an eighth of the ``spacing``, so the volume of a speck may stay another one.
+
+def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Walls:
+    """Return walls moved along their normals until the labels 1, 2, ... have the given volumes.
+
+    No wall moves by more than an eighth of the ``spacing``, so the volume of a speck may stay
+    another one.
     """
-    vertices = np.concatenate([mesh.vertices for mesh in meshes]) + 0  # -0 is 0
-    bits = np.ascontiguousarray(vertices).view(f"V{3 * vertices.itemsize}").ravel()
-    _, first, place = np.unique(bits, return_index=True, return_inverse=True)
-    rows = np.split(place, np.cumsum([len(mesh.vertices) for mesh in meshes])[:-1])
-    middle = vertices.mean(0, dtype=np.float64)
-    start = points = vertices[first] - middle  # (n, 3), each vertex once
-    normals = _mean_normals(start / (CELL * spacing), meshes, rows)
-    distances = np.zeros(len(meshes))
+    middle, most = walls.points.mean(0), MOST * spacing
+    start = walls.points - middle
+    lattice = _mean_normals(replace(walls, points=start), len(volumes), CELL * spacing)
+    for _ in range(TURNS):
+        moved = _solved(walls, start, lattice, volumes, most)
+        wrong = faults(replace(walls, points=moved), len(volumes), CELL * spacing)
+        if not len(wrong):
+            return replace(walls, points=middle + moved)
+        lattice.normals[np.isin(lattice.node, lattice.nodes[wrong])] = 0
+    return walls
+
+
+def _solved(
+    walls: Walls, start: Vectors, lattice: _Lattice, volumes: Sequence[float], most: float
+) -> Vectors:
+    """Return the points, moved so that the labels have their volumes."""
+    effects, distances, points = lattice.effects(len(volumes)), np.zeros(len(volumes)), start
     for _ in range(ROUNDS):
-        slopes = [_slopes(points[own], mesh.faces) for own, mesh in zip(rows, meshes)]
-        off = volumes - np.array([dot(s, points[own]).sum() / 3 for s, own in zip(slopes, rows)])
+        off = np.asarray(volumes) - _volumes(points, walls, len(volumes))
         if (np.abs(off) <= GOOD * np.abs(volumes)).all():
             break
-        effects = np.zeros((len(meshes), len(meshes)))  # on each volume, of each surface
-        for nth, (some, vectors) in enumerate(normals):
-            moves = np.zeros_like(start)
-            moves[some] = vectors
-            effects[:, nth] = [dot(s, moves[own]).sum() for s, own in zip(slopes, rows)]
-        free = np.abs(distances) < MOST * spacing  # the others have moved as far as they may
+        free = np.abs(distances) < most  # the others have moved as far as they may
         step = np.linalg.lstsq(effects[np.ix_(free, free)], off[free], rcond=None)[0]
-        distances[free] = np.clip(distances[free] + step, -MOST * spacing, MOST * spacing)
-        points = start.copy()
-        for distance, (some, vectors) in zip(distances, normals):
-            points[some] += distance * vectors
-    points = (middle + points).astype(meshes[0].vertices.dtype)
-    return [Mesh(points[own], mesh.faces) for own, mesh in zip(rows, meshes)]
+        distances[free] = np.clip(distances[free] + step, -most, most)
+        points = start + lattice.moves(distances, most)
+    return points
 
 
-def _slopes(points: Vectors, faces: NDArray[Any]) -> Vectors:
-    """Return by how much a volume grows as its vertices move, (n, 3)."""
-    return sums_at(faces.ravel(), face_normals(points, faces).repeat(3, 0), len(points)) / 6
+def _volumes(points: Vectors, walls: Walls, count: int) -> Numbers:
+    """Return the volumes of the labels 1 to ``count``."""
+    a, b, c = (points[corner] for corner in walls.faces.T)
+    each = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+    one, other = (np.bincount(side, each, count + 1) for side in walls.sides.T)
+    return np.asarray((one - other)[1:], np.float64)
 
 
-def _mean_normals(
-    places: Vectors, meshes: Sequence[Mesh], rows: Sequence[Rows]
-) -> list[tuple[Rows, Vectors]]:
-    """Return the mean normals of each mesh at some rows of places, in cells of the lattice."""
+class _Lattice(NamedTuple):
+    """Mean normals of labels near the nodes of a lattice that are near walls."""
+
+    nodes: Rows  # (n, 8), round each point ...
+    weights: Numbers  # (n, 8), ... and their shares in it
+    # for pairs of a node and a label that is near it, in the order of nodes
+    node: Rows  # (p,)
+    label: Rows  # (p,), from 0 on
+    slopes: Vectors  # (p, 3), by which the volume grows as the node moves
+    normals: Vectors  # (p, 3)
+
+    def moves(self, distances: Numbers, most: float) -> Vectors:
+        """Return the moves of points, (n, 3), if labels move by distances, and nodes by no more."""
+        moves = self.normals * distances[self.label, None]
+        moves = sums_at(self.node, moves, int(self.node[-1]) + 1)
+        moves *= np.minimum(1, most / np.maximum(length(moves), 1e-300))[:, None]
+        total = np.zeros((len(self.nodes), 3))
+        for near, shares in zip(self.nodes.T, self.weights.T):
+            total += shares[:, None] * moves[near]
+        return total
+
+    def effects(self, count: int) -> NDArray[np.float64]:
+        """Return by how much each label's volume grows as each other one's surface moves."""
+        effects = np.zeros((count, count))
+        for step in range(count):
+            first = np.arange(len(self.node) - step)
+            first = first[self.node[first] == self.node[first + step]]
+            if not len(first):
+                break
+            for one, other in ((first, first + step), (first + step, first))[: 1 + (step > 0)]:
+                both = self.label[one], self.label[other]
+                np.add.at(effects, both, dot(self.slopes[one], self.normals[other]))
+        return effects
+
+
+def _mean_normals(walls: Walls, count: int, cell: float) -> _Lattice:
+    """Return the mean normals of the labels 1 to ``count`` near walls, whose middle is at 0."""
+    places = walls.points / cell
     corners = np.floor(places)[:, None] + CORNERS
-    weights = np.prod(1 - np.abs(places[:, None] - corners), axis=2)  # (n, 8)
-    _, nodes = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
-    nodes, count = nodes.reshape(-1, 8), int(nodes.max()) + 1
-    found = []
-    for mesh, own in zip(meshes, rows):
-        slopes = _slopes(places[own], mesh.faces)
-        parts, at = weights[own], nodes[own].ravel()
-        sums = sums_at(at, (parts[..., None] * slopes[:, None]).reshape(-1, 3), count)
-        areas = np.bincount(at, (parts * length(slopes)[:, None]).ravel(), count)
-        means = sums / np.maximum(areas, np.finfo(float).tiny)[:, None]
-        some = np.flatnonzero((areas > 0)[nodes].any(1))
-        found.append((some, (weights[some, :, None] * means[nodes[some]]).sum(1)))
-    return found
+    weights = np.prod(1 - np.abs(places[:, None] - corners), axis=2)
+    corners -= corners.min((0, 1))
+    _, ny, nz = (corners.max((0, 1)) + 1).tolist()
+    _, nodes = np.unique(corners @ [ny * nz, nz, 1], return_inverse=True)
+    nodes = nodes.reshape(-1, 8)
+    faces, point, first, _ = of_labels(walls, count)
+    label = np.repeat(np.arange(count), np.diff(first))
+    slopes = face_normals(walls.points[point], faces).repeat(3, 0) / 6
+    slopes = sums_at(faces.ravel().astype(np.int64), slopes, len(point))
+    keys, at = np.unique(nodes[point] * count + label[:, None], return_inverse=True)
+    at, shares = at.ravel(), weights[point]
+    sums = sums_at(at, (shares[..., None] * slopes[:, None]).reshape(-1, 3), len(keys))
+    areas = np.bincount(at, (shares * length(slopes)[:, None]).ravel(), len(keys))
+    normals = sums / np.maximum(areas, np.finfo(float).tiny)[:, None]
+    return _Lattice(nodes, weights, keys // count, keys % count, sums, normals)

@@ -177,8 +177,8 @@ def entry_of_report(name: str, report: Mapping[str, Any], item: Item | None) -> 
         "spacing": numbers(report.get("spacing", ())),
         "origin": numbers(report.get("origin", ())),
         "values": (report.get("field") or {}).get("kind"),
-        **{key: report.get("asked", {}).get(key) for key in ("factor", "mesher")},
-        **{key: report.get(key) for key in ("model", "precision", "device", "version")},
+        "mesher": report.get("asked", {}).get("mesher"),
+        **{key: report.get(key) for key in ("factor", "model", "precision", "device", "version")},
         **{key.replace("_", " "): f"{report[key]:,}" for key in COUNTED if key in report},
         "bounds": " to ".join(f"({numbers(corner)})" for corner in report.get("bounds", ())),
     }

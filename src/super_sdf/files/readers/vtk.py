@@ -62,7 +62,7 @@ def read_vtk(request: Request) -> Volume:
         if name == request.member or (array.GetNumberOfComponents() == 1 and not is_mark):
             plain.append(name)
     name = request.choose(plain or list(arrays), "array of points or cells")
-    return _volume_of(image, *arrays[name], f"its array {name!r}")
+    return _volume_of(image, *arrays[name], f"its array {name!r}", *request.numbers)
 
 
 def volume_of_image(image: Any, scalars: str | None) -> Volume:
@@ -95,7 +95,7 @@ def _arrays(image: Any) -> dict[str, tuple[Any, bool]]:
     return arrays
 
 
-def _volume_of(image: Any, array: Any, of_points: bool, what: str) -> Volume:
+def _volume_of(image: Any, array: Any, of_points: bool, what: str, *numbers: int) -> Volume:
     """Return an array at the points of an image, or at the centres of its cells.
 
     Point (i, j, k) of the extent, which need not begin at 0, is at
@@ -118,10 +118,11 @@ def _volume_of(image: Any, array: Any, of_points: bool, what: str) -> Volume:
         raise GridError(f"{said}: sample its distances on a lattice, and write that as .vti")
     shape = tuple(int(n) for n in extent[1::2] - extent[::2] + of_points)
     components, length = array.GetNumberOfComponents(), array.GetNumberOfTuples()
-    if components != 1:
-        raise GridError(f"{what} has {components} numbers per sample: give an array of one")
+    if components != 1 and not (len(numbers) == 1 and numbers[0] < components):
+        said = f"{what} has {components} numbers per sample"
+        raise GridError(f"{said}: give an array of one, or NAME[0]")
     if length != prod(shape):
         raise GridError(f"{what} has {length:,} values for {prod(shape):,} samples")
     start = direction @ (np.array(spacing) * (first + (0 if of_points else 0.5)))
-    values = vtk_to_numpy(array).reshape(shape[::-1]).T
+    values = vtk_to_numpy(array).reshape(*shape[::-1], -1)[..., numbers[0] if numbers else 0].T
     return Volume(*of_array(values), triple(spacing), triple(np.array(origin) + start), direction)
