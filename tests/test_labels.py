@@ -301,9 +301,15 @@ def test_labels_are_chosen_by_name(command, boxes):
         rows, _ = convert(command, boxes, "t.stl", "all", "--names", "t.json", "--force")
         assert [row["name"] for row in rows] == names
         assert [row["output"] for row in rows] == [f"t-{end}.stl" for end in ends]
+    run = "upsample", boxes, "one.ply", "--force", *PLAIN
+    assert command(*run, "--label", 5)[0] == 0
+    made = Path("one.ply").read_bytes()
+    assert command(*run, "--label", "left_kidney", "--names", "names.ctbl")[0] == 0
+    assert Path("one.ply").read_bytes() == made
     known = "names of the table (Background, liver&co, left_kidney)"
     for words, said in (
         (("--labels", "lung"), f"--labels has 'lung': give numbers, or {known}"),
+        (("--label", "lung"), "--label is 'lung': give a whole number, -2^63 to 2^64 - 1"),
         ((), "--names names.ctbl is for --labels: give that, too"),
     ):
         run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words

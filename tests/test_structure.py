@@ -47,7 +47,7 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     "simplify check truth": 1377,  # 1,100: both ways are measured where edges cross; slivers
     "batch": 938,  # 900
     "pages": 414,  # 400
-    "cli": 1056,  # 800
+    "cli": 1055,  # 800
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 99, 48, 110  # 95, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 18_640, 38_300  # 17,800 and 36,000
