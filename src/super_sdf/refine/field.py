@@ -113,9 +113,9 @@ class FineField:
         can. The sign of ``pinned_nodes`` had to be changed to that of a voxel that holds no
         surface: if there are any, the input is not a distance field there, or the network failed.
         """
-        counts = self.found[0], self.found[1], len(self.voxel_ijk[own])
         pinned = 0 if self.pinned is None else int(self.pinned[own].sum())
-        return dict(zip(COUNTS, (*counts, self.parts.count_nodes(self.factor, own), pinned)))
+        nodes = self.parts.count_nodes(self.factor, own)
+        return dict(zip(COUNTS, (*self.found, len(self.voxel_ijk[own]), nodes, pinned)))
 
     @cached_property
     def numbers(self) -> IntArray:

@@ -30,7 +30,7 @@ LEAST_OF_MASK = np.float32(0.04)
 
 # The neighbours that share each part, the voxel itself included.
 SHARING = [
-    np.flatnonzero(((NEIGHBOURHOOD == 0) | (NEIGHBOURHOOD == part)).all(1))
+    np.flatnonzero(((NEIGHBOURHOOD == 0) | (part == NEIGHBOURHOOD)).all(1))
     for part in NEIGHBOURHOOD
 ]
 

@@ -102,8 +102,12 @@ def fit_to_spheres(
     """
     if not len(spheres.distance):  # in a noisy field, for example
         return
-    feet = find_foot_points(blocks, factor, spheres, index, threads)
-    correction = find_correction(feet, parts)
+
+    def touch(rows: slice) -> FootPoints:
+        return find_foot_points(blocks, factor, spheres.some(rows), index)
+
+    feet = map_chunks(touch, len(spheres.distance), TEMPORARIES, threads)
+    correction = find_correction(FootPoints(*map(_joined, zip(*feet))), parts)
 
     def subtract(rows: slice) -> None:
         blocks[:, rows] -= prolong(correction[:, rows], 2, factor)
@@ -148,7 +152,7 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
 
 
 def find_foot_points(
-    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, threads: int = 1
+    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex
 ) -> FootPoints:
     """Return the foot points of samples, leaving out those outside all blocks (Q, D + 1).
 
@@ -157,24 +161,18 @@ def find_foot_points(
     distance, since an error of the direction matters more. Spheres from beyond the band mostly
     touch edges, which linear cells cut off: that they are clear of them is no error.
     """
-
-    def search(rows: slice) -> FootPoints:
-        some = spheres.some(rows)
-        found, size = _touch(blocks, factor, some, index), np.abs(some.distance)
-        clear = (size >= MAX_DISTANCE) & (found.clearance > 0)
-        unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
-        aligned = np.clip(inner(found.direction, found.normal), 0, 1)
-        for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
-            aligned *= aligned
-        farther: FloatArray = np.maximum(size - np.float32(MAX_DISTANCE), 0)
-        penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
-        weights = aligned / penalty
-        values = np.clip(found.value, -MAX_ERROR, MAX_ERROR)
-        kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
-        return FootPoints(found.rows[kept], found.place[:, kept], values[kept], weights[kept])
-
-    parts = map_chunks(search, len(spheres.distance), TEMPORARIES, threads)
-    return FootPoints(*map(_joined, zip(*parts)))
+    found, size = _touch(blocks, factor, spheres, index), np.abs(spheres.distance)
+    clear = (size >= MAX_DISTANCE) & (found.clearance > 0)
+    unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
+    aligned = np.clip(inner(found.direction, found.normal), 0, 1)
+    for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
+        aligned *= aligned
+    farther: FloatArray = np.maximum(size - np.float32(MAX_DISTANCE), 0)
+    penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
+    weights = aligned / penalty
+    values = np.clip(found.value, -MAX_ERROR, MAX_ERROR)
+    kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
+    return FootPoints(found.rows[kept], found.place[:, kept], values[kept], weights[kept])
 
 
 def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Look:
@@ -273,10 +271,10 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
 
     def nodes_round(rows: slice, cells: int) -> tuple[NDArray[np.intp], FloatArray]:
         """Return the 8 nodes round foot points, (8, n), and their trilinear weights there."""
-        low, within = _find_cell(feet.place[:, rows], cells)
+        low, inside = _find_cell(feet.place[:, rows], cells)
         step = STRIDES * (2 // cells)
         at = (step @ low + (CORNERS @ step)[:, None]) * voxels + feet.rows[rows]
-        upper = np.stack([1 - within, within])  # (2, 3, n)
+        upper = np.stack([1 - inside, inside])  # (2, 3, n)
         x, y, z = CORNERS.T
         shares: FloatArray = upper[x, 0] * upper[y, 1] * upper[z, 2]
         return numbers.ravel().take(at).astype(np.intp), shares
@@ -315,8 +313,6 @@ def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
     ((cells + 1)^3, n) become ((finer + 1)^3, n). If the copies of shared nodes were equal before,
     they are equal, bit for bit.
     """
-    if cells == finer:
-        return values
     block = values.reshape(*(cells + 1,) * 3, -1)
     for axis in range(3):
         source = np.moveaxis(block, axis, 0)
