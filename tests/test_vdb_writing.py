@@ -21,7 +21,7 @@ from super_sdf import (
 )
 from super_sdf.errors import OptionError
 from super_sdf.files.grids import open_volume
-from super_sdf.files.vdb_writer import (
+from super_sdf.files.readers.vdb import (
     INSIDE,
     MIXED,
     OUTSIDE,

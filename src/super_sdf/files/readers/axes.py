@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import FileError, GridError, seen
 from ...grid.samples import UNNAMED, even_steps
-from . import Index, Request, axes_direction, triple
+from . import Index, Request, axes_direction, kept_of, triple
 
 SPACE = "xyz"
 STATED = ("spacing", "origin", "direction", "element_size_um")
@@ -30,6 +30,11 @@ class Axis(NamedTuple):
     start: float | None = None  # position of the first sample
     alias: str = ""  # another name, by an attribute of its coordinates
     is_down: bool = False  # the file's coordinates grow downwards; step and start are those upwards
+
+
+def in_unit(unit: str) -> tuple[str, ...]:
+    """Return a note on the unit that a file states, if it does."""
+    return (f"lengths are in the unit that it states, {unit}",) * bool(unit)
 
 
 def one_unit(units: Sequence[str]) -> tuple[bool, tuple[str, ...]]:
@@ -82,7 +87,7 @@ def placed(
     names = aliases if _are_space(aliases) and not _are_space(names) else names
     in_space = [n for n, name in enumerate(names) if name in tuple(SPACE)]
     index = request.pick(shape, in_space if _are_space(names) else None, names)
-    kept = [n for n, at in enumerate(index) if isinstance(at, slice)]
+    kept = kept_of(index)
     named, notes = [names[axis] for axis in kept], list[str]()
     if order == "zyx" and _are_space(names):
         order = "".join(named)
