@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
-from ..grid.samples import cropped, in_spacings
+from ..grid.samples import cropped, in_spacings, over_three
 from ..network.contract import Adapter, decode
 from ..threads import chunks_of
 from .band import Band
@@ -95,12 +95,11 @@ def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
             jumps = np.clip((rough - JUMPING) / (JUMPED - JUMPING), 0, 1)
             straight = np.pad(values, 2, mode="reflect", reflect_type="odd")
             found += jumps * (_evaluate(straight, ijk + 2, linear) - found)
-        cube, middle = found.reshape(factor + 1, factor + 1, factor + 1, -1), factor // 2
+        middle, nodes = factor // 2, found.reshape(factor + 1, factor + 1, factor + 1, -1)
         for axis in range(3):  # beyond the outermost samples the surface goes straight on
-            nodes, at = np.moveaxis(cube, axis, 0), voxel_ijk[rows, axis]
-            first, last = at == 0, at == shape[axis] - 1
-            nodes[:middle][..., first] = nodes[middle][..., first]
-            nodes[middle:][..., last] = nodes[middle][..., last]
+            lines, at = np.moveaxis(nodes, axis, 0), voxel_ijk[rows, axis]
+            for outer, end in ((slice(0, middle), 0), (slice(middle, None), shape[axis] - 1)):
+                lines[outer][..., at == end] = lines[middle][..., at == end]
         blocks[:, rows] = found
     blocks[:, :-1] -= np.float32(band.offset / unit)
     return blocks
@@ -135,13 +134,7 @@ def roughness(values: FloatArray) -> FloatArray:
             for step in range(5)
         )
         total += np.moveaxis(np.abs(e - 4 * d + 6 * c - 4 * b + a), 0, axis)
-    for axis in range(3):
-        lines = np.moveaxis(total, axis, 0)
-        largest = lines.copy()
-        np.maximum(largest[1:], lines[:-1], out=largest[1:])
-        np.maximum(largest[:-1], lines[1:], out=largest[:-1])
-        total = np.moveaxis(largest, 0, axis)
-    return total
+    return over_three(total, np.maximum)
 
 
 def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float32]) -> FloatArray:
