@@ -29,5 +29,5 @@ for offset in (0, 1, 2, 3, 99):
     mesh = extract_mesh(field, grid)
     write_mesh(mesh, out / f"part+{offset}.ply", force=True)
     print(
-        f"offset {offset}: {field.counts['band_voxels']:,} voxels -> {len(mesh.faces):,} triangles"
+        f"offset {offset}: {field.count()['band_voxels']:,} voxels -> {len(mesh.faces):,} triangles"
     )

@@ -10,13 +10,14 @@ import pytest
 import trimesh
 from solids import cube, inverted, joined, saved
 
-from super_sdf import Mesh, SdfGrid
-from super_sdf.check import check
-from super_sdf.check.check import LIMITS, check_mesh, exceeded
+from super_sdf import Mesh, SdfGrid, check
+from super_sdf.check import LIMITS, check_mesh, exceeded
 from super_sdf.files import meshes
+from super_sdf.truth.solid import Solid
 
 H = 1 / 24  # of the grids
 RADIUS = 0.4
+NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
 
 
 def sphere_values() -> np.ndarray:
@@ -101,11 +102,19 @@ def test_holes_components_and_twists_are_counted():
     assert check.examine_surface(Mesh(cube().vertices, collapsed)).faults() == []
 
 
+def test_slivers_and_needles_are_counted():
+    spiked = round_mesh(subdivisions=3)
+    spiked.vertices[0] *= 3.0
+    flat = np.array([[0, 0, 0], [1, 0, 0], [0.5, 0.004, 0]])
+    found = check.examine_surface(joined(spiked, Mesh(flat, np.array([[0, 1, 2]], np.int32))))
+    assert (found.slivers, found.needles) == (1, 1)
+
+
 def test_pairs_of_triangles_that_intersect_are_counted():
     corners = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, -0.5], [0.3, 0.2, 0.5], [0.2, 0.3, 0.5]]
     crossed = Mesh(np.array(corners, np.float64), np.array([[0, 1, 2], [3, 4, 5]], np.int32))
-    assert check.self_intersections(crossed) == 1
-    assert check.self_intersections(cube()) == 0
+    assert Solid(crossed).intersecting().tolist() == [[0, 1]]
+    assert len(Solid(cube()).intersecting()) == 0
 
 
 def test_a_vertex_shared_by_two_pieces_is_pinched():
@@ -168,7 +177,7 @@ def test_truncated_and_noisy_samples_promise_nothing(ball_mesh):
     assert found.report()["residual"] is None and found.strays is None
     assert "residual: unknown, since no sample is exact" in found.lines()
     none = dict.fromkeys(LIMITS)
-    assert exceeded(found, {**none, "max_mean": 9.0}) == [check.NO_EVIDENCE]
+    assert exceeded(found, {**none, "max_mean": 9.0}) == [NO_EVIDENCE]
     assert exceeded(found, none) == []
 
 
@@ -180,6 +189,9 @@ def test_of_a_mask_the_volume_is_beside_that_of_its_samples(here, command):
     share = trimesh.load("mask.ply").volume / inside - 1
     want = f"volume of the samples inside: {inside:.6g}; the mesh's volume is {share:+.2%} off"
     assert code == 0 and want in out and abs(share) < 0.02
+    assert "noisy" not in out and "residual: unknown, since the samples are no distances" in out
+    code, out, _ = command("check", "mask.ply", "mask.npz", "--unit", "mm", "--skip-intersections")
+    assert f" ({trimesh.load('mask.ply').volume / 1000:.6g} ml), area" in out
     moved = command("check", "mask.ply", "mask.npz", "--no-faults", "--origin", "-.5,-.5,-.5")
     assert moved[0] == 1 and " vertices where the grid has no surface" in moved[2]
     report = json.loads(command("check", "mask.ply", "mask.npz", "--json")[1])
@@ -216,12 +228,16 @@ def test_the_command_prints_figures(here, command):
     code, out, err = command("check", "ball.ply", "ball.npz", "--max-residual", 0.01, "--no-faults")
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert lines[0].startswith("mesh: 10,242 vertices, 20,480 triangles, 1 component, volume 0.26")
-    assert lines[1].endswith(" cut off and 0 noisy left out")
-    assert lines[2].startswith("residual in voxels: mean 0.001")
-    assert re.search(r"\), 0\.000\d+ in world units$", lines[2]), lines[2]
-    assert lines[3] == "above 0.1 voxel: 0.00% of the samples (0.00% not touching, 0.00% pierced)"
-    assert lines[4] == "faults: none (closed, oriented, manifold, no self-intersections)"
+    assert lines[0].startswith("mesh: 10,242 vertices, 20,480 triangles, 1 piece, volume 0.26")
+    assert lines[1] == (
+        "shape: 0 slivers (triangles with an angle under 0.5 degrees), "
+        "0 needles (vertices at the tip of a spike)"
+    )
+    assert lines[2].endswith(" cut off and 0 noisy left out")
+    assert lines[3].startswith("residual in voxels: mean 0.001")
+    assert re.search(r"\), 0\.000\d+ in world units$", lines[3]), lines[3]
+    assert lines[4] == "above 0.1 voxel: 0.00% of the samples (0.00% not touching, 0.00% pierced)"
+    assert lines[5] == "faults: none (closed, oriented, manifold, no self-intersections)"
     code, out, _ = command("check", "ball.ply", "ball.npz", "--skip-intersections")
     assert code == 0 and out.endswith("self-intersections: not counted\n")
     assert len(os.listdir()) == 3

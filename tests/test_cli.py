@@ -135,6 +135,8 @@ WRONG = {
     "in.npy --label 1.5": "--label is '1.5': give a whole number, -2^63 to 2^64 - 1",
     "in.npy --scale 0": "--scale is 0: give a number greater than 0",
     "in.npy --simplify -1": "--simplify is -1: give a number greater than 0",
+    "in.npy --mesher dual": "--mesher is 'dual': give one of auto, marching, sharp",
+    "in.npy --field scaled": "--field is 'scaled': give smooth",
     "in.npy --factor 18": f"--factor is 18: {FACTOR}",
     "in.npy --factor four": f"--factor is 'four': {FACTOR}",
     "in.npy --spacing 1,2": "--spacing is '1,2': give one number, or three",

@@ -5,7 +5,7 @@ import pytest
 from conftest import refusal, trilinear
 
 from super_sdf import DistanceFunction, reconstruct
-from super_sdf.check.check import check_mesh
+from super_sdf.check import check_mesh
 from super_sdf.errors import GridError, OptionError, OptionTypeError
 
 H = 2 / 19

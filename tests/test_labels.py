@@ -15,7 +15,7 @@ from conftest import refusal, trilinear
 from scipy.ndimage import gaussian_filter
 
 from super_sdf import load_network, make_grid, reconstruct, reconstruct_labels
-from super_sdf.check.check import check_mesh, examine_surface, self_intersections
+from super_sdf.check import check_mesh, examine_surface
 from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
 from super_sdf.grid.sdf_grid import volume_of_samples
 from super_sdf.labels import fewer
@@ -83,7 +83,7 @@ def test_meshes_are_closed_and_share_their_walls(name, factor, more):
     triangles = {label: corners_of(mesh) for label, mesh in meshes.items()}
     seen = sum(triangles.values(), Counter())
     for label, mesh in meshes.items():
-        assert examine_surface(mesh, self_intersections(mesh)).faults() == []
+        assert examine_surface(mesh, len(Solid(mesh).intersecting())).faults() == []
         assert set(triangles[label].values()) == {1}
     for a, b, c in seen:  # no two labels are on the same side of a triangle, nor three beside it
         assert seen[a, b, c] == 1
@@ -98,7 +98,7 @@ def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, network):
         made = reconstruct_labels(labels, "all", network, spacing=1.0, **more)
         for label, mesh in made.items():
             for some in (mesh, plain[label]):
-                assert examine_surface(some, self_intersections(some)).faults() == []
+                assert examine_surface(some, len(Solid(some).intersecting())).faults() == []
             if "tolerance" in more:
                 assert len(mesh.faces) < 0.95 * len(plain[label].faces)
                 assert Solid(mesh).distance(plain[label].vertices).max() <= 0.05
@@ -301,9 +301,15 @@ def test_labels_are_chosen_by_name(command, boxes):
         rows, _ = convert(command, boxes, "t.stl", "all", "--names", "t.json", "--force")
         assert [row["name"] for row in rows] == names
         assert [row["output"] for row in rows] == [f"t-{end}.stl" for end in ends]
+    run = "upsample", boxes, "one.ply", "--force", *PLAIN
+    assert command(*run, "--label", 5)[0] == 0
+    made = Path("one.ply").read_bytes()
+    assert command(*run, "--label", "left_kidney", "--names", "names.ctbl")[0] == 0
+    assert Path("one.ply").read_bytes() == made
     known = "names of the table (Background, liver&co, left_kidney)"
     for words, said in (
         (("--labels", "lung"), f"--labels has 'lung': give numbers, or {known}"),
+        (("--label", "lung"), "--label is 'lung': give a whole number, -2^63 to 2^64 - 1"),
         ((), "--names names.ctbl is for --labels: give that, too"),
     ):
         run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words

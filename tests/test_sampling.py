@@ -105,11 +105,20 @@ def test_the_layout_fits_round_the_box(padding):
     assert fitted_layout(mesh, spacing=0.25)[1] == 0.25
 
 
+@pytest.mark.parametrize("goal", [{"n": 33}, {"spacing": 0.25}, {"spacing": 0.5}], ids=str)
+def test_no_face_of_a_box_lies_on_a_plane_of_samples(goal):
+    for size in ([3, 1, 2], [2, 2, 2], [4, 3.5, 0.25]):
+        mesh = Mesh(cube().vertices * size, cube().faces)
+        _, spacing, origin = fitted_layout(mesh, **goal)
+        places = (np.stack([mesh.vertices.min(0), mesh.vertices.max(0)]) - origin) / spacing
+        assert np.abs(places - np.rint(places)).min() > 0.09
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({}, "give either the number of samples or the spacing"),
-        ({"n": 5}, "5 samples leave no room within a padding of 2 voxels"),
+        ({"n": 5}, "5 samples leave no room within a padding of 2.37 voxels"),
         ({"spacing": -1.0}, "spacing is -1: it must be greater than 0"),
         ({"n": 9, "padding": -1.0}, "padding is -1: give 0 voxels or more"),
     ],

@@ -11,13 +11,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from solids import cube, joined, sphere, square, torus
 
-from super_sdf import Mesh, SdfGrid, reconstruct, simplify_mesh
+from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
 from super_sdf.network.network import load_network
 from super_sdf.simplify import collapsing
-from super_sdf.simplify.collapsing import Original, irregular_places
-from super_sdf.truth.solid import Solid
+from super_sdf.simplify.collapsing import irregular_places
+from super_sdf.simplify.measuring import Original
+from super_sdf.truth.solid import Solid, smallest_angles
 
+PART = Path(__file__).parent.parent / "examples" / "part.npz"
 QUICK = ("--quality", "fast", "--factor", 2)
 UNREACHED = (
     "{} triangles cannot be reached while the mesh stays a manifold of the same topology: it has "
@@ -40,6 +42,13 @@ def refined(mesh: Mesh, times: int) -> Mesh:
         fine = fine.subdivide()
     fine.merge_vertices()
     return Mesh(np.array(fine.vertices), np.array(fine.faces, np.int32))
+
+
+def farthest(mesh: Mesh, other: Mesh) -> float:
+    """Return the largest distance of ten points on every triangle of a mesh to another one."""
+    shares = np.array([[i, j, 3 - i - j] for i in range(4) for j in range(4 - i)]) / 3
+    points = np.einsum("pc,mcd->mpd", shares, mesh.vertices[mesh.faces].astype(np.float64))
+    return float(Solid(other).distance(points.reshape(-1, 3)).max())
 
 
 def genus(mesh: Mesh) -> int:
@@ -91,6 +100,19 @@ def test_a_sphere_stays_within_the_error(error):
     assert off.max() <= error + 2e-3  # the fine mesh is within 2e-3 of the sphere
 
 
+@pytest.mark.parametrize("error", [0.005, 0.02, 0.1])
+def test_a_part_keeps_to_the_error_meets_itself_nowhere_and_has_no_slivers(error):
+    """Both ways, also where edges of the two meshes cross."""
+    mesh = reconstruct(read_grid(PART), load_network())
+    error *= read_grid(PART).voxel_size
+    found = simplify_mesh(mesh, error=error)
+    assert 0.7 * error < max(farthest(mesh, found.mesh), farthest(found.mesh, mesh)) <= error
+    assert found.deviation.largest == pytest.approx(farthest(mesh, found.mesh), rel=0.05)
+    assert is_closed_manifold(found.mesh) and len(Solid(found.mesh).intersecting()) == 0
+    corners = found.mesh.vertices[found.mesh.faces].astype(np.float64)
+    assert (smallest_angles(corners) < 0.5).mean() < 0.01
+
+
 @pytest.mark.parametrize("goal", [{"error": 0.05}, {"triangles": 4}], ids=str)
 def test_three_holes_and_all_components_stay(goal):
     plate = three_holes()
@@ -130,7 +152,8 @@ def test_any_field_stays_a_closed_manifold_within_the_error(seed, error, in_floa
     assert found.mesh.vertices.dtype == mesh.vertices.dtype
     assert is_closed_manifold(found.mesh)
     assert len(np.unique(found.mesh.vertices, axis=0)) == len(found.mesh.vertices)
-    assert max(found.deviation.largest, found.deviation.largest_back) <= error
+    assert max(farthest(mesh, found.mesh), farthest(found.mesh, mesh)) <= error
+    assert len(Solid(found.mesh).intersecting()) <= len(Solid(mesh).intersecting())
     before, after = (m.components()[0] for m in (mesh, found.mesh))
     assert before == after
 

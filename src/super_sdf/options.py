@@ -189,12 +189,11 @@ class Option(NamedTuple):
         return None if is_left_out else self.kind.check(value, name or flag(self.name))
 
     def parse(self, text: str) -> Any:
-        """Return the value that a text on the command line stands for."""
+        """Return the value, not checked, that a text on the command line stands for."""
         try:
-            value = self.kind.parse(text)
+            return self.kind.parse(text)
         except ValueError:
             raise wrong(text, flag(self.name), self.kind.give) from None
-        return self.check(value)
 
 
 def _option(default: Any, group: str, shows: str, kind: Kind, text: str, **more: Any) -> Any:
@@ -250,7 +249,8 @@ class Options:
         "What the values are: distances, distances with noise, a mask or its transform, or a "
         "smooth field, which has the surface of its own cubic spline; auto goes by the samples.")
     label: int | None = _option(None, VALUES, "read list", Kind("", check_label, _parse_label),
-        "Mesh the samples with the value N of a label image.", metavar="N")
+        "Mesh the samples with the value N of a label image, or its name by --names.",
+        metavar="N")
     labels: str | tuple[int | str, ...] | None = _option(None, VALUES, "list labels",
         Kind("", check_labels, _parse_labels),
         "Mesh all labels of a label image but 0, or those listed, with shared walls: as parts of "

@@ -88,7 +88,7 @@ def convert_job(
 
 def _check(job: Job, settings: Settings, mesh: Path, made: Conversion, sha256: str) -> Row:
     """Return the certificate of a mesh, or why there is none; keep what a page shows of it."""
-    from ..check.check import check_mesh, read_for_check
+    from ..check import check_mesh, read_for_check
     from ..pages.items import item_of_files, keep_item
 
     try:

@@ -52,7 +52,7 @@ TAKES = (
         help="Do not count self-intersections, which takes up to half of the time."),
     *map(table_option, READ),
     table_option("offset", "The --offset that the mesh was made with."),
-    table_option("unit", "The --unit that a .glb was made with."),
+    table_option("unit", "The unit of the mesh: of a .glb, and for volumes in ml."),
     table_option("max_memory", "Memory limit of the process, such as 1500M or 4G. Default: 60 % of "
         "the free memory. Larger meshes are refused."),
     *(SHARED[name] for name in ("force", "json", "quiet")),
@@ -64,7 +64,7 @@ TAKES = (
 def command(mesh: Path, grid: Path, out: Path | None, **given: Any) -> None:
     """Check the mesh, print the certificate, and fail where it exceeds a limit."""
     check_modules("check", "report", ("igl",))
-    from ..check import check
+    from .. import check
     from ..files.formats import files_of
     from ..files.output import check_apart
 

@@ -11,7 +11,7 @@ import click
 import numpy as np
 
 from .. import __version__, errors
-from ..options import DISTANCE, FLOAT32, MASK, MESHERS, Device
+from ..options import DISTANCE, FLOAT32, MASK, MESHERS, OPTIONS, Device
 from . import main
 from .main import SHARED, option, table_option
 
@@ -44,6 +44,7 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
     if source is not None and check:
         raise errors.OptionError(f"{source} and --check: give only one of them")
     facts: dict[str, Any]
+    OPTIONS["device"].check(device)
     if check:
         findings = []
         for state, what, says in run_checks(device):

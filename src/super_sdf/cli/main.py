@@ -30,6 +30,7 @@ PIPE_CLOSED = 141  # exit code of programs whose reader has ended: 128 and SIGPI
 OUTPUT = "Output"
 FILE = click.Path(path_type=Path)
 
+Paths = Iterable[str | Path]
 Decorator = Callable[[Any], Any]
 """Adds options to a command."""
 
@@ -109,9 +110,8 @@ def table_option(name: str, text: str = "") -> Decorator:
     more: dict[str, Any] = {"help": text or row.help, "group": row.group, "default": row.default}
     if isinstance(row.default, bool):
         return option(f"{word}/--{row.off}" if row.off else word, is_flag=True, **more)
-    more |= {"show_default": row.default is not None, "metavar": row.metavar}
-    if row.kind.choices:
-        return option(word, type=click.Choice(row.kind.choices), **more)
+    choices = f"[{'|'.join(row.kind.choices)}]" if row.kind.choices else None
+    more |= {"show_default": row.default is not None, "metavar": row.metavar or choices}
 
     def parse(context: click.Context, param: click.Parameter, value: Any) -> Any:
         return row.parse(value) if isinstance(value, str) else value
@@ -123,7 +123,7 @@ def table_option(name: str, text: str = "") -> Decorator:
 SHARED = {
     "names": option("--names", type=FILE, metavar="TABLE", group=VALUES,
         help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP "
-        "or FreeSurfer, CSV, or JSON such as nnU-Net's. --labels takes names then."),
+        "or FreeSurfer, CSV, or JSON such as nnU-Net's. --label and --labels take names then."),
     "cluster": option("--cluster", metavar="ADDRESS", group=WORK,
         help="Convert on the workers of the Dask scheduler at ADDRESS, each within --max-memory, "
         "or with 'local' on Dask workers of this machine. Needs the extra cluster."),
@@ -145,6 +145,11 @@ SHARED = {
 
 def chosen_options(given: dict[str, Any]) -> Options:
     """Return the options of a conversion, from all options of a command that may go with them."""
+    if given.get("names") and isinstance(given["label"], str):
+        from ..labels.files import read_names
+
+        numbers = {entry.name: number for number, entry in read_names(given["names"]).items()}
+        given = {**given, "label": numbers.get(given["label"], given["label"])}
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
         check_modules(flag(name), "simplify")
@@ -162,19 +167,12 @@ def chosen_options(given: dict[str, Any]) -> Options:
 
 
 def check_names(given: dict[str, Any], labels: Any) -> None:
-    """Raise OptionError if there are names, and no labels are meshed."""
-    if given["names"] and not labels:
+    """Raise OptionError if there are names, and no labels are meshed, nor one by its name."""
+    if given["names"] and not labels and not isinstance(given["label"], str):
         raise OptionError(f"--names {given['names']} is for --labels: give that, too")
 
 
-def check_page(
-    word: str,
-    page: Path,
-    sources: Iterable[str | Path],
-    others: Iterable[str | Path] = (),
-    *,
-    force: bool,
-) -> None:
+def check_page(word: str, page: Path, sources: Paths, others: Paths, *, force: bool) -> None:
     """Raise if a page cannot be written, is a file that a source is read from, or an output."""
     from ..files.formats import files_of
     from ..files.output import check_apart, check_free

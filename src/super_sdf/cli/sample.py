@@ -31,7 +31,7 @@ TAKES = (
     option("--spacing", type=float, metavar="H",
         help="World distance between samples, instead of -n."),
     option("--padding", type=float, metavar="VOXELS",
-        help="Voxels between the bounding box of the mesh and the outermost samples. Default: 2."),
+        help="Voxels between the bounding box of the mesh and the last samples. Default: 2.37."),
     option("--frame", type=click.Choice(["world", "unit"]), default="world", show_default=True,
         help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and "
         "centres it in a unit cube, sampled at n^3 voxel centres."),
@@ -51,7 +51,7 @@ def command(source: Path, target: Path, **given: Any) -> None:
     check_modules("sample", "eval")
     from ..files.grids import check_grid_target, write_grid
     from ..files.output import check_apart
-    from ..truth.sampling import check_numbers, fitted_layout, sample_solid, unit_layout
+    from ..truth.sampling import PADDING, check_numbers, fitted_layout, sample_solid, unit_layout
     from ..truth.solid import Solid, load_solid, normalise
 
     start, in_unit = time.perf_counter(), given["frame"] == "unit"
@@ -62,7 +62,7 @@ def command(source: Path, target: Path, **given: Any) -> None:
         raise OptionError("--frame unit has a side of 1: give -n, no --spacing and no --padding")
     if (count is None) == (spacing is None):
         raise OptionError("give either -n (samples along the longest axis) or --spacing")
-    padding = 0.0 if in_unit else 2.0 if given["padding"] is None else given["padding"]
+    padding = given["padding"] if given["padding"] is not None else PADDING * (not in_unit)
     check_numbers(count, spacing, padding, given["band"])
     solid, notes = load_solid(source, allow_open=given["allow_open"])
     if in_unit:

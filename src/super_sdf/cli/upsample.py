@@ -78,7 +78,7 @@ def command(source: str, target: str, **given: Any) -> None:
 
         report["network"] = sha256(network.path.read_bytes()).hexdigest()
     if given["check"]:
-        from ..check.check import check_mesh, read_for_check
+        from ..check import check_mesh, read_for_check
 
         try:
             certificate = check_mesh(*read_for_check(target, source, options, done), options)

@@ -42,7 +42,7 @@ def command(sources: tuple[str, ...], out: Path | None, **given: Any) -> None:
     from ..pages.html import viewed_page, write_page
 
     if out:
-        main.check_page("--out", out, sources, force=given["force"])
+        main.check_page("--out", out, sources, (), force=given["force"])
     text = viewed_page(sources, main.chosen_options(given))
     page = out or Path(mkdtemp(prefix="super-sdf-"), "view.html")  # only this user can read it
     write_page(text, page, force=given["force"])

@@ -120,7 +120,7 @@ class ImageAccessor:
         faces: Any = mesh.faces  # PyVista takes them with any integers
         surface = pyvista.PolyData.from_regular_faces(mesh.vertices, faces)
         if residuals:
-            from ..check.check import check_mesh
+            from ..check import check_mesh
 
             options = Options(offset=offset, max_memory=max_memory)
             found = check_mesh(mesh, grid, options, intersections=False)

@@ -1,20 +1,17 @@
 """Samples made of others (masks, truncated and resampled distances), and of functions.
 
 A mask only says which samples are inside. Its surface passes half-way between a sample inside and
-one outside, for want of better knowledge. So the distance of a sample is that to the nearest sample
-of the other side, less half a voxel: the Euclidean distance transform of both sides, exact up to
-``REACH`` voxels and constant beyond, since farther samples do not matter to the surface.
+one outside. So the distance of a sample is that to the nearest one of the other side, less half a
+voxel: the Euclidean distance transform of both sides, up to ``REACH`` voxels.
 
 Of a truncated field, a sample x with distance d and gradient n touches the surface at the foot
 point x - d n. The distance of a sample that was cut off is that to the nearest foot point of the
 others, and no less than where it was cut off.
 
 Between two samples of an axis that is resampled the values are those of a cubic polynomial
-(Hermite), which obeys the two laws of distances. The gradient has length 1, so the differences
-across the line tell how steep the field is along it: the slope is kept within what they allow, and
-near the differences along the line, so that a linear field which is no distance is reproduced. And
-two distances differ by no more than their points are apart, so the samples round a point bound its
-value (McShane, Whitney): it is kept within, unless they contradict each other, as noise does.
+(Hermite). The gradient has length 1, so the differences across the line bound the slope along it.
+And two distances differ by no more than their points are apart: the samples round a point bound its
+value (McShane, Whitney), unless they contradict each other, as noise does.
 
 A function is sampled in cells of 8^3 spacings first, then in their eighths. A cell is left out if
 even the steepest slope seen would not bring the values at its corners down to those of ``reach``

@@ -130,11 +130,13 @@ class Case:
         field = replace(field, facts=facts, given=self.wanted.field == field.kind)
         if self.known is not None and self.known.unseen is not None:
             field = replace(field, unseen=self.known.unseen, why_open=self.known.why_open)
-        positive = more.pop("positive_inside", None)
-        positive = self.positive_inside if positive is None else positive
-        extremes = more.pop("extremes", (self.look.low, self.look.high))
-        samples = more.pop("samples", self.samples)
-        return Taken(samples, extremes, spacing, positive, field, self.notes)
+        positive = (
+            more.pop("positive_inside") if "positive_inside" in more else self.positive_inside
+        )
+        kept = {"samples": self.samples, "extremes": (self.look.low, self.look.high)} | more
+        return Taken(
+            **kept, spacing=spacing, positive_inside=positive, field=field, notes=self.notes
+        )
 
 
 def interpret(
@@ -199,8 +201,6 @@ def _as_recognised(case: Case, answer: Answer) -> Taken:
         if "two values" not in answer.why:
             case.notes.append(f"the values are {answer.why}")
         return _of_sides(case, facts)
-    if case.look.is_one_sided and wanted.inside == AUTO and answer.kind != DISTANCE:
-        raise GridError(f"no value is on one side of 0: {which_level(case.look)}")
     if answer.kind == SMOOTH:
         if answer.why:
             case.notes.append(
@@ -285,11 +285,7 @@ def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None)
     """Return the distances of the samples that are true to those that are not, on the lattice."""
     positive = case.wanted.inside == "positive"
     if case.wanted.inside == AUTO:  # the border is outside
-        ends = [np.asarray(mask[i]) for i in (0, -1)]
-        sides = [plane[edge] for plane in mask for edge in (0, -1)]
-        sides += [plane[:, edge] for plane in mask for edge in (0, -1)]
-        faces = np.concatenate([x.ravel() for x in (*ends, *sides)])
-        above = float(faces.mean())
+        above = float(look_at(mask).faces.mean())
         positive, share = above < 0.5, max(above, 1 - above)
         if share < 1:
             case.notes.append(

@@ -8,7 +8,7 @@ is one slab. Of these, seeded samples are kept: what is asked are shares, for wh
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -58,16 +58,16 @@ class Look:
     infinite: int
     few: list[Any]  # different finite values, up to ``FEW`` of them, as found
     faces: NDArray[Any]  # all samples on the border of the grid
-    slabs: list[Slab]
-    scale: float  # by which what is kept was divided
-    boxes: Floats  # (n, 5, 5, 5), round samples beside the surface at 0
-    lines: Floats  # (m, 3, 5), through samples that are neither the lowest nor the highest
-    pairs: list[Floats]  # of each axis: neighbours that differ, (2, k)
-    at_ends: tuple[
-        float, float
-    ]  # share of the samples amid others that are the lowest, the highest
-
-    common: dict[float, float]  # other values, and their shares, of which one sample in 100 is
+    slabs: list[Slab] = field(default_factory=list)
+    scale: float = 1.0  # by which what is kept was divided
+    # samples (n, 5, 5, 5) round some beside the surface at 0
+    boxes: Floats = field(default_factory=lambda: np.empty((0, 5, 5, 5)))
+    # (m, 3, 5), through samples that are neither the lowest nor the highest
+    lines: Floats = field(default_factory=lambda: np.empty((0, 3, 5)))
+    pairs: list[Floats] = field(default_factory=list)  # of each axis: different neighbours, (2, k)
+    at_ends: tuple[float, float] = 0.0, 0.0  # share of the samples amid the lowest, the highest
+    # other values, and their shares, of which one sample in 100 is amid equal ones
+    common: dict[float, float] = field(default_factory=dict)
 
     @property
     def is_finite(self) -> bool:
@@ -116,19 +116,14 @@ def look_at(samples: SampleArray) -> Look:
         faces += [plane[0], plane[-1], plane[:, 0], plane[:, -1]]
         if i % SLABS == 0:
             let_go(samples)
-    look = Look(tuple(map(int, samples.shape)), low, high, unknown, infinite, few,
-                np.concatenate(faces), [], 1.0, *_nothing())  # fmt: skip
+    shape, together = tuple(map(int, samples.shape)), np.concatenate(faces)
+    look = Look(shape, low, high, unknown, infinite, few, together)
     if not low < high:
         return look
     if high <= 0:
         changes = np.array([np.count_nonzero(plane < 0) for plane in samples])
     look = replace(look, slabs=_slabs(samples, changes))
     return _with_samples(look)
-
-
-def _nothing() -> tuple[Floats, Floats, list[Floats], tuple[float, float], dict[float, float]]:
-    none = [np.empty((2, 0))] * 3
-    return np.empty((0, 5, 5, 5)), np.empty((0, 3, 5)), none, (0.0, 0.0), {}
 
 
 def _beside(plane: BoolArray, former: BoolArray | None) -> list[tuple[BoolArray, BoolArray]]:
@@ -251,8 +246,8 @@ def border_share(look: Look, is_marked: Callable[[NDArray[Any]], BoolArray]) -> 
 def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float:
     """Return the median slope beside the surface, between samples that are not ``cut`` off.
 
-    Along each axis it is the steeper one to both sides of a sample, if some are cut off, and the
-    mean if none are. NaN if it is not known.
+    Along each axis it is the steeper one to both sides of a sample, if most are beside some that
+    are cut off, else the mean. NaN if it is not known.
     """
     boxes = look.boxes[:, 1:4, 1:4, 1:4]
     lines = np.stack([boxes[:, :, 1, 1], boxes[:, 1, :, 1], boxes[:, 1, 1]], 1)
@@ -260,7 +255,7 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
     rise = np.diff(lines) / (steps[:, None] / look.scale)
     mean = np.sqrt((rise.mean(2) ** 2).sum(1))
     known = np.isfinite(mean) & (mean > 0)
-    if known.sum() >= ENOUGH or not len(cut):
+    if known.sum() >= max(ENOUGH, len(lines) / 2) or not len(cut):
         return float(np.median(mean[known])) if known.any() else float("nan")
     steep = np.nan_to_num(np.abs(rise)).max(2)
     length = np.sqrt((steep**2).sum(1))[(steep > 0).all(1)]

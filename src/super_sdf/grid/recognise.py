@@ -68,8 +68,10 @@ EXACT = 0.02  # spacings, and share of a slope: the error of differences of exac
 SAME_UNIT = 0.01  # from 1: exact to .002; saturating and smooth unions from .019
 MOST_DIGIT = 0.12  # spacings: the last digit of rounded distances
 MATTERS = 3.0  # spacings: values farther from 0 may be anything
-NARROW = 2.5  # spacings up to which values that are cut off have too few slopes to judge
-SLOPE_OFF = 0.25  # of the slope between these from 1: cut off at half a voxel .05, fused .4
+NARROW = 4.5  # spacings up to which values that are cut off have too few slopes to judge
+NEVER = 5e-4  # contradictions of these: cut off 0, fused depth images from .0018
+SLOPE_NEAR = 0.5, 1.25  # of these: cut off at half a voxel .55 to 1.05, in half the unit .5 and 2
+SLOPE_OFF = 0.25  # of rounded distances from 1
 CROWDED = 0.7  # of the uncut samples, those in the last tenth: cut off to .55, tanh from .85
 SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
 THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
@@ -111,31 +113,24 @@ def recognise(
     """Return what samples are; ``given`` is the spacing (3,), ``hint`` what a file says of them."""
     facts: dict[str, Any] = {"cut": cut_values(look)}
     if hint == "labels":
-        return Answer("labels", "the file says so", facts, which_label(samples))
+        return Answer("labels", "", facts, which_label(samples))
     if len(look.few) == 2:
         if not _is_plane(look):
             return Answer("mask", "there are two values", facts)
         steps = np.full(3, look.high - look.low) if given is None else given
         return Answer("distance", "", facts | {"spacing": steps})
     if look.is_finite and not hint and _are_labels(samples, look, facts):
-        why = "whole numbers in regions of equal ones"
-        return Answer("labels", why, facts, which_label(samples))
+        return Answer("labels", "", facts, which_label(samples))
     transform = "a distance transform, so only their sign says something"
-    if not hint:
-        _follow_from_signs(look, given, facts)
-    follow = facts.get("follow", 0.0) >= FOLLOW
-    is_sure = (
-        follow and facts["stepped"] and max(facts["shape"] - FOLLOW, facts["zeros"] - ZEROS) >= 0
-    )
-    if is_sure or (follow and _jump_over_0(look)):
+    follow = not hint and _follow_from_signs(look, given, facts)
+    is_sure = follow and (facts["shape"] >= FOLLOW or facts["zeros"] >= ZEROS)
+    if (is_sure and facts["stepped"]) or (follow and _jump_over_0(look)):
         return Answer("mask", transform, facts | {"zeros": _side_of_zeros(look)})
     signs = look
     look = _without_sentinels(look, facts)
     facts["digit"] = _last_digit(look)
-    inner = np.where(
-        np.isin(look.lines, [x / look.scale for x in facts["cut"]]), np.nan, look.lines
-    )
-    unit = _find_unit(inner, given, facts)
+    is_cut = np.isin(look.lines, np.array(facts["cut"]) / look.scale)
+    unit = _find_unit(np.where(is_cut, np.nan, look.lines), given, facts)
     enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
     if unit is not None and enough and facts["slopes"] >= SLOPES:
         steps = unit * (np.ones(3) if given is None else given)
@@ -145,7 +140,7 @@ def recognise(
     if follow and facts["stepped"]:
         return Answer("mask", transform, facts | {"zeros": _side_of_zeros(signs)})
     if hint == "density":
-        return Answer("density", "the file says so", facts, which_level(look))
+        return Answer("density", "", facts, which_level(look))
     if look.is_one_sided:
         return _of_one_side(look, facts)
     if "perhaps_unknown" in facts:
@@ -153,7 +148,7 @@ def recognise(
         said = f"beside some of the samples that are {value:g} the values jump: --unknown {value:g}"
         return Answer("smooth", "", facts, said)
     if given is not None and _is_cut_near(look, given, facts):
-        return Answer("distance", "cut off near the surface", facts | {"spacing": given})
+        return Answer("distance", "", facts | {"spacing": given})
     return _of_both_sides(look, given, facts)
 
 
@@ -219,8 +214,8 @@ def _share_amid(look: Look, distinct: NDArray[Any], counts: NDArray[np.int64], l
     return equal / total if total else 1.0
 
 
-def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> None:
-    """Find whether samples beside the surface are equal wherever the 27 signs round them are.
+def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
+    """Return whether samples beside the surface are equal wherever the 27 signs round them are.
 
     Of one shape they all have one size. So have distances to faces along the axes, which differ by
     their steps; others may follow by chance, which is told by their slopes.
@@ -255,6 +250,7 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
             is_many = patterns > PATTERNS or patterns > OF_ALL * most
             facts.update(follow=share, shape=shape, stairs=stairs, step=typical * look.scale)
             facts["stepped"] = stairs > STAIRS and is_many and len(cut) < 2
+    return bool(facts["follow"] >= FOLLOW)
 
 
 def _jump_over_0(look: Look) -> bool:
@@ -460,11 +456,13 @@ def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
         return Answer("distance", "", facts, said)
     if np.median(walls[walls > -0.25]) > THICK if (walls > -0.25).any() else False:
         return Answer("distance", "", facts)
-    inside = "negative" if sign > 0 else "positive"
-    said = (
-        "unsigned distances have no inside: mesh the shell round the surface with "
-        f"--inside {inside} --offset {h:.4g}"
-    )
+    return _unsigned(sign, h, facts)
+
+
+def _unsigned(sign: int, h: float, facts: dict[str, Any]) -> Answer:
+    """Return the refusal of distances without a sign; ``sign`` is that of all values."""
+    option = f"--inside {'negative' if sign > 0 else 'positive'} --offset {h:.4g}"
+    said = f"unsigned distances have no inside: mesh the shell round the surface with {option}"
     return Answer("distance", "", facts, said)
 
 
@@ -476,10 +474,10 @@ def _is_cut_near(look: Look, given: Floats, facts: dict[str, Any]) -> bool:
     size = np.abs(look.lines[:, 0, 2]) / (min(cut) / look.scale)
     size = size[np.isfinite(size)]
     facts["crowded"] = float((size > 0.9).mean()) if size.size else 0.0
-    if _contradictions(look, given / look.scale, facts["digit"]) > CONTRADICTIONS:
+    if _contradictions(look, given / look.scale, facts["digit"]) > NEVER:
         return False
     slope = typical_slope(look, given, facts["cut"])
-    return facts["crowded"] < CROWDED and abs(slope - 1) < SLOPE_OFF
+    return facts["crowded"] < CROWDED and SLOPE_NEAR[0] < slope < SLOPE_NEAR[1]
 
 
 # Questions 6 to 8: noise, densities, smooth fields
@@ -497,8 +495,7 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
         why = f"distances rounded to {digit * look.scale:.3g}"
         return Answer("noisy", why, facts | {"spacing": steps * look.scale})
     if not is_tsdf and has_few_digits:
-        why = "values of few digits with no slope of distances"
-        return Answer("density", why, facts, which_level(look, signed=True))
+        return Answer("density", "", facts, which_level(look, signed=True))
     if given is not None and _is_noise(look, given / look.scale, facts):
         return Answer("noisy", "distances with noise", facts | {"spacing": given})
     middle = np.abs(look.lines[:, 0, 2])
@@ -509,8 +506,7 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
         at_0, best = (((pairs[0] > x) != (pairs[1] > x)).sum() for x in (0.0, _parting(look)))
         facts["area"] = float(at_0 / max(best, 1))
         if facts["centred"] < CENTRED and facts["area"] > AREA:
-            why = "most values are near 0"
-            return Answer("density", why, facts, which_level(look, signed=True))
+            return Answer("density", "", facts, which_level(look, signed=True))
     return Answer("smooth", "the slope is not that of a distance everywhere", facts)
 
 
@@ -560,13 +556,8 @@ def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
     facts["rising"] = float(np.median(np.abs(pairs[0] - pairs[1]))) * look.scale / steep
     is_unsigned = nearest not in facts["cut"] and facts["rising"] > RISING
     if is_unsigned and VALLEY[0] < found < VALLEY[1]:
-        inside = "negative" if sign > 0 else "positive"
-        said = (
-            "unsigned distances have no inside: mesh the shell round the surface with "
-            f"--inside {inside} --offset {steep:.4g}"
-        )
-        return Answer("distance", "", facts, said)
-    return Answer("density", "no value is on the other side of 0", facts, which_level(look))
+        return _unsigned(sign, steep, facts)
+    return Answer("density", "", facts, which_level(look))
 
 
 def _parting(look: Look) -> float:

@@ -76,10 +76,9 @@ class SdfGrid:
     Raises
     ------
     GridError
-        If the array is not three-dimensional, finite, and at least 2 samples long on each axis; if
-        most of its border is negative; if the spacing is not positive, or the direction no rotation
-        or mirrored rotation; or if the values change from sample to sample by more than the
-        spacing.
+        If the array is no finite grid of at least 2 samples along each of three axes; if most of
+        its border is negative; if the spacing is not positive, the direction is no rotation, or the
+        values change by more than the spacing.
     """
 
     samples: SampleArray
@@ -118,10 +117,8 @@ class SdfGrid:
             )
         rise, h = typical_slope(look, np.ones(3)), max(steps)
         if rise > MOST_RISE * h:
-            raise GridError(
-                f"the values change by {rise:.6g} from sample to sample, but spacing is {h:.6g}: "
-                "give distances in the unit of the spacing, or make the grid with make_grid"
-            )
+            said = f"the values change by {rise:.6g} from sample to sample, but spacing is {h:.6g}"
+            raise GridError(f"{said}: give distances in its unit, or use make_grid")
         place, extremes = (steps, given.origin, ()), (low, high)
         grid = self.trusted(samples, *place, direction=direction, extremes=extremes)
         vars(self).update(vars(grid))

@@ -18,8 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from .. import __version__, load_network
-from ..check import check
+from .. import __version__, check, load_network
 from ..convert import convert
 from ..errors import SuperSdfError
 from ..files.formats import is_grid

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..check.check import FULL, Certificate, check_mesh, read_for_check
+from ..check import FULL, Certificate, check_mesh, read_for_check
 from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
 from ..grid.sdf_grid import cubic_grid

@@ -95,12 +95,11 @@ def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
             jumps = np.clip((rough - JUMPING) / (JUMPED - JUMPING), 0, 1)
             straight = np.pad(values, 2, mode="reflect", reflect_type="odd")
             found += jumps * (_evaluate(straight, ijk + 2, linear) - found)
-        cube, middle = found.reshape(factor + 1, factor + 1, factor + 1, -1), factor // 2
+        middle, nodes = factor // 2, found.reshape(factor + 1, factor + 1, factor + 1, -1)
         for axis in range(3):  # beyond the outermost samples the surface goes straight on
-            nodes, at = np.moveaxis(cube, axis, 0), voxel_ijk[rows, axis]
-            first, last = at == 0, at == shape[axis] - 1
-            nodes[:middle][..., first] = nodes[middle][..., first]
-            nodes[middle:][..., last] = nodes[middle][..., last]
+            lines, at = np.moveaxis(nodes, axis, 0), voxel_ijk[rows, axis]
+            for outer, end in ((slice(0, middle), 0), (slice(middle, None), shape[axis] - 1)):
+                lines[outer][..., at == end] = lines[middle][..., at == end]
         blocks[:, rows] = found
     blocks[:, :-1] -= np.float32(band.offset / unit)
     return blocks

@@ -2,17 +2,15 @@
 
 pyfqmr is fast quadric mesh simplification (Forstmann): an edge is collapsed if the sum of squared
 distances of the new vertex to the planes of the triangles it replaces is under a threshold, which
-rises in every round. It neither bounds the distance of triangles nor keeps every mesh a manifold.
-So the mesh of the last pass is measured. Where it is too far from the unsimplified mesh, or not a
-manifold, the triangles around the place are kept in the first pass that got it wrong, and this pass
-and those after it are made anew. Distances are exact, from points to triangles: vertices, a pattern
-of points on the simplified mesh, and the middles of triangles where a corner may not be farthest.
+rises in every round. It neither bounds the distance of triangles nor keeps every mesh a manifold
+without intersections. So the mesh of the last pass is examined. Where it is too far from the
+unsimplified mesh, not a manifold, or meets itself, the triangles around the place are kept in the
+first pass that got it wrong, and this pass and those after it are made anew.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from threading import Lock
 from typing import Any
 
@@ -21,157 +19,69 @@ from numpy.typing import NDArray
 from pyfqmr import Simplify
 
 from ..surface.mesh import Mesh, row_keys
-from ..truth.solid import Distances, Points, Solid
+from ..truth.solid import Points, Solid, smallest_angles
+from .measuring import Original, mean_side
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
-# of the sum of squares), in each pass. What an early pass gets wrong costs most time, so they rise;
-# with an end of 1.4 or 2.8, more triangles are left.
-PLANE_DISTANCES = 1.0, 1.4, 1.7, 2.0, 2.0
+# of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
+# the error, those of the second do at some places, and leave a fifth fewer triangles.
+PLANE_DISTANCES = (1.0,), (1.4, 1.4, 1.4), (1.7, 1.7)
 ROUNDS = 30, 3.0  # of the threshold, and its rise; from more rounds, meshes get no smaller
 FEW_ROUNDS, LARGE = (8, 5.0), 1 << 12  # nearly as well, from this many triangles on
+FEW_SLIVERS = 0.002  # of the triangles, which stay
+THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
 MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
-POINTS_AT_ONCE, SIDES = 1 << 18, 2 / 3  # sides of the unsimplified mesh between points
 # A number of triangles is sought by the error that leaves as many.
 MOST_ERRORS = 12  # that are tried
 FIRST_ERROR = 0.006  # in sides of a triangle, over the share of the triangles that is wanted
 STRIDE, CLOSE = 4.0, 1.02  # largest ratio of an error to the next, and smallest of two in the end
-FARTHEST, NEAR_END = 0.05, 1.2  # over the diagonal: larger errors leave no fewer; near it, to stop
-MARGIN = 1.06  # fewer triangles by about this factor if simplified again within the same error
+FARTHEST = 0.05  # error over the diagonal: larger ones leave no fewer
+MARGIN = 1.03  # over the triangles that are left: near enough
 
-Collapse = Callable[[Mesh, NDArray[np.bool_]], Mesh]
-"""Collapses edges of a mesh, but those of the triangles in a mask, (m,)."""
-
-
-class Original:
-    """A mesh before it was simplified, to measure simplified ones against.
-
-    What was measured of one simplified mesh holds for the triangles that the next one still has: to
-    them, the distance of a vertex is no larger, and theirs is the same.
-    """
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.mesh, self.solid, self.step = mesh, Solid(mesh), SIDES * mean_side(mesh)
-        self.distance = np.zeros(len(mesh.vertices))
-        self.near = np.zeros(len(mesh.vertices), np.uint64)  # key of a triangle; 0: not measured
-        self.back: dict[int, tuple[float, float]] = {}  # by key: largest distance, and its integral
-
-    def compare(
-        self, other: Solid, error: float = np.inf
-    ) -> tuple[Points, tuple[float, float, float, float]]:
-        """Return points of this mesh, (n, 3), where the other is farther away than an error.
-
-        They are its vertices, or if these are near enough, the middles of its triangles, or else
-        what is nearest to points of the other. The numbers, those of ``Deviation``, are right if
-        there are none.
-        """
-        vertices, nowhere = self.solid.mesh.vertices, (np.inf,) * 4
-        keys = row_keys(other.mesh.vertices[other.mesh.faces].reshape(-1, 9))
-        stale = ~np.isin(self.near, keys)
-        self.distance[stale], face, _ = other.nearest(vertices[stale])
-        self.near[stale] = keys[face]
-        if (far := self.distance > error).any():
-            self.near[far] = 0
-            return vertices[far], nowhere
-        # Triangles are convex: one whose corners are near the same triangle of the other mesh is
-        # nowhere farther from it than its corners.
-        near = self.near[self.mesh.faces]
-        middles = vertices[self.mesh.faces[(near[:, :1] != near[:, 1:]).any(1)]].mean(1)
-        off = other.distance(middles)
-        if (far := off > error).any():
-            return middles[far], nowhere
-        known = np.array([self.back.get(key, (np.nan, 0.0)) for key in keys.tolist()])
-        new = np.flatnonzero(~(known[:, 0] <= error))
-        known[new], wrong = 0.0, [np.zeros((0, 3))]
-        for points, weights, face in points_within(other.mesh, new, self.step):
-            found, _, feet = self.solid.nearest(points)
-            wrong.append(feet[found > error])
-            np.maximum.at(known[:, 0], face, found)
-            known[:, 1] += np.bincount(face, found * weights, len(known))
-        self.back.update(zip(keys[new].tolist(), map(tuple, known[new].tolist())))
-        around, area = self.distance[self.mesh.faces].mean(1), areas(self.solid.mesh)
-        largest = max(float(self.distance.max()), float(off.max(initial=0)))
-        mean_back = float(known[:, 1].sum() / areas(other.mesh).sum())
-        means = float(around @ area / area.sum()), mean_back
-        return np.concatenate(wrong), (largest, means[0], float(known[:, 0].max()), means[1])
-
-
-def areas(mesh: Mesh) -> Distances:
-    """Return the areas of triangles, (m,)."""
-    a, b, c = mesh.vertices[mesh.faces.T]
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-
-
-def mean_side(mesh: Mesh) -> float:
-    """Return the mean length of the first sides of all triangles."""
-    start, end = mesh.vertices.astype(np.float64)[mesh.faces[:, :2].T]
-    return float(np.linalg.norm(end - start, axis=1).mean())
-
-
-def points_within(
-    mesh: Mesh, some: NDArray[np.intp], step: float
-) -> Iterator[tuple[Points, Distances, NDArray[np.intp]]]:
-    """Yield points on some triangles, (n, 3), their areas and triangles, (n,), in chunks.
-
-    They are the corners, without an area, and the middles of a pattern of cells on each triangle:
-    as many along its longest side, and across, as are needed to be no wider than a step.
-    """
-    corners, row = mesh.vertices[mesh.faces[some]], np.arange(len(some))
-    yield corners.reshape(-1, 3), np.zeros(3 * len(some)), np.repeat(some, 3)
-    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)
-    apex, low, high = (corners[row, (sides.argmax(1) + turn) % 3] for turn in range(3))
-    area, side = areas(Mesh(mesh.vertices, mesh.faces[some])), sides.max(1, initial=0)
-    across = np.divide(2 * area, side, out=np.zeros(len(side)), where=side > 0)
-    along, rows = (np.maximum(np.ceil(x / step), 1).astype(np.int64) for x in (side, across))
-    ends = np.cumsum(along * rows)
-    for first in range(0, int(ends[-1]) if len(ends) else 0, POINTS_AT_ONCE):
-        number = np.arange(first, min(first + POINTS_AT_ONCE, ends[-1]))
-        face = np.searchsorted(ends, number, side="right")
-        line, column = np.divmod(number - ends[face] + along[face] * rows[face], along[face])
-        v, u = (line + 0.5) / rows[face], (column + 0.5) / along[face]
-        base = low[face] + u[:, None] * (high[face] - low[face])
-        # cells are narrower, and so stand for less, towards the apex
-        weight = area[face] * 2 * (1 - v) / (along[face] * rows[face])
-        yield base + v[:, None] * (apex[face] - base), weight, some[face]
+Pass = Sequence[dict[str, float]]
+"""What ``collapse_edges`` is told, step by step."""
 
 
 def collapsed(
     mesh: Mesh,
-    passes: Sequence[Collapse],
+    passes: Sequence[Pass],
+    original: Original,
+    error: float,
     count_round: Callable[[], None],
-    original: Original | None = None,
-    error: float = np.inf,
 ) -> Mesh | None:
     """Return what the last pass makes once nothing is wrong with it, None if that fails.
 
-    Right is a mesh within the error of the original, if there is one, with no place that is less
-    of a manifold than in ``mesh``, with all its components and their holes.
+    Right is a mesh within the error of the original, with no place that is less of a manifold than
+    in ``mesh``, without triangles that intersect, with all components and their holes.
     """
-    meshes, solids, is_closed = [mesh], [Solid(mesh)], mesh.is_closed()
+    meshes = [mesh]
+    solids = [original.solid if mesh is original.mesh else Solid(mesh)]
     kept: list[NDArray[np.bool_]] = []  # triangles of each mesh but the last
     places, since = np.zeros((0, 3)), np.zeros(0, np.intp)  # to keep, and from which pass on
-    first = 0  # pass that is to be made anew
+    first, before = 0, irregular_places(mesh)  # pass that is to be made anew
     for _ in range(MOST_REPEATS):
         count_round()
         del meshes[first + 1 :], solids[first + 1 :], kept[first:]
-        for number, collapse in enumerate(passes[first:], first):
-            base = meshes[number]
-            chosen: NDArray[np.bool_] = np.zeros(len(base.vertices), bool)
-            chosen[base.faces[solids[number].nearest_face(places[since <= number])]] = True
-            kept.append(np.any(chosen[base.faces], axis=1))
-            meshes.append(collapse(base, kept[number]))
-            solids.append(Solid(meshes[-1]))
-            if not len(meshes[-1].faces):
-                return None
-        result, wrong = meshes[-1], np.zeros((0, 3))
-        irregular = irregular_places(result)
-        if len(irregular) or not is_closed:
-            before = irregular_places(mesh)
-            made = irregular[~np.isin(row_keys(irregular), row_keys(before))]
-            lost = before[~np.isin(row_keys(before), row_keys(irregular))]
-            lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
-            wrong = np.concatenate([made, lost]).reshape(-1, 3)
-        if original:
+        for number, steps in enumerate(passes[first:], first):
+            result = meshes[number]
+            corners = result.faces[solids[number].nearest_face(places[since <= number])]
+            chosen: NDArray[np.bool_] = np.zeros(len(result.vertices), bool)
+            chosen[corners] = True
+            held: NDArray[np.bool_] = np.any(chosen[result.faces], axis=1)
+            kept.append(held)
+            count = np.count_nonzero(held)
+            for step in steps:
+                result = collapse_edges(result, held, **step)
+                held = np.arange(len(result.faces)) >= len(result.faces) - count
+            if number == len(passes) - 1 and error < np.inf:
+                result = turn_edges(result, held, LOW * error)
+            meshes.append(result)
+            solids.append(Solid(result))
+        if not len(result.faces):
+            return None
+        wrong = faults(result, mesh, before)
+        if error < np.inf:
             wrong = np.concatenate([wrong, original.compare(solids[-1], error)[0]])
         if not len(wrong):
             if same_topology(result, mesh):
@@ -180,7 +90,7 @@ def collapsed(
             component = mesh.components()[1][mesh.faces[:, 0]]
             roots = np.unique(result.components()[1][result.faces[:, 0]])
             found = component[solids[0].nearest_face(solids[-1].mesh.vertices[roots])]
-            missing = mesh.vertices[np.unique(mesh.faces[~np.isin(component, found)])]
+            missing = solids[0].mesh.vertices[np.unique(mesh.faces[~np.isin(component, found)])]
             if not len(missing):
                 return None
             first, places = 0, np.concatenate([places, missing])
@@ -199,16 +109,37 @@ def collapsed(
     return None
 
 
+def faults(result: Mesh, mesh: Mesh, before: NDArray[np.float64]) -> Points:
+    """Return where a mesh is less of a manifold than another one, or meets itself, (n, 3).
+
+    ``before`` are the irregular places of the other mesh.
+    """
+    found = irregular_places(result)
+    made = found[~np.isin(row_keys(found), row_keys(before))]
+    lost = before[~np.isin(row_keys(before), row_keys(found))]
+    lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
+    wrong = np.concatenate([made, lost]).reshape(-1, 3)
+    pairs = Solid(result).intersecting()
+    if not len(pairs):
+        return wrong
+    corners = result.vertices[result.faces[pairs]].astype(np.float64)  # (k, 2, 3, 3)
+    old = row_keys(mesh.vertices[mesh.faces].reshape(-1, 9).astype(np.float64))
+    is_old = np.isin(row_keys(corners.reshape(-1, 9)), old).reshape(-1, 2).all(1)
+    corners = corners[~is_old].reshape(-1, 3, 3)
+    return np.concatenate([wrong, corners.reshape(-1, 3), corners.mean(1)])
+
+
 def within(
     mesh: Mesh, original: Original, error: float, count_round: Callable[[], None]
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh within a distance of the original one, and a warning if it is not simpler."""
     for halving in range(HALVINGS):
-        distances = error / 2**halving * np.array(PLANE_DISTANCES)
-        passes = [partial(collapse_edges, distance=distance) for distance in distances]
-        result = collapsed(mesh, passes, count_round, original, error)
-        if result and len(result.faces) < len(mesh.faces):
-            return result, ()
+        unit = error / 2**halving
+        passes = [[{"distance": unit * share} for share in steps] for steps in PLANE_DISTANCES]
+        for some in (passes, passes[:1]):
+            result = collapsed(mesh, some, original, error, count_round)
+            if result and len(result.faces) < len(mesh.faces):
+                return result, ()
     return mesh, (
         "the mesh was not simplified: none of its triangles can be spared within the error",
     )
@@ -219,50 +150,38 @@ def down_to(
 ) -> tuple[Mesh, tuple[str, ...]]:
     """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning.
 
-    The error is sought that leaves somewhat more. Each error that is tried is a whole
+    The error is sought that leaves hardly fewer. Each error that is tried is a whole
     simplification, so that the mesh is as good as that of the error.
     """
-    everything, wanted = len(mesh.faces), MARGIN * triangles
-    if everything <= triangles:
+    if len(mesh.faces) <= triangles:
         return mesh, ()
     farthest = FARTHEST * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    error = min(FIRST_ERROR * mean_side(mesh) * everything / triangles, farthest)
-    # an error and the triangles that it leaves at first: too many, and few enough
-    (low, more), (high, fewer) = (0.0, everything), (np.inf, 0)
-    reached, least, is_near = None, mesh, False
+    error = min(FIRST_ERROR * original.side * len(mesh.faces) / triangles, farthest)
+    low, more, high, fewer = 0.0, len(mesh.faces), np.inf, 0  # errors and what they leave
+    reached, least = None, mesh
     for _ in range(MOST_ERRORS):
         result = within(mesh, original, error, count_round)[0]
-        once = len(result.faces)
-        if triangles < once < MARGIN * wanted:
-            result = within(result, original, error, count_round)[0]
         left = len(result.faces)
-        all_alike = not low and once == fewer  # as on planes
-        found = triangles < MARGIN * left and left <= triangles < once
-        if left <= triangles:  # ``is_near`` if it leaves hardly fewer
-            reached, high, fewer, is_near = result, error, once, triangles < MARGIN * left
-        elif once == everything > more and not fewer:  # the error is too large
-            farthest = min(farthest, error)
-        else:
-            low, more, least = error, once, min(least, result, key=lambda one: len(one.faces))
-        if found or all_alike or (not fewer and farthest < NEAR_END * low):
+        if left <= triangles:
+            reached, high, fewer = result, error, left
+        elif left < len(mesh.faces) or not low:
+            low, more, least = error, left, min(least, result, key=lambda one: len(one.faces))
+        else:  # an error so large that nothing is found within it
+            farthest = error
+        if triangles < MARGIN * left <= MARGIN * triangles or min(high, farthest) < CLOSE * low:
             break
-        if high < CLOSE * low:
-            if is_near:
-                break
-            low = 0.0  # smaller errors may leave few enough, too
         # what is left falls about as a power of the error
-        if high == np.inf:
-            rise = float(np.clip(more / wanted, 1.1, STRIDE))
-            error = low * min(rise, max(1.1, float(np.sqrt(farthest / low))))
-        elif not low:
-            error = high * float(np.clip(fewer / wanted, 1 / STRIDE, 0.9))
-        else:
-            share = np.log(more / wanted) / np.log(more / fewer)
+        if reached and low:
+            share = np.log(more / triangles) / np.log(more / fewer)
             error = float(low * (high / low) ** np.clip(share, 0.15, 0.85))
+        elif reached:
+            error = high * max(fewer / triangles, 1 / STRIDE)
+        else:
+            error = min(low * min(more / triangles, STRIDE), (low * farthest) ** 0.5)
     if reached:
         return reached, ()
-    passes = [partial(collapse_edges, triangles=triangles)] * len(PLANE_DISTANCES)
-    exact = collapsed(least, passes, count_round)  # whatever the distance
+    steps = [{"triangles": float(triangles)}] * 5
+    exact = collapsed(least, [steps], original, np.inf, count_round)  # whatever the distance
     if exact and len(exact.faces) <= triangles:
         return exact, ()
     return least, (
@@ -286,7 +205,7 @@ def same_topology(one: Mesh, other: Mesh) -> bool:
 
 
 def collapse_edges(
-    mesh: Mesh, kept: NDArray[np.bool_], *, distance: float = 0.0, triangles: int = 0
+    mesh: Mesh, kept: NDArray[np.bool_], *, distance: float = 0.0, triangles: float = 0
 ) -> Mesh:
     """Collapse the edges whose new vertex is within a distance of the planes around it.
 
@@ -296,7 +215,7 @@ def collapse_edges(
     The others are a mesh of its own, whose open edges pyfqmr keeps: there it is joined to the kept
     triangles again.
     """
-    target = max(triangles - int(np.count_nonzero(kept)), 0)
+    target = max(int(triangles) - int(np.count_nonzero(kept)), 0)
     options: dict[str, Any] = {"target_count": target, "update_rate": 1}
     if distance:
         rounds, rise = FEW_ROUNDS if len(mesh.faces) > LARGE else ROUNDS
@@ -321,6 +240,46 @@ def collapse_edges(
     number[held[at]], number[extra] = found, len(moved) + np.arange(len(extra))
     faces = np.concatenate([faces.astype(np.int32), number[mesh.faces[kept]]])
     return Mesh(np.concatenate([vertices, mesh.vertices[extra]]), faces)
+
+
+def turn_edges(mesh: Mesh, held: NDArray[np.bool_], distance: float) -> Mesh:
+    """Turn the longest edges of slivers that are lower than a distance, where that makes none.
+
+    So the surface moves by less than the distance. The triangles ``held``, (m,), stay.
+    """
+    points, faces, count = mesh.vertices.astype(np.float64), mesh.faces.copy(), len(mesh.vertices)
+    for _ in range(4):  # not all edges can be turned at once
+        corners = points[faces]
+        thin = np.flatnonzero((smallest_angles(corners) < THIN) & ~held)
+        if len(thin) <= FEW_SLIVERS * len(faces):
+            break
+        sides = np.linalg.norm(corners[thin] - np.roll(corners[thin], -1, axis=1), axis=2)
+        solid, flat = Solid(Mesh(points, faces)), faces.ravel()
+        normals = solid.normals()
+        is_low = np.linalg.norm(normals[thin], axis=1) < distance * sides.max(1, initial=0)
+        if not is_low.any():
+            break
+        half, opposite = (3 * thin + sides.argmax(1))[is_low], solid.mesh.pair_edges()[0]
+        half = half[(opposite[half] >= 0) & ~held[opposite[half] // 3]]
+        one, other = half // 3, opposite[half] // 3
+        a, b, c = (flat[3 * one + (half + turn) % 3] for turn in range(3))
+        d = flat[3 * other + (opposite[half] + 2) % 3]
+        new = np.stack([c, a, d, d, b, c], axis=1).reshape(-1, 2, 3)
+        better = smallest_angles(points[new.reshape(-1, 3)]).reshape(-1, 2).min(1) > THIN
+        after = Solid(Mesh(points, new.reshape(-1, 3))).normals().reshape(-1, 2, 3)
+        lengths = np.linalg.norm(after, axis=2) * np.linalg.norm(normals[other], axis=1)[:, None]
+        steady = (np.einsum("nij,nj->ni", after, normals[other]) > STEADY * lengths).all(1)
+        edges = flat.astype(np.int64) * count + np.roll(faces, -1, axis=1).ravel()
+        free = ~np.isin(c * np.int64(count) + d, edges) & ~np.isin(d * np.int64(count) + c, edges)
+        taken: set[int] = set()
+        for row in np.flatnonzero(better & steady & free):
+            quad = {int(corner) for corner in new[row].ravel()}
+            if not quad & taken:
+                taken |= quad
+                faces[[one[row], other[row]]] = new[row]
+        if not taken:
+            break
+    return Mesh(mesh.vertices, faces)
 
 
 def irregular_places(mesh: Mesh) -> NDArray[np.float64]:

@@ -8,26 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from ..errors import check_modules
 from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import check_bound, give_back
 
+if TYPE_CHECKING:
+    from .measuring import Deviation
+
 # Peak of memory beside the mesh, measured on meshes of 120,000 to 760,000 triangles: 680 to 1,230,
 # with the libraries that it loads.
 BYTES_PER_TRIANGLE = 1300
 LEFT = 0.85  # share of the work that is left after a round: a guess
-
-
-class Deviation(NamedTuple):
-    """Distances between a mesh and a simplified one, in world units; means are over the area."""
-
-    largest: float  # from vertices of the mesh and middles of its triangles, or a bound
-    mean: float
-    largest_back: float  # from the vertices of the simplified mesh, and points on it, to the mesh
-    mean_back: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +87,8 @@ def simplify_mesh(
     way_out = "use a smaller factor, do not simplify, or "
     check_bound(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", most, way_out)
     from ..truth.solid import Solid
-    from .collapsing import Original, down_to, within  # need the extra
+    from .collapsing import down_to, within  # need the extra
+    from .measuring import Deviation, Original
 
     if not count:
         return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
@@ -105,11 +100,12 @@ def simplify_mesh(
             progress(1 - left)
         left *= LEFT
 
-    if error is not None:
-        result, warnings = within(mesh, original, error, count_round)
+    if triangles is None:
+        result, warnings = within(mesh, original, error or 0.0, count_round)
     else:
-        result, warnings = down_to(mesh, original, triangles or 0, count_round)
-    deviation = Deviation(*original.compare(Solid(result))[1])
+        error = float("inf")
+        result, warnings = down_to(mesh, original, triangles, count_round)
+    deviation = original.compare(Solid(result), error or 0.0)[1]
     if progress:
         progress(1.0)
     return Simplified(result, count, deviation, warnings)

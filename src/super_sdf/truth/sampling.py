@@ -28,6 +28,8 @@ BIG_GRID_BAND = 4.0  # voxels; upsampling uses none beyond 1.5 + sqrt(3)
 LEAST_BAND = 1.5  # voxels; the band of the pipeline
 MOST_ALONG_AXIS = 1e9  # samples; a larger number can only be a mistake
 POSITION_ERROR = 1e-4  # largest error of a sample's position, over the spacing
+PADDING = 2.37  # voxels; a whole number puts faces of a box on planes of samples
+ON_PLANE = 0.1  # voxels between a face of the box and a plane of samples
 WORK_BYTES = 500_000_000  # for search trees and chunks, besides the values
 
 Progress = Callable[[int, int], None]
@@ -38,7 +40,7 @@ Layout = tuple[tuple[int, int, int], float, NDArray[np.float64]]
 def check_numbers(
     n: int | None = None,
     spacing: float | None = None,
-    padding: float = 2.0,
+    padding: float = PADDING,
     band: float | None = None,
 ) -> None:
     """Raise OptionError if a number that is given is out of range, whatever the mesh."""
@@ -61,21 +63,25 @@ def unit_layout(n: int, side: float = 1.0) -> Layout:
 
 
 def fitted_layout(
-    mesh: Mesh, *, n: int | None = None, spacing: float | None = None, padding: float = 2.0
+    mesh: Mesh, *, n: int | None = None, spacing: float | None = None, padding: float = PADDING
 ) -> Layout:
     """Return the layout of a grid around a mesh, in the units of the mesh.
 
     Give the samples ``n`` along the longest axis of its bounding box, or the ``spacing``.
-    ``padding`` is the least number of voxels between the box and the outermost samples.
+    ``padding`` is the least number of voxels between the box and the outermost samples. Faces of
+    the box lie on no plane of samples, unless n and the padding put them there.
     """
     if (n is None) == (spacing is None):
         raise OptionError("give either the number of samples or the spacing")
     check_numbers(n=n, spacing=spacing, padding=padding)
     low, high = mesh.vertices.min(0).astype(np.float64), mesh.vertices.max(0).astype(np.float64)
+    size, is_free = high - low, np.ones(3, bool)
     if spacing is None:
-        spacing = float((high - low).max() / ((n or 0) - 1 - 2 * padding))
-    with np.errstate(over="ignore"):
-        steps = np.ceil((high - low) / spacing + 2 * padding - 1e-6)
+        spacing, is_free = float(size.max() / ((n or 0) - 1 - 2 * padding)), size < size.max()
+    with np.errstate(over="ignore", invalid="ignore"):
+        steps = np.ceil(size / spacing + 2 * padding - 1e-6)
+        room = (steps - size / spacing) / 2
+        steps += is_free & (np.abs(room - np.rint(room)) < ON_PLANE)
         origin = (low + high - steps * spacing) / 2  # not finite: refused by the grid
     if steps.max() >= MOST_ALONG_AXIS:
         raise OptionError(f"spacing is {spacing:g}: it makes {steps.max():.3g} samples an axis")

@@ -186,10 +186,25 @@ class Solid:
         found = self.distance(points)
         return np.where(self.is_inside(points), -found, found)
 
+    def normals(self) -> Points:
+        """Return normals of the triangles, (m, 3), as long as twice their areas."""
+        a, b, c = self.mesh.vertices[self.mesh.faces.T]
+        return np.cross(b - a, c - a)
+
+    def intersecting(self) -> NDArray[np.int64]:
+        """Return the pairs of triangles, (k, 2), that meet off a common vertex or edge.
+
+        Vertices at the same position must be one vertex.
+        """
+        import igl.predicates
+
+        faces = self.mesh.faces.astype(np.int64)
+        whole = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(1))
+        return whole[igl.predicates.find_self_intersections(self.mesh.vertices, faces[whole])[1]]
+
     def count_overlapping(self) -> int:
         """Count the faces with a winding number of 2 or more, or below 0, on one side."""
-        a, b, c = self.mesh.vertices[self.mesh.faces.T]
-        normals, centres = np.cross(b - a, c - a), (a + b + c) / 3
+        normals, centres = self.normals(), self.mesh.vertices[self.mesh.faces].mean(1)
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         size = np.linalg.norm(np.ptp(self.mesh.vertices, axis=0))
         step = SIDE_STEP * size * normals / np.where(lengths > 0, lengths, 1)
@@ -197,6 +212,16 @@ class Solid:
         winding = winding * (np.sign(self.mesh.volume()) or 1)
         wrong = ((winding > 1.5) | (winding < -0.5)).reshape(2, -1).any(0)
         return int(np.count_nonzero(wrong & (lengths[:, 0] > 0)))
+
+
+def smallest_angles(corners: Points) -> Distances:
+    """Return the smallest angle of each triangle, (m,), in degrees; corners are (m, 3, 3)."""
+    found = []
+    for turn in range(3):
+        at, one, other = np.roll(corners, turn, axis=1).transpose(1, 0, 2)
+        sine = np.linalg.norm(np.cross(one - at, other - at), axis=1)
+        found.append(np.arctan2(sine, ((one - at) * (other - at)).sum(1)))
+    return np.degrees(np.min(found, axis=0))
 
 
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:

@@ -4,7 +4,7 @@ An exact sample is the radius of an empty ball that touches the surface. Its res
 distance to the mesh minus that radius: positive if the mesh does not reach the ball, negative if it
 pierces it. All lengths are in voxels unless they are named otherwise.
 
->>> from super_sdf.check.check import check_mesh
+>>> from super_sdf.check import check_mesh
 >>> check_mesh(mesh, grid).report()                                      # doctest: +SKIP
 """
 
@@ -18,18 +18,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
-from ..errors import OptionError
-from ..files.grids import read_grid
-from ..files.meshes import write_coloured_ply
-from ..files.output import check_free
-from ..grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
-from ..options import LENGTHS, Options
-from ..refine.band import Band, no_surface, plane_blocks, rescale, survey
-from ..refine.nodes import VoxelIndex
-from ..surface.mesh import Mesh
-from ..threads import check_bound, chunks_of, give_back, useful_threads
-from ..truth.solid import Points, Solid, merged, read_mesh
+from .arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
+from .errors import OptionError
+from .files.grids import read_grid
+from .files.meshes import write_coloured_ply
+from .files.output import check_free
+from .grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
+from .options import LENGTHS, Options
+from .refine.band import Band, no_surface, plane_blocks, rescale, survey
+from .refine.nodes import VoxelIndex
+from .surface.mesh import Mesh
+from .threads import check_bound, chunks_of, give_back, useful_threads
+from .truth.solid import Points, Solid, merged, read_mesh, smallest_angles
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
 BYTES_PER_TRIANGLE, BYTES_PER_SAMPLE = 650, 150
@@ -37,14 +37,14 @@ OFF_OF_MASKS = 0.5  # by which the distances that are made of a mask may be off
 CLEAR = 0.5  # cosine to the nearest triangle's normal above which that tells the side
 NOTICEABLE = 0.1  # a residual that is counted as large
 STRAY = 0.5  # within a ball, from which on a vertex is counted
-NEAREST_FEET = 8  # foot points that a vertex looks at
-SMOOTHING = 0.02  # distance of a foot point that halves its weight
+NEAREST_FEET, SMOOTHING = 8, 0.02  # foot points of a vertex; distance that halves the weight of one
 FARTHEST = 1.5  # foot points farther away say nothing of a vertex
+SLIVER = 0.5  # degrees: a triangle with a smaller angle
+NEEDLE = 0.94  # length of the mean direction of the edges of a vertex; 0.97 in a cone of 15 degrees
 FULL = 0.1  # residual at which a colour is saturated
 TOUCHING, PIERCED = (240, 240, 240), (190, 20, 30)
 NOT_TOUCHING, UNKNOWN = (20, 70, 190), (120, 120, 60)
-NO_EVIDENCE = "no sample is exact, so no limit on residuals can be shown to be kept"
-WORLD = "in world units"
+WORLD, FROM_ZERO, AS_GIVEN = "in world units", "number from 0 on", Options()
 LIMITS = {
     "max_residual": ("largest", "the largest residual is", "voxels"),
     "tolerance": ("largest", "the largest residual is", WORLD),
@@ -52,7 +52,6 @@ LIMITS = {
     "max_share": ("share_above_tenth", "above 0.1 voxel is", ""),
 }
 """Options, the figures that they limit, and how these are named, with their unit."""
-AS_GIVEN = Options()
 
 
 @dataclass(frozen=True)
@@ -69,6 +68,8 @@ class Surface:
     self_intersections: int | None  # pairs that meet off a common vertex or edge; None: not counted
     volume: float  # in cubic world units, negative if the triangles face inward
     area: float
+    slivers: int  # triangles with an angle under half a degree
+    needles: int  # vertices at the tip of a spike: all their edges are in a narrow cone
 
     def faults(self) -> list[str]:
         """Return what keeps the mesh from being the boundary of a solid, in words."""
@@ -97,16 +98,15 @@ class Certificate:
     """What is certain of a mesh without the true surface: its surface, samples, and strays.
 
     Samples that promise nothing are counted and left out: cut off at the limit of truncated values
-    or at the band's edge; and noisy ones, which differ from a neighbour by more than distances can,
-    together with the rest if they are many. The exact samples near the surface see nothing of a
-    piece that lies far from it, but every sample, also if its value was truncated, promises a ball
-    without surface. A stray is a vertex in the ball of its nearest sample.
+    or at the band's edge, or noisy, which differ from a neighbour by more than distances can. Every
+    sample, also if its value was truncated, promises a ball without surface; a stray is a vertex in
+    the ball of its nearest sample.
     """
 
     mesh: Mesh  # vertices at the same position are one
     grid: SdfGrid  # on its cubic lattice
     surface: Surface
-    samples: dict[str, int]  # exact (n), cut_off, noisy
+    samples: dict[str, int]  # exact (n), cut_off, noisy; all 0 where samples are no distances
     voxel_ijk: IntArray  # (n, 3), of the exact samples
     points: Points  # (n, 3), in world units
     values: FloatArray  # (n,), negative inside
@@ -117,6 +117,7 @@ class Certificate:
     # no sample is exact, and it is no mask
     strays: dict[str, Any] | None = None
     sample_volume: float | None = None  # of a mask: of its samples inside, each of which is a box
+    volume_ml: float | None = None  # of the mesh, in millilitres, if its unit is stated
 
     @property
     def has_evidence(self) -> bool:
@@ -148,6 +149,7 @@ class Certificate:
             "wrong_side": int(self.wrong_side.sum()) if self.has_evidence else None,
             "strays": self.strays,
             "sample_volume": self.sample_volume,
+            "volume_ml": self.volume_ml,
             "faults": self.faults(),
             "inferred": list(self.grid.notes),
         }
@@ -161,26 +163,29 @@ class Certificate:
 
     def lines(self) -> list[str]:
         """Return the certificate as lines for users."""
-        of, samples = self.surface, self.samples
+        of, samples, h = self.surface, self.samples, self.grid.voxel_size
+        ml = "" if self.volume_ml is None else f" ({self.volume_ml:.6g} ml)"
         lines = [
             f"mesh: {of.vertices:,} vertices, {of.triangles:,} triangles, {of.components:,} "
-            f"component{'s' * (of.components != 1)}, volume {of.volume:.6g}, area {of.area:.6g}",
-            f"samples: {samples['exact']:,} exact near the surface, {samples['cut_off']:,} cut off "
-            f"and {samples['noisy']:,} noisy left out",
+            f"piece{'s' * (of.components != 1)}, volume {of.volume:.6g}{ml}, area {of.area:.6g}",
+            f"shape: {of.slivers:,} slivers (triangles with an angle under {SLIVER:g} degrees), "
+            f"{of.needles:,} needles (vertices at the tip of a spike)",
         ]
+        if any(samples.values()):
+            text = "samples: {exact:,} exact near the surface, {cut_off:,} cut off and {noisy:,} "
+            lines.append(text.format(**samples) + "noisy left out")
         if self.has_evidence:
-            figures, h = self.figures(), self.grid.voxel_size
+            figures = self.figures()
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
-            lines += [
-                "residual in voxels: mean {mean:.4f}, 99th percentile {p99:.4f}, largest "
-                "{largest_signed:+.4f} at ".format(**figures)
-                + f"({at}), {figures['largest'] * h:.4g} in world units",
-                f"above {NOTICEABLE:g} voxel: "
-                "{share_above_tenth:.2%} of the samples ({share_not_touching:.2%} not touching, "
-                "{share_pierced:.2%} pierced)".format(**figures),
-            ]
+            text = "residual in voxels: mean {mean:.4f}, 99th percentile {p99:.4f}, largest "
+            text += f"{{largest_signed:+.4f}} at ({at}), {figures['largest'] * h:.4g} {WORLD}"
+            lines.append(text.format(**figures))
+            text = "{share_above_tenth:.2%} of the samples ({share_not_touching:.2%} not touching, "
+            text += "{share_pierced:.2%} pierced)"
+            lines.append(f"above {NOTICEABLE:g} voxel: {text.format(**figures)}")
         else:
-            lines.append("residual: unknown, since no sample is exact")
+            why = "no sample is exact" if any(samples.values()) else "the samples are no distances"
+            lines.append(f"residual: unknown, since {why}")
         if self.sample_volume:
             lines.append(f"volume of the samples inside: {self.sample_volume:.6g}; {self._off()}")
         counted = of.self_intersections is not None
@@ -231,18 +236,16 @@ class Certificate:
 def check_limits(limits: Mapping[str, float | None]) -> None:
     """Raise OptionError if one of ``LIMITS``, None for those not asked for, is out of range."""
     for name, limit in limits.items():
-        most, kind = (
-            (1, "share from 0 to 1") if name == "max_share" else (1e300, "number from 0 on")
-        )
+        most, words = (1, "share from 0 to 1") if name == "max_share" else (1e300, FROM_ZERO)
         if limit is not None and not 0 <= limit <= most:
-            raise OptionError(f"--{name.replace('_', '-')} is {limit:g}: give a {kind}")
+            raise OptionError(f"--{name.replace('_', '-')} is {limit:g}: give a {words}")
 
 
 def exceeded(certificate: Certificate, limits: Mapping[str, float | None]) -> list[str]:
     """Return a sentence for each of ``LIMITS`` that a certificate exceeds."""
     asked = {name: limit for name in LIMITS if (limit := limits[name]) is not None}
     if asked and not certificate.has_evidence:
-        return [NO_EVIDENCE]
+        return ["no sample is exact, so no limit on residuals can be shown to be kept"]
     figures, found = certificate.figures() if asked else {}, []
     for name, limit in asked.items():
         key, words, unit = LIMITS[name]
@@ -284,39 +287,42 @@ def check_mesh(
         raise no_surface(grid, offset)
     need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
     check_bound(need, f"checking {len(mesh.faces):,} triangles", options.max_memory)
-    surface = examine_surface(mesh, self_intersections(mesh) if intersections else None)
+    surface = examine_surface(mesh, len(Solid(mesh).intersecting()) if intersections else None)
     found = touch(mesh, band, lattice, surface)
     give_back()
     is_mask, strays = lattice.field.sides_only, None
     if is_mask or found.has_evidence:
         strays = find_strays(mesh.vertices, lattice, offset, OFF_OF_MASKS * is_mask)
     volume = volume_of_samples(grid, offset) if is_mask else None
-    return replace(found, strays=strays, sample_volume=volume)
+    ml = surface.volume * (100 * LENGTHS[options.unit]) ** 3 if options.unit else None
+    return replace(found, strays=strays, sample_volume=volume, volume_ml=ml)
 
 
 def examine_surface(mesh: Mesh, crossing: int | None = None) -> Surface:
     """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
-    a, b, c = mesh.faces.T
-    whole = Mesh(mesh.vertices, mesh.faces[(a != b) & (b != c) & (c != a)])
+    whole = Mesh(mesh.vertices, mesh.faces[(mesh.faces != np.roll(mesh.faces, 1, 1)).all(1)])
     opposite, uses, flipped = whole.pair_edges()
-    pinched = int(np.count_nonzero(whole.count_fans(opposite) > 1))
-    edges = int((uses % 2).sum()), int((uses > 2).sum()), flipped
-    counts = len(whole.vertices), len(whole.faces), pinched, whole.components()[0]
-    return Surface(*edges, *counts, crossing, whole.volume(), whole.area())
-
-
-def self_intersections(mesh: Mesh) -> int | None:
-    """Return the number of pairs of a mesh's triangles that intersect; None if libigl has no test.
-
-    Vertices at the same position must be one vertex.
-    """
-    import igl.predicates  # here, so that pages are made without it
-
-    if not hasattr(igl.predicates, "find_self_intersections"):
-        return None
-    faces = mesh.faces.astype(np.int64)
-    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
-    return len(igl.predicates.find_self_intersections(mesh.vertices.astype(np.float64), faces)[1])
+    fans = whole.count_fans(opposite)
+    corners, at = whole.vertices[whole.faces].astype(np.float64), whole.faces.ravel()
+    sides = (np.roll(corners, -1, axis=1) - corners).reshape(-1, 3)
+    lengths = np.maximum(np.linalg.norm(sides, axis=1), 1e-300)
+    degrees = np.bincount(at, minlength=len(fans))
+    sums = np.stack([np.bincount(at, side / lengths, len(fans)) for side in sides.T], axis=1)
+    tips = (np.linalg.norm(sums, axis=1) > NEEDLE * degrees) & (degrees > 2)
+    return Surface(
+        open_edges=int((uses % 2).sum()),
+        crowded_edges=int((uses > 2).sum()),
+        flipped_edges=flipped,
+        vertices=len(whole.vertices),
+        triangles=len(whole.faces),
+        pinched_vertices=int(np.count_nonzero(fans > 1)),
+        components=whole.components()[0],
+        self_intersections=crossing,
+        volume=whole.volume(),
+        area=whole.area(),
+        slivers=int(np.count_nonzero(smallest_angles(corners) < SLIVER)),
+        needles=int(np.count_nonzero(tips)),
+    )
 
 
 def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Certificate:
@@ -332,12 +338,10 @@ def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Certificat
     sampled = int(np.count_nonzero(band.sampled))
     # if none is exact, too many are no distances for any to be taken for one
     noisy = band.count_noisy() if len(rows) else sampled
-    cut_off = sampled - len(rows) - noisy
     ijk, values = band.voxel_ijk[rows], values[rows] * np.float32(0.5)
     points, solid = grid.to_world(ijk), Solid(mesh)
     found, faces, feet = solid.nearest(points)
-    a, b, c = solid.mesh.vertices[mesh.faces[faces].T]
-    normals = np.cross(b - a, c - a)  # and the cosines to them of the ways from the feet
+    normals = solid.normals()[faces]  # and the cosines to them of the ways from the feet
     sizes, dots = np.linalg.norm(normals, axis=1) * found, ((points - feet) * normals).sum(1)
     cosines = np.divide(dots, sizes, out=np.zeros(len(points)), where=sizes > 0)
     distances, size = found / grid.voxel_size, np.abs(values)
@@ -346,7 +350,9 @@ def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Certificat
     agreed = is_sheet & (np.where(values > 0, 1, -1) * cosines > CLEAR)
     apart = np.flatnonzero((distances + size > NOTICEABLE) & ~agreed)  # where the side matters
     wrong[apart] = solid.is_inside(points[apart]) != (values[apart] <= 0)
-    samples = {"exact": len(rows), "cut_off": cut_off, "noisy": noisy}
+    are_distances = grid.field.network is not None and not grid.field.sides_only
+    counts = {"exact": len(rows), "cut_off": sampled - len(rows) - noisy, "noisy": noisy}
+    samples = {name: count * are_distances for name, count in counts.items()}
     found_there = ijk, points, values, residuals, feet, wrong
     return Certificate(mesh, grid, surface, samples, *found_there)
 
@@ -378,9 +384,8 @@ def check_coloured(path: Path, *, force: bool = False) -> None:
 
 def write_coloured(certificate: Certificate, path: Path, *, force: bool = False) -> None:
     """Write the mesh of a certificate as PLY, with a colour and ``residual`` for each vertex."""
-    mesh = certificate.mesh
-    residuals = certificate.residuals_at(mesh.vertices)
-    write_coloured_ply(mesh, residuals, colours(residuals), path, force=force)
+    residuals = certificate.residuals_at(certificate.mesh.vertices)
+    write_coloured_ply(certificate.mesh, residuals, colours(residuals), path, force=force)
 
 
 def colours(residuals: FloatArray) -> NDArray[np.uint8]:
