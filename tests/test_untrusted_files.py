@@ -107,7 +107,7 @@ def test_damaged_numpy_files_are_a_line():
     said = said_of(write("a.npy", whole[:-40]))
     assert said == "a.npy cannot be read as NumPy: mmap length is greater than file size"
     said_of(write("a.npy", whole[:60]))
-    np.save("a.npy", np.array([{}]), allow_pickle=True)
+    np.save("a.npy", np.array([[[{}]]]), allow_pickle=True)
     assert "values have dtype object: give floating" in said_of("a.npy")
     np.savez("a.npz", values=VALUES)
     whole = bytearray(Path("a.npz").read_bytes())

@@ -42,9 +42,7 @@ def read_nrrd(request: Request) -> Volume:
     raw = nrrd.read_header((stated.before + stated.rest * (not stated.lists)).splitlines(True))
     header = {SPELT.get(name, name): value for name, value in raw.items()}
     sizes = tuple(int(size) for size in header["sizes"])
-    if header["dimension"] != len(sizes) or len(sizes) < 3:
-        raise GridError(f"{path} has shape {sizes}: give a file of three axes (x, y, z)")
-    if min(sizes) < 1:
+    if header["dimension"] != len(sizes) or min(sizes) < 1:
         raise FileError(f"its sizes are {sizes}")
     index = request.pick(sizes, _axes_in_space(header))
 
@@ -154,10 +152,9 @@ def read_metaimage(request: Request) -> Volume:
         reader.ReadImageInformation()
     except RuntimeError:
         raise FileError("its header is damaged, or not that of a MetaImage file") from None
-    size, components = reader.GetSize(), reader.GetNumberOfComponents()
-    if len(size) < 3 or components != 1:
-        said = f"{path} has shape {size} of {components} numbers"
-        raise GridError(f"{said}: give a file of three axes (x, y, z)")
+    size = reader.GetSize()
+    if (components := reader.GetNumberOfComponents()) != 1:
+        raise GridError(f"{path} has {components} numbers a sample: give a file of three axes")
     one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
     data, start = (files[0], 0) if files else (path, stated.start)
