@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import os
+import socket
 import zlib
 from pathlib import Path
 
@@ -12,11 +13,13 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
+import trimesh
 from conftest import refusal
 from placed import CUBES, sampled, save, text_sdf
 
 from super_sdf import read_grid
-from super_sdf.errors import SuperSdfError
+from super_sdf.errors import FileError, SuperSdfError
+from super_sdf.truth.solid import read_mesh
 
 VALUES = sampled(CUBES)
 RAW = VALUES.ravel("F").tobytes()
@@ -216,6 +219,55 @@ def test_files_of_an_ome_set_are_read_beside_the_file(tmp_path):
     os.mkfifo("pipe.tif")
     ome_set("pipe.tif")
     assert said_of("a.ome.tif").endswith("pipe.tif is a named pipe: give a file")
+
+
+# What is no regular file
+
+
+WHAT_IS_WRONG = {
+    "folder.npy": "is a folder: give a file",
+    "pipe.npy": "is a named pipe: give a file",
+    "socket.npy": "is a socket: give a file",
+    "zero.npy": "is a device: give a file",
+    "loop.npy": "cannot be read: Too many levels of symbolic links",
+    "dangling.npy": "does not exist",
+    "missing.npy": "does not exist",
+    "file/in.npy": "does not exist: the path before its last / is not a folder",
+    "n" * 300 + ".npy": "cannot be read: File name too long",
+    "a\0.npy": "is not a valid file name",
+    "a\ud800.npy": "is not a valid file name",
+}
+
+
+@pytest.mark.parametrize("name", WHAT_IS_WRONG, ids=ascii)
+def test_what_is_no_regular_file_is_named_as_grid_and_as_mesh(name):
+    Path("folder.npy").mkdir()
+    os.mkfifo("pipe.npy")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind("socket.npy")
+    for link, end in {"zero": "/dev/zero", "loop": "loop.npy", "dangling": "nothing.npy"}.items():
+        Path(f"{link}.npy").symlink_to(end)
+    write("file")
+    shown = name if name.isprintable() else repr(name)
+    assert refusal(FileError, read_grid, name) == f"{shown} {WHAT_IS_WRONG[name]}"
+    if name in ("folder.npy", "pipe.npy", "zero.npy", "loop.npy", "dangling.npy"):
+        Path("a.ply").symlink_to(name)
+        assert refusal(FileError, read_mesh, "a.ply") == f"a.ply {WHAT_IS_WRONG[name]}"
+
+
+def test_links_to_files_are_read_unless_they_may_not_be(monkeypatch):
+    np.save("file", VALUES)
+    Path("link.npy").symlink_to("file.npy")
+    assert np.array_equal(read_grid("link.npy", spacing=0.5).values, VALUES)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may read everything
+    assert said_of("link.npy") == "link.npy cannot be read: permission denied"
+
+
+def test_a_mesh_that_names_a_pipe_is_read_without_it():
+    os.mkfifo("pipe.mtl")
+    box = trimesh.creation.box().export(file_type="obj")
+    write("cube.obj", f"mtllib pipe.mtl\nusemtl red\n{box}")
+    assert len(read_mesh("cube.obj").faces) == 12
 
 
 # Where ITK places a MetaImage
