@@ -368,9 +368,8 @@ def find_strays(
     values = np.zeros(len(nearest))
     for planes in chunks_of(grid.shape[0], grid.shape[1] * grid.shape[2]):
         rows = np.flatnonzero((nearest[:, 0] >= planes.start) & (nearest[:, 0] < planes.stop))
-        i, j, k = nearest[rows].T
         some = rescale(grid, offset, planes.start, planes.stop)
-        values[rows] = some[i - planes.start, j, k]
+        values[rows] = some[tuple((nearest[rows] - np.array([planes.start, 0, 0])).T)]
     depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1) - slack
     count, beyond = int((depth > STRAY).sum()), int((~inside).sum())
     return {"count": count, "beyond": beyond, "deepest": float(depth.max(initial=0))}
