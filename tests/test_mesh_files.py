@@ -15,7 +15,7 @@ from solids import cube, sphere
 from super_sdf import Mesh, reconstruct, write_mesh
 from super_sdf.convert import convert
 from super_sdf.errors import FileError, GridError, MeshError, OptionError, SuperSdfError
-from super_sdf.files import meshes, scenes
+from super_sdf.files import meshes
 from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
 from super_sdf.options import Options
 from super_sdf.truth.solid import load_solid, merged, read_mesh
@@ -153,7 +153,7 @@ def test_arrays_that_are_no_mesh_are_refused(said):
 
 @pytest.mark.parametrize("suffix", [".ply", ".obj", ".off", ".3mf"])
 def test_files_hold_the_very_numbers(monkeypatch, suffix):
-    monkeypatch.setattr(scenes, "TEXT_CHUNK", 100)
+    monkeypatch.setattr(meshes, "TEXT_CHUNK", 100)
     numbers = np.random.default_rng(0).standard_normal((999, 3)) ** 9 * 1e-3
     faces = np.arange(999, dtype=np.int32).reshape(-1, 3)
     for dtype in (np.float32, np.float64):

@@ -15,7 +15,7 @@ from test_vdb import text
 from super_sdf import SdfGrid, fine_grid, make_grid, upsample, write_field
 from super_sdf.errors import OptionError
 from super_sdf.files.grids import open_volume
-from super_sdf.files.vdb_writer import INSIDE, MIXED, OUTSIDE, LevelSet, leaf_bytes, write_tree
+from super_sdf.files.readers.vdb import INSIDE, MIXED, OUTSIDE, LevelSet, leaf_bytes, write_tree
 
 PAD = 8  # voxels that are looked at beyond the lattice
 

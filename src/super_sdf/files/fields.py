@@ -33,7 +33,7 @@ from ..surface.cap import check_all_seen, find_border_inside
 from ..threads import check_fits
 from .formats import check_regular_file
 from .output import check_free, naming, replacing
-from .vdb_writer import write_level_set
+from .readers.vdb import write_level_set
 
 VERSION = 1
 PLANES = 16  # of the fine lattice at a time

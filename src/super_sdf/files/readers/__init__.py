@@ -179,11 +179,16 @@ def triple(numbers: Any) -> Triple:
 
 
 def from_affine(matrix: NDArray[Any]) -> dict[str, Any]:
-    """Split an affine (3 or 4, 4) into spacing, origin and direction of the array's axes."""
+    """Split an affine, or the columns that are no origin, into spacing, origin and direction."""
     columns = np.asarray(matrix, np.float64)[:3, :3]
     lengths = np.linalg.norm(columns, axis=0)
-    direction = columns / np.where(lengths > 0, lengths, 1)
-    return {"spacing": triple(lengths), "origin": triple(matrix[:3, 3]), "direction": direction}
+    place = {"spacing": triple(lengths), "direction": columns / np.where(lengths > 0, lengths, 1)}
+    return {**place, "origin": triple(matrix[:3, 3]) if matrix.shape[1] > 3 else None}
+
+
+def kept_of(index: Index) -> list[int]:
+    """Return the axes of an array that are in space."""
+    return [axis for axis, at in enumerate(index) if isinstance(at, slice)]
 
 
 def axes_direction(axes: str) -> NDArray[np.float64]:

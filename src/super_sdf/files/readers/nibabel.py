@@ -16,6 +16,7 @@ from ...errors import GridError
 from ...options import RAS
 from ..formats import check_beside
 from . import LABELS, XYZ, Request, Volume, from_affine, triple
+from .axes import in_unit
 
 PAIRS = (".img", ".IMG", ".img.gz")
 UNITS = {1: "metre", 3: "micrometre"}  # of lengths, but for millimetres
@@ -35,8 +36,7 @@ def read_nifti(request: Request) -> Volume:
     scaled by the slope and intercept of the header.
     """
     image, header = _load(request)
-    unit = UNITS.get(int(header["xyzt_units"]) & 7)
-    image["notes"] = (f"lengths are in the unit that it states, {unit}",) * bool(unit)
+    image["notes"] = in_unit(UNITS.get(int(header["xyzt_units"]) & 7, ""))
     if int(header["intent_code"]) == INTENT_LABEL:
         image["hint"] = LABELS
     codes = int(header["sform_code"]), int(header["qform_code"])
