@@ -8,7 +8,6 @@ from super_sdf.refine.field import FineField
 from super_sdf.refine.nodes import (
     average_shared,
     block_ijk,
-    block_offsets,
     pin_to_skipped,
     share_parts,
 )
@@ -17,16 +16,6 @@ from super_sdf.refine.nodes import (
 def some_voxels(seed, density=0.4, shape=(6, 5, 7)):
     voxels = np.argwhere(np.random.default_rng(seed).random(shape) < density).astype(np.int32)
     return voxels, neighbour_table(voxels, shape)
-
-
-@pytest.mark.parametrize("factor", [2, 16])
-def test_offsets_are_equation_5_on_the_lattice(factor):
-    offsets = block_offsets(factor)
-    assert offsets.shape == ((factor + 1) ** 3, 3)
-    assert offsets.min() == -1 and offsets.max() == 1
-    np.testing.assert_array_equal(offsets[len(offsets) // 2], 0)
-    steps = (offsets + 1) * factor / 2
-    np.testing.assert_array_equal(steps, np.round(steps))
 
 
 @pytest.mark.parametrize(("factor", "threads"), [(2, 3), (4, 1)])
