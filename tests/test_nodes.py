@@ -8,7 +8,6 @@ from super_sdf.refine.field import FineField
 from super_sdf.refine.nodes import (
     average_shared,
     block_ijk,
-    pin_to_skipped,
     share_parts,
 )
 
@@ -40,15 +39,3 @@ def test_nodes_have_a_number_for_each_position_and_are_plain_means_of_all_blocks
     np.testing.assert_array_equal(blocks[:, :-1].T, want[field.numbers])
     np.testing.assert_array_equal(field.values, want)
     assert not blocks[:, -1].any()
-
-
-def test_a_pinned_node_of_two_voxels_is_pinned_in_both_and_counted_once():
-    voxels = np.array([[1, 1, 1], [1, 1, 2]], np.int32)
-    parts = share_parts(neighbour_table(voxels, (3, 3, 4)))
-    patches = -np.ones((2, 27), np.float32)
-    blocks, rows = np.ones((27, 2), np.float32), np.arange(2, dtype=np.int32)
-    changed = pin_to_skipped(blocks, parts, 2, voxels, patches, rows, (3, 3, 4))
-    middle = (block_ijk(2) == 1).all(1)  # all other nodes touch a skipped voxel ...
-    between = (block_ijk(2) == [1, 1, 2]).all(1)  # ... except the middle of the common face
-    assert (blocks[~middle & ~between, 0] < 0).all() and (blocks[middle | between, 0] > 0).all()
-    np.testing.assert_array_equal(changed, [25, 17])
