@@ -113,7 +113,7 @@ def bad_files() -> None:
     Path("short.npy").write_bytes(good[: len(good) // 2])
     Path("text.npz").write_text("hello")
     Path("empty.npy").write_bytes(b"")
-    np.save("objects.npy", np.array([{}], object), allow_pickle=True)
+    np.save("objects.npy", np.array([[[{}]]], object), allow_pickle=True)
     np.savez("other.npz", field=np.zeros(3), more=np.zeros(3))
     with zipfile.ZipFile("short.npz", "w") as archive:
         archive.writestr("values.npy", good[: len(good) // 2])

@@ -147,6 +147,16 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
     assert read_grid(name, spacing=0.5).shape == (24, 20, 17)
 
 
+@pytest.mark.parametrize("entry", ["datafile: ", " data file : ", "data file:="])
+def test_a_nrrd_file_names_its_data_once_and_beside_it(entry, tmp_path):
+    write("a.raw", RAW)
+    other = f"{entry}{tmp_path.parent}/a.raw\n"
+    write("a.nhdr", DETACHED["a.nhdr"], "a.raw\n", other)
+    assert said_of("a.nhdr").startswith("a.nhdr")
+    write("a.nhdr", NRRD, "encoding: raw\n", other)
+    assert said_of("a.nhdr").endswith(APART)
+
+
 def test_lists_and_patterns_of_metaimage_are_what_itk_reads():
     for number, plane in enumerate(np.ascontiguousarray(VALUES.T)):
         write(f"p{number + 3:03d}.raw", plane.tobytes())

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -36,9 +37,7 @@ LIPSCHITZ_SLACK = 0.1
 MAX_DISTANCE = 2.8  # of exact samples: those near the band's edge, 3, may have been truncated there
 MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
 MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
-# Planes are worked on in blocks of about this many samples, but of a few planes at least, since a
-# block also reads one plane more on either side.
-BLOCK_SAMPLES, BLOCK_PLANES = 1 << 18, 4
+BLOCK_SAMPLES = 1 << 18  # read at a time, about, and a plane more on either side
 # The largest difference between neighbours along an axis, and between a voxel's sample and that at
 # each place of its patch, (27,).
 MAX_STEP = 2 + LIPSCHITZ_SLACK
@@ -203,11 +202,8 @@ def _found(
         # Samples of a resampled grid are judged by samples alone: interpolated values do not tell
         # whether these are noisy. Interpolated values that contradict no others count as exact,
         # since thin parts need them (docs/guides/formats.md).
-        lipschitz, sampled, centre = (
-            is_lipschitz(patches),
-            on_samples(grid, ijk),
-            patches[:, CENTRE],
-        )
+        centre = patches[:, CENTRE]
+        lipschitz, sampled = is_lipschitz(patches), on_samples(grid, ijk)
         if grid.on_sample is not None:
             lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
         # Only a patch that can be distances proves, by a sample far from the surface, that the
@@ -226,7 +222,8 @@ def _found(
         number, value = np.flatnonzero(beyond) + first * inner[0].size, inner[beyond]
         return _Found(ijk, patches, lipschitz, sampled, decoded, number, value, figures)
 
-    blocks = list(plane_blocks(grid.shape, planes_at_once(grid.samples)))
+    step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), planes_at_once(grid.samples))
+    blocks = [(first, min(first + step, count)) for first in range(0, count, step)]
     yield from over_threads(look, blocks, threads)
 
 
@@ -326,15 +323,6 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArra
     for place, step in enumerate(NEIGHBOURHOOD):
         table[:, place] = index.find(voxel_ijk + step)
     return table
-
-
-def plane_blocks(
-    shape: tuple[int, int, int], least: int = BLOCK_PLANES
-) -> Iterator[tuple[int, int]]:
-    """Yield (start, stop) of blocks of ``BLOCK_SAMPLES`` samples or of ``least`` planes."""
-    step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), least)
-    for start in range(0, shape[0], step):
-        yield start, min(start + step, shape[0])
 
 
 def is_lipschitz(patches: FloatArray, places: slice | NDArray[np.intp] = slice(None)) -> BoolArray:

@@ -80,8 +80,6 @@ def placed(
     ``order`` is that of axes that have no names. With ``beside``, attributes elsewhere in the file,
     notes say what was not taken from the file.
     """
-    if len(shape) < len(SPACE):
-        raise GridError(f"values have shape {tuple(shape)}: give three axes (x, y, z)")
     order = order or request.axes
     names = ["" if axis.name in UNNAMED else axis.name.strip().lower() for axis in axes]
     aliases = [axis.alias.strip().lower() or name for axis, name in zip(axes, names)]

@@ -38,13 +38,15 @@ def read_nrrd(request: Request) -> Volume:
     import nrrd
 
     path, stated = request.path, split_header(request.path)
+    with path.open("rb") as file:
+        raw = nrrd.read_header(stated.before.splitlines(True) if stated.lists else file)
+    named = [raw.pop(name) for name in ("data file", "datafile") if name in raw]
+    if len(named) != (stated.start > 0 and not stated.lists):  # pynrrd would open another one
+        raise FileError("its header is damaged: it does not name one data file")
     files = [check_beside(path, name) for name in stated.names()]
-    raw = nrrd.read_header((stated.before + stated.rest * (not stated.lists)).splitlines(True))
     header = {SPELT.get(name, name): value for name, value in raw.items()}
     sizes = tuple(int(size) for size in header["sizes"])
-    if header["dimension"] != len(sizes) or len(sizes) < 3:
-        raise GridError(f"{path} has shape {sizes}: give a file of three axes (x, y, z)")
-    if min(sizes) < 1:
+    if header["dimension"] != len(sizes) or min(sizes) < 1:
         raise FileError(f"its sizes are {sizes}")
     index = request.pick(sizes, _axes_in_space(header))
 
@@ -145,7 +147,8 @@ def read_metaimage(request: Request) -> Volume:
     def is_true(name: str) -> bool:
         return fields.get(name, "F")[:1] in ("T", "t", "1")  # as ITK reads it
 
-    files = [check_beside(path, name) for name in stated.names()]
+    names = stated.names() if stated.entry.lower() != "local" else []
+    files = [check_beside(path, name) for name in names]
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
@@ -154,10 +157,9 @@ def read_metaimage(request: Request) -> Volume:
         reader.ReadImageInformation()
     except RuntimeError:
         raise FileError("its header is damaged, or not that of a MetaImage file") from None
-    size, components = reader.GetSize(), reader.GetNumberOfComponents()
-    if len(size) < 3 or components != 1:
-        said = f"{path} has shape {size} of {components} numbers"
-        raise GridError(f"{said}: give a file of three axes (x, y, z)")
+    size = reader.GetSize()
+    if (components := reader.GetNumberOfComponents()) != 1:
+        raise GridError(f"{path} has {components} numbers a sample: give a file of three axes")
     one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
     data, start = (files[0], 0) if files else (path, stated.start)
