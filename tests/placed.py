@@ -153,14 +153,15 @@ def slices_of(affine: np.ndarray, **about: Any) -> list[pydicom.Dataset]:
     }
     images = []
     for k in range(SIZES[2]):
-        images.append(holding(pydicom.Dataset(), **common, PixelData=stored[:, :, k].T.tobytes()))
+        images.append(holding(**common, PixelData=stored[:, :, k].T.tobytes()))
         place = affine[:3, 3] + affine[:3, 2] * k
         images[-1].ImagePositionPatient = np.round(place, 8).tolist()
     return images
 
 
-def holding(dataset: pydicom.Dataset, **values: Any) -> pydicom.Dataset:
+def holding(dataset: pydicom.Dataset | None = None, **values: Any) -> pydicom.Dataset:
     """Return a dataset with these values; a dataset among them is a sequence of one."""
+    dataset = pydicom.Dataset() if dataset is None else dataset
     for name, value in values.items():
         setattr(dataset, name, [value] if isinstance(value, pydicom.Dataset) else value)
     return dataset

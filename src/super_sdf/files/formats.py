@@ -167,7 +167,8 @@ REASONS = {
 MARKS = ("zarr.json", ".zarray", ".zgroup")  # one of them makes a folder a Zarr store
 HEADERS = (".mhd", ".mha", ".nhdr", ".nrrd")  # text that may name data files, a line each
 LONGEST_HEADER = 1 << 20  # bytes, with a list of files
-DATA_FILE = re.compile(rb"^(?:ElementDataFile *[=:]|data ?file:) *([^\n]*)\n?", re.M)
+META_DATA = re.compile(rb"^ElementDataFile *[=:] *([^\n]*)\n?", re.M)
+NRRD_DATA = re.compile(rb"^[ \t]*data ?file[ \t]*:=? *([^\n]*)\n?", re.M)
 WEIGHTS = re.compile(rb"\n\x08location\x12([\x01-\x7f])")  # of a network: before a name, its length
 
 
@@ -222,7 +223,7 @@ class Header(NamedTuple):
         return self.entry.upper().startswith("LIST")
 
     def names(self) -> list[str]:
-        """Return the names of the files with the data: none, if it is in the file itself."""
+        """Return the names of the files with the data."""
         if self.lists:
             listed = self.rest.decode(errors="surrogateescape").splitlines()
             return [name for name in listed if name.strip()]
@@ -232,15 +233,17 @@ class Header(NamedTuple):
                 raise FileError(f"its data file is {seen(self.entry)}: give NAME%03d.raw 1 20 1")
             first, last, step = (int(number) for number in (*numbers, "1")[:3])
             return [pattern % number for number in range(first, last + 1, step)]
-        return [self.entry] if self.entry.lower() not in ("", "local") else []
+        return [self.entry] * bool(self.entry)
 
 
 def split_header(path: Path) -> Header:
     """Return the header at the beginning of a NRRD or MetaImage file."""
     with path.open("rb") as file:
         text = file.read(LONGEST_HEADER)
-    head = re.split(rb"\n\r?\n", text, maxsplit=1)[0] if text.startswith(b"NRRD") else text
-    if not (found := DATA_FILE.search(head)):
+    found = META_DATA.search(text)
+    if path.suffix.lower() in (".nrrd", ".nhdr"):  # after a blank line there is data
+        found = NRRD_DATA.search(re.split(rb"\n\r?\n", text, maxsplit=1)[0])
+    if not found:
         return Header(text, "", b"", 0)
     entry = found[1].decode(errors="surrogateescape").strip()
     return Header(text[: found.start()], entry, text[found.end() :], found.end())

@@ -73,9 +73,8 @@ class Request:
                 raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
             return same[0]
         if len(names) > 1:
-            raise FileError(
-                f"{self.path} holds several arrays, {listed}: give {self.path}:{names[0]}, say"
-            )
+            said = f"{self.path} holds several arrays, {listed}"
+            raise FileError(f"{said}: give {self.path}:{names[0]}, say")
         return names[0]
 
     def choose_array(self, shapes: Mapping[str, Sequence[int]], what: str) -> str:
@@ -91,11 +90,14 @@ class Request:
     def pick(
         self, shape: Sequence[int], kept: Sequence[int] | None = None, names: Sequence[str] = ()
     ) -> Index:
-        """Return which samples of an array are read; GridError if a number is missing.
+        """Return which samples of an array are read; GridError if an axis or a number is missing.
 
         ``kept`` are the axes in space. Without it, axes of length 1 are left out, and of those left
         the longest are in space.
         """
+        if len(shape) < 3:
+            said = f"{self.path} has shape {tuple(shape)}"
+            raise GridError(f"{said}: give a file of three axes (x, y, z)")
         if kept is None:
             by_length = sorted(range(len(shape)), key=lambda axis: (shape[axis], axis))
             kept = by_length[-3:]
@@ -146,7 +148,7 @@ class Volume:
     def shape(self) -> tuple[int, ...]:
         """Number of samples along each axis in space."""
         kept = (count for count, at in zip(self.stored, self.index) if isinstance(at, slice))
-        return tuple(map(int, kept)) if len(self.stored) >= 3 else tuple(self.stored)
+        return tuple(map(int, kept))
 
     def read(self) -> NDArray[Any]:
         """Return the samples along the axes in space."""

@@ -93,7 +93,7 @@ def read_vdb(request: Request) -> Volume:
     if "PicoGK.VoxelSize" in metadata:
         notes = (f"voxels of {size:.6g} mm, as PicoGK states: the mesh is in millimetres",)
     if request.describes:
-        about["grids"] = [start.described(*each) for each in entries.items()]
+        about["grids"] = [start.described(each, k, at) for each, (k, _, at) in entries.items()]
         other = f"shape and place are those of {name!r}: give {start.name}:NAME for another"
         notes += (f"{other} grid",) * (len(entries) > 1)
 
@@ -173,10 +173,9 @@ class _Cursor:
                 found[name] = struct.unpack("<" + NUMBERS[kind], data)[0]
         return found
 
-    def described(self, name: str, entry: tuple[str, str, int]) -> dict[str, Any]:
-        metadata = self.at(entry[2] + 4).metadata()
-        kind = entry[0].removeprefix("Tree_").split("_")[0]
-        about = {"name": name, "type": kind, "class": metadata.get("class", "unknown")}
+    def described(self, name: str, kind: str, place: int) -> dict[str, Any]:
+        metadata, value = self.at(place + 4).metadata(), kind.removeprefix("Tree_").split("_")[0]
+        about = {"name": name, "type": value, "class": metadata.get("class", "unknown")}
         return {**about, "active_voxels": metadata.get("file_voxel_count")}
 
     def head(self) -> tuple[int, dict[str, Any], NDArray[np.float64]]:
