@@ -204,3 +204,9 @@ def test_a_large_band_is_predicted_in_runs_of_planes(monkeypatch):
     many = reconstruct(grid, network, 2)
     np.testing.assert_array_equal(one.vertices, many.vertices)
     np.testing.assert_array_equal(one.faces, many.faces)
+
+
+def test_tiles_are_reported_as_they_are_made():
+    done = []
+    mesh_grid(ball(), CLOSE, Options(2), progress=lambda n, _: done.append(n), least_tiles=3)
+    assert done == sorted(done) and (done[0], done[-1]) == (30, 1000) and len(set(done)) == 4
