@@ -23,7 +23,6 @@ from ..grid.samples import let_go, over_three, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
 from ..threads import over_threads
 from .bounds import FARTHEST, TrustedSamples
-from .nodes import VoxelIndex
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
 # Patch values are clipped to this (3 h): samples that are farther from the surface do not matter to
@@ -315,9 +314,19 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArra
     It has their rows at the 27 places of ``NEIGHBOURHOOD`` round each, -1 where there is no voxel.
     As an index -1 is the last row, so append a row of zeros to the array that is gathered from.
     """
-    table, index = np.empty((len(voxel_ijk), 27), np.int32), VoxelIndex(voxel_ijk, shape)
-    for place, step in enumerate(NEIGHBOURHOOD):
-        table[:, place] = index.find(voxel_ijk + step)
+    strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1])
+    keys = voxel_ijk.astype(np.int64) @ strides  # ascending; a step beyond the grid has no key
+    rows = np.arange(len(keys), dtype=np.int32)
+    table = np.full((len(keys), 27), -1, np.int32)
+    table[:, CENTRE] = rows
+    at = np.empty(0, np.int64)
+    for place, step in enumerate((NEIGHBOURHOOD[:CENTRE] @ strides).tolist()):
+        if place % 3 == 0:  # the next two are beside it along z
+            at = np.searchsorted(keys, keys + step)
+        found = keys[at] == keys + step
+        table[found, place] = at[found]
+        table[at[found], 26 - place] = rows[found]  # a neighbour's neighbour
+        at += found
     return table
 
 
