@@ -18,7 +18,7 @@ from super_sdf import load_network, make_grid, reconstruct, reconstruct_labels
 from super_sdf.check import check_mesh, examine_surface
 from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
 from super_sdf.grid.sdf_grid import volume_of_samples
-from super_sdf.labels import fewer
+from super_sdf.labels import reconstruct as labelling
 from super_sdf.labels.files import LabelName, read_names
 from super_sdf.labels.volumes import keep_volume
 from super_sdf.truth.solid import Solid
@@ -107,7 +107,7 @@ def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, network):
 
 
 def test_without_pyfqmr_the_walls_stay_as_they_are(monkeypatch, image, command):
-    monkeypatch.setattr(fewer, "find_spec", lambda name: None)
+    monkeypatch.setattr(labelling, "find_spec", lambda name: None)
     code, _, err = command("upsample", image, "a.ply", "--labels", "all", "--json", *PLAIN)
     assert code == 0 and "Note: pyfqmr is not installed: no triangles are spared\n" in err
 

@@ -15,8 +15,8 @@ from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
 from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
 from super_sdf.network.network import load_network
 from super_sdf.simplify import collapsing
-from super_sdf.simplify.collapsing import irregular_places
 from super_sdf.simplify.measuring import Original
+from super_sdf.simplify.walls import Walls, irregular_places
 from super_sdf.truth.solid import Solid, smallest_angles
 
 PART = Path(__file__).parent.parent / "examples" / "part.npz"
@@ -132,7 +132,7 @@ def test_an_open_border_stays_exactly_where_it_is():
     assert len(found.mesh.faces) < len(sheet.faces) / 4
 
     def border(mesh):
-        return set(map(tuple, irregular_places(mesh)))
+        return set(map(tuple, irregular_places(Walls.of(mesh))))
 
     assert border(found.mesh) == border(sheet) and len(border(sheet)) == 64
 

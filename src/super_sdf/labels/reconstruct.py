@@ -1,13 +1,14 @@
 """All labels of an image in one run: closed meshes whose shared walls coincide.
 
-``fields`` refines the labels, ``walls`` makes the surfaces of these fields, ``fewer`` spares
-triangles, and ``volumes`` makes up for what smooth surfaces lack.
+``fields`` refines the labels, ``walls`` makes the surfaces of these fields, and ``volumes`` makes
+up for what smooth surfaces lack. Then triangles are spared, see ``simplify.collapsing``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from importlib.util import find_spec
 from os import PathLike
 from typing import Any
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import options
+from ..arrays import NEIGHBOURHOOD
 from ..errors import GridError, OptionError, check_modules, seen
 from ..files.grids import read_array
 from ..grid.derived import extremes_of_masks
@@ -24,14 +26,17 @@ from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.contract import Decoder, adapt
 from ..network.network import load_network, network_for
+from ..simplify.collapsing import collapse_edges, within
+from ..simplify.measuring import Original
+from ..simplify.walls import Walls, faults, meshes_of
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import Progress
-from .fewer import meshes_of, simplified
 from .fields import label_fields
 from .volumes import keep_volumes
-from .walls import Walls, extract_walls
+from .walls import extract_walls
 
 MOST_LABELS = 1000  # more values than these are densities
+SLIGHT, MOST_REPEATS = 0.01, 8  # voxels from planes within which triangles are spared by default
 
 
 def reconstruct_labels(
@@ -213,10 +218,42 @@ def label_meshes(
     walls = extract_walls(fields)
     del fields
     faces = walls.faces[:, ::-1] if grid.is_mirrored else walls.faces
-    walls = Walls(grid.to_world(walls.points / factor - 0.5), faces, walls.sides)
+    vertices = grid.to_world(walls.vertices / factor - 0.5).astype(kind)
+    walls = Walls(vertices, faces, walls.sides)
     if chosen.keep_volume:
         walls = keep_volumes(walls, image.volumes, mean_spacing(grid))
-    voxel = grid.voxel_size
-    walls, notes, warnings = simplified(walls, count, voxel, factor, chosen.error(voxel))
-    meshes = meshes_of(replace(walls, points=walls.points.astype(kind)), count)
-    return meshes, notes, warnings
+    notes, warnings, voxel = [], [], grid.voxel_size
+    if find_spec("pyfqmr") is None:
+        notes.append("pyfqmr is not installed: no triangles are spared")
+    else:
+        walls = spared(walls, SLIGHT * voxel, voxel / factor)
+    if error := chosen.error(voxel):
+        originals = [Original(mesh) for mesh in meshes_of(walls, count)]
+        if found := within(walls, originals, error, lambda: None):
+            walls = found
+        else:
+            warnings.append("the meshes were not simplified: no way was found within the error")
+    return meshes_of(walls, count), notes, warnings
+
+
+def spared(walls: Walls, distance: float, spacing: float) -> Walls:
+    """Return walls after collapses within a distance of planes, without ``faults``.
+
+    Round a fault, the vertices up to about a ``spacing`` of the lattice away are held, and all is
+    done anew. If that does not help, the walls are returned as they were.
+    """
+    held, reach, vertices = np.zeros(len(walls.vertices), bool), spacing, walls.vertices
+    for _ in range(MOST_REPEATS):
+        made = collapse_edges(walls, held, distance=distance)[0]
+        places = made.vertices[faults(made, spacing)]
+        if not len(places):
+            return made
+        low, before = vertices.min(0) - 8 * reach, np.count_nonzero(held)
+        while np.count_nonzero(held) == before < len(held):
+            cells, near = (np.floor((some - low) / reach) for some in (vertices, places))
+            size = cells.max(0) + 8
+            near = np.unique(near, axis=0)[:, None] + NEIGHBOURHOOD
+            along = np.array([size[1] * size[2], size[2], 1])
+            held |= np.isin(cells @ along, near @ along)
+            reach *= 1 if np.count_nonzero(held) > before else 2
+    return walls

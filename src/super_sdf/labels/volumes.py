@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from ..arrays import CORNERS, Numbers, Vectors, dot, face_normals, length, sums_at
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
+from ..simplify.walls import Rows, Walls, faults, labels_apart
 from ..surface.mesh import Mesh
-from .fewer import Rows, faults, of_labels
-from .walls import Walls
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
@@ -52,10 +51,8 @@ def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
 
 def keep_volume(mesh: Mesh, volume: float, spacing: float) -> Mesh:
     """Return a closed mesh moved along its normals until it has the given volume."""
-    sides = np.tile(np.array([1, 0], np.int16), (len(mesh.faces), 1))
-    walls = Walls(mesh.vertices.astype(np.float64), mesh.faces, sides)
-    moved = keep_volumes(walls, [volume], spacing)
-    return Mesh(moved.points.astype(mesh.vertices.dtype), mesh.faces)
+    moved = keep_volumes(Walls.of(mesh), [volume], spacing)
+    return Mesh(moved.vertices, mesh.faces)
 
 
 def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Walls:
@@ -64,14 +61,15 @@ def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Wall
     No wall moves by more than an eighth of the ``spacing``, so the volume of a speck may stay
     another one.
     """
-    middle, most = walls.points.mean(0), MOST * spacing
-    start = walls.points - middle
-    lattice = _mean_normals(replace(walls, points=start), len(volumes), CELL * spacing)
+    middle, most = walls.vertices.mean(0, dtype=np.float64), MOST * spacing
+    start = walls.vertices - middle
+    lattice = _mean_normals(replace(walls, vertices=start), len(volumes), CELL * spacing)
     for _ in range(TURNS):
-        moved = _solved(walls, start, lattice, volumes, most)
-        wrong = faults(replace(walls, points=moved), len(volumes), CELL * spacing)
+        vertices = middle + _solved(walls, start, lattice, volumes, most)
+        moved = replace(walls, vertices=vertices.astype(walls.vertices.dtype))
+        wrong = faults(moved, CELL * spacing)
         if not len(wrong):
-            return replace(walls, points=middle + moved)
+            return moved
         lattice.normals[np.isin(lattice.node, lattice.nodes[wrong])] = 0
     return walls
 
@@ -137,17 +135,17 @@ class _Lattice(NamedTuple):
 
 def _mean_normals(walls: Walls, count: int, cell: float) -> _Lattice:
     """Return the mean normals of the labels 1 to ``count`` near walls, whose middle is at 0."""
-    places = walls.points / cell
+    places = walls.vertices / cell
     corners = np.floor(places)[:, None] + CORNERS
     weights = np.prod(1 - np.abs(places[:, None] - corners), axis=2)
     corners -= corners.min((0, 1))
     _, ny, nz = (corners.max((0, 1)) + 1).tolist()
     _, nodes = np.unique(corners @ [ny * nz, nz, 1], return_inverse=True)
     nodes = nodes.reshape(-1, 8)
-    faces, point, first, _ = of_labels(walls, count)
+    mesh, point, first, _ = labels_apart(walls, count)
     label = np.repeat(np.arange(count), np.diff(first))
-    slopes = face_normals(walls.points[point], faces).repeat(3, 0) / 6
-    slopes = sums_at(faces.ravel().astype(np.int64), slopes, len(point))
+    slopes = face_normals(mesh.vertices, mesh.faces).repeat(3, 0) / 6
+    slopes = sums_at(mesh.faces.ravel().astype(np.int64), slopes, len(point))
     keys, at = np.unique(nodes[point] * count + label[:, None], return_inverse=True)
     at, shares = at.ravel(), weights[point]
     sums = sums_at(at, (shares[..., None] * slopes[:, None]).reshape(-1, 3), len(keys))

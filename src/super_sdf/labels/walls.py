@@ -18,8 +18,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CORNERS, FloatArray, IntArray, Vectors, sums_at
+from ..arrays import CORNERS, FloatArray, IntArray, sums_at
 from ..refine.nodes import VoxelIndex, block_ijk
+from ..simplify.walls import Walls
 from ..surface.marching import CAP_HEIGHT, EDGE_AXIS, EDGE_START, FACES, cells_low_nodes, strides
 from ..surface.mesh import CLEARANCE
 from .cases import CELL_POINTS, FACE_POINTS, PLACES, walls_of_cell
@@ -29,15 +30,6 @@ STEP = (4, 2, 1)  # from a corner of a cell to the next one along each axis
 
 Keys = NDArray[np.int64]
 Labels = NDArray[np.int16]
-
-
-@dataclass(frozen=True, eq=False)
-class Walls:
-    """Triangles between labels, each once: what bounds a label is closed."""
-
-    points: Vectors  # (n, 3)
-    faces: IntArray  # (m, 3), counter-clockwise seen from the second of the labels beside each ...
-    sides: Labels  # (m, 2), ... of which the higher one is the first
 
 
 @dataclass(frozen=True, eq=False)

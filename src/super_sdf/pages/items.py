@@ -103,9 +103,10 @@ def packed_mesh(title: str, mesh: Mesh, certificate: Certificate | None = None) 
     if len(mesh.faces) > MOST_TRIANGLES:  # in one pass, unlike ``simplify_mesh``: only to be seen
         check_modules(f"a view of more than {MOST_TRIANGLES:,} triangles", "simplify", ("pyfqmr",))
         from ..simplify.collapsing import collapse_edges
+        from ..simplify.walls import Walls
 
-        kept = np.zeros(len(mesh.faces), bool)
-        mesh = collapse_edges(mesh, kept, triangles=MOST_TRIANGLES)
+        held = np.zeros(len(mesh.vertices), bool)
+        mesh = collapse_edges(Walls.of(mesh), held, triangles=MOST_TRIANGLES)[0]
         caption += f", shown simplified to {len(mesh.faces):,}"
     vertices = mesh.vertices.astype(np.float64)
     low, high = (vertices.min(0), vertices.max(0)) if len(vertices) else np.zeros((2, 3))

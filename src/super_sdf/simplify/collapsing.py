@@ -3,26 +3,32 @@
 pyfqmr is fast quadric mesh simplification (Forstmann): an edge is collapsed if the sum of squared
 distances of the new vertex to the planes of the triangles it replaces is under a threshold, which
 rises in every round. It neither bounds the distance of triangles nor keeps every mesh a manifold
-without intersections. So the mesh of the last pass is examined. Where it is too far from the
-unsimplified mesh, not a manifold, or meets itself, the triangles around the place are kept in the
-first pass that got it wrong, and this pass and those after it are made anew.
+without intersections. So the result of the last pass is examined. Where it is too far from what it
+was made of, not a manifold, or meets itself, the triangles around the place are kept in the first
+pass that got it wrong, and this pass and those after it are made anew.
+
+What is simplified are the walls between labels, each once, so that every label stays closed, and
+neighbours stay neighbours; a mesh is the wall round one label.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from threading import Lock
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pyfqmr import Simplify
 
+from ..arrays import BoolArray, face_normals
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid, smallest_angles
 from .measuring import Original, mean_side
+from .walls import Walls, irregular_places, meshes_of
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
+ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])  # a triangle apart from all others
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
 # of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
 # the error, those of the second do at some places, and leave a fifth fewer triangles.
@@ -44,59 +50,46 @@ Pass = Sequence[dict[str, float]]
 
 
 def collapsed(
-    mesh: Mesh,
+    walls: Walls,
     passes: Sequence[Pass],
-    original: Original,
+    originals: Sequence[Original],
     error: float,
     count_round: Callable[[], None],
-) -> Mesh | None:
+) -> Walls | None:
     """Return what the last pass makes once nothing is wrong with it, None if that fails.
 
-    Right is a mesh within the error of the original, with no place that is less of a manifold than
-    in ``mesh``, without triangles that intersect, with all components and their holes.
+    Right are walls of which each label is within the error of its original, with no place that is
+    less of a manifold than in ``walls``, without triangles that intersect, with all components and
+    their holes.
     """
-    meshes = [mesh]
-    solids = [original.solid if mesh is original.mesh else Solid(mesh)]
-    kept: list[NDArray[np.bool_]] = []  # triangles of each mesh but the last
+    is_original = originals[0].mesh.faces is walls.faces
+    stages, solids = [walls], [originals[0].solid if is_original else Solid(walls)]
+    kept: list[BoolArray] = []  # triangles of each stage but the last
     places, since = np.zeros((0, 3)), np.zeros(0, np.intp)  # to keep, and from which pass on
-    first, before = 0, irregular_places(mesh)  # pass that is to be made anew
+    first, before = 0, irregular_places(walls)  # pass that is to be made anew
     for _ in range(MOST_REPEATS):
         count_round()
-        del meshes[first + 1 :], solids[first + 1 :], kept[first:]
+        del stages[first + 1 :], solids[first + 1 :], kept[first:]
         for number, steps in enumerate(passes[first:], first):
-            result = meshes[number]
-            corners = result.faces[solids[number].nearest_face(places[since <= number])]
-            chosen: NDArray[np.bool_] = np.zeros(len(result.vertices), bool)
-            chosen[corners] = True
-            held: NDArray[np.bool_] = np.any(chosen[result.faces], axis=1)
-            kept.append(held)
-            count = np.count_nonzero(held)
+            result, held = stages[number], np.zeros(len(stages[number].vertices), bool)
+            held[result.faces[solids[number].nearest(places[since <= number])[1]]] = True
+            held[result.faces[held[result.faces].any(1)]] = True
+            kept.append(np.asarray(held[result.faces].all(1)))
             for step in steps:
-                result = collapse_edges(result, held, **step)
-                held = np.arange(len(result.faces)) >= len(result.faces) - count
+                result, held = collapse_edges(result, held, **step)
             if number == len(passes) - 1 and error < np.inf:
                 result = turn_edges(result, held, LOW * error)
-            meshes.append(result)
-            solids.append(Solid(result))
-        if not len(result.faces):
-            return None
-        wrong = faults(result, mesh, before)
-        if error < np.inf:
-            wrong = np.concatenate([wrong, original.compare(solids[-1], error)[0]])
-        if not len(wrong):
-            if same_topology(result, mesh):
-                return result
-            # keep the components of which nothing is left, in all passes
-            component = mesh.components()[1][mesh.faces[:, 0]]
-            roots = np.unique(result.components()[1][result.faces[:, 0]])
-            found = component[solids[0].nearest_face(solids[-1].mesh.vertices[roots])]
-            missing = solids[0].mesh.vertices[np.unique(mesh.faces[~np.isin(component, found)])]
-            if not len(missing):
+            if not len(result.faces):
                 return None
-            first, places = 0, np.concatenate([places, missing])
-            since = np.append(since, np.zeros(len(missing), np.intp))
-            continue
-        first = len(passes)
+            stages.append(result)
+            solids.append(Solid(result))
+        wrong, lost, is_same = examine(result, walls, before, solids[-1], originals, error)
+        if not len(wrong) and is_same:
+            return result
+        if not len(wrong) and not len(lost):
+            return None
+        places, since = np.concatenate([places, lost]), np.append(since, np.zeros(len(lost), int))
+        first = len(passes) if len(wrong) else 0
         while len(wrong) and first:  # back to the first pass that got it wrong
             first -= 1
             distance, face, _ = solids[first].nearest(wrong)
@@ -109,85 +102,51 @@ def collapsed(
     return None
 
 
-def faults(result: Mesh, mesh: Mesh, before: NDArray[np.float64]) -> Points:
-    """Return where a mesh is less of a manifold than another one, or meets itself, (n, 3).
+def examine(
+    result: Walls,
+    walls: Walls,
+    before: NDArray[np.float64],
+    solid: Solid,
+    originals: Sequence[Original],
+    error: float,
+) -> tuple[Points, Points, bool]:
+    """Return where a result is wrong; if nowhere, also lost components, and if the topology stays.
 
-    ``before`` are the irregular places of the other mesh.
+    ``before`` are the irregular places of the ``walls`` that it was made of, ``solid`` is its own.
+    """
+    labels = [solid]
+    if len(originals) > 1:
+        labels = [Solid(mesh) for mesh in meshes_of(result, len(originals))]
+    none, pairs = np.zeros((0, 3)), list(zip(originals, labels))
+    if not all(len(label.mesh.faces) for label in labels):
+        return none, none, False
+    wrong = [faults_made(result, walls, before, solid)]
+    if error < np.inf:
+        wrong += [original.compare(label, error)[0] for original, label in pairs]
+    if len(far := np.concatenate(wrong)):
+        return far, none, False
+    others = [(one, label.mesh) for one, label in pairs if not same_topology(one.mesh, label.mesh)]
+    return far, np.concatenate([none, *(lost_places(*pair) for pair in others)]), not others
+
+
+def faults_made(result: Walls, walls: Walls, before: NDArray[np.float64], solid: Solid) -> Points:
+    """Return where walls are less of a manifold than those they were made of, or meet themselves.
+
+    ``before`` are the irregular places of the latter, ``solid`` is that of the former.
     """
     found = irregular_places(result)
     made = found[~np.isin(row_keys(found), row_keys(before))]
     lost = before[~np.isin(row_keys(before), row_keys(found))]
     lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
     wrong = np.concatenate([made, lost]).reshape(-1, 3)
-    pairs = Solid(result).intersecting()
+    pairs = solid.intersecting()
     if not len(pairs):
         return wrong
     corners = result.vertices[result.faces[pairs]].astype(np.float64)  # (k, 2, 3, 3)
-    old = row_keys(mesh.vertices[mesh.faces].reshape(-1, 9).astype(np.float64))
+    old = row_keys(walls.vertices[walls.faces].reshape(-1, 9).astype(np.float64))
     is_old = np.isin(row_keys(corners.reshape(-1, 9)), old).reshape(-1, 2).all(1)
     corners = corners[~is_old].reshape(-1, 3, 3)
     return np.concatenate([wrong, corners.reshape(-1, 3), corners.mean(1)])
-
-
-def within(
-    mesh: Mesh, original: Original, error: float, count_round: Callable[[], None]
-) -> tuple[Mesh, tuple[str, ...]]:
-    """Return a mesh within a distance of the original one, and a warning if it is not simpler."""
-    for halving in range(HALVINGS):
-        unit = error / 2**halving
-        passes = [[{"distance": unit * share} for share in steps] for steps in PLANE_DISTANCES]
-        for some in (passes, passes[:1]):
-            result = collapsed(mesh, some, original, error, count_round)
-            if result and len(result.faces) < len(mesh.faces):
-                return result, ()
-    return mesh, (
-        "the mesh was not simplified: none of its triangles can be spared within the error",
-    )
-
-
-def down_to(
-    mesh: Mesh, original: Original, triangles: int, count_round: Callable[[], None]
-) -> tuple[Mesh, tuple[str, ...]]:
-    """Return a mesh of at most ``triangles`` triangles, or the smallest found and a warning.
-
-    The error is sought that leaves hardly fewer. Each error that is tried is a whole
-    simplification, so that the mesh is as good as that of the error.
-    """
-    if len(mesh.faces) <= triangles:
-        return mesh, ()
-    farthest = FARTHEST * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-    error = min(FIRST_ERROR * original.side * len(mesh.faces) / triangles, farthest)
-    low, more, high, fewer = 0.0, len(mesh.faces), np.inf, 0  # errors and what they leave
-    reached, least = None, mesh
-    for _ in range(MOST_ERRORS):
-        result = within(mesh, original, error, count_round)[0]
-        left = len(result.faces)
-        if left <= triangles:
-            reached, high, fewer = result, error, left
-        elif left < len(mesh.faces) or not low:
-            low, more, least = error, left, min(least, result, key=lambda one: len(one.faces))
-        else:  # an error so large that nothing is found within it
-            farthest = error
-        if triangles < MARGIN * left <= MARGIN * triangles or min(high, farthest) < CLOSE * low:
-            break
-        # what is left falls about as a power of the error
-        if reached and low:
-            share = np.log(more / triangles) / np.log(more / fewer)
-            error = float(low * (high / low) ** np.clip(share, 0.15, 0.85))
-        elif reached:
-            error = high * max(fewer / triangles, 1 / STRIDE)
-        else:
-            error = min(low * min(more / triangles, STRIDE), (low * farthest) ** 0.5)
-    if reached:
-        return reached, ()
-    steps = [{"triangles": float(triangles)}] * 5
-    exact = collapsed(least, [steps], original, np.inf, count_round)  # whatever the distance
-    if exact and len(exact.faces) <= triangles:
-        return exact, ()
-    return least, (
-        f"{triangles:,} triangles cannot be reached while the mesh stays a manifold of the same "
-        f"topology: it has {len(least.faces):,}",
-    )
 
 
 def same_topology(one: Mesh, other: Mesh) -> bool:
@@ -204,69 +163,146 @@ def same_topology(one: Mesh, other: Mesh) -> bool:
     return np.array_equal(numbers[0], numbers[1])
 
 
+def lost_places(original: Original, mesh: Mesh) -> Points:
+    """Return the vertices of those components of a mesh of which nothing is left."""
+    component = original.mesh.components()[1][original.mesh.faces[:, 0]]
+    roots = np.unique(mesh.components()[1][mesh.faces[:, 0]])
+    found = component[original.solid.nearest(mesh.vertices[roots].astype(np.float64))[1]]
+    missing = np.unique(original.mesh.faces[~np.isin(component, found)])
+    return original.mesh.vertices[missing].astype(np.float64)
+
+
+def within(
+    walls: Walls, originals: Sequence[Original], error: float, count_round: Callable[[], None]
+) -> Walls | None:
+    """Return walls within a distance of the originals; None if no triangle can be spared."""
+    for halving in range(HALVINGS):
+        unit = error / 2**halving
+        passes = [[{"distance": unit * share} for share in steps] for steps in PLANE_DISTANCES]
+        for some in (passes, passes[:1]):
+            result = collapsed(walls, some, originals, error, count_round)
+            if result and len(result.faces) < len(walls.faces):
+                return result
+    return None
+
+
+def down_to(
+    walls: Walls, original: Original, triangles: int, count_round: Callable[[], None]
+) -> Walls:
+    """Return walls of at most ``triangles`` triangles, or the fewest that are found.
+
+    The error is sought that leaves hardly fewer. Each error that is tried is a whole
+    simplification, so that the mesh is as good as that of the error.
+    """
+    if len(walls.faces) <= triangles:
+        return walls
+    farthest = FARTHEST * float(np.linalg.norm(np.ptp(walls.vertices, axis=0)))
+    error = min(FIRST_ERROR * original.side * len(walls.faces) / triangles, farthest)
+    low, more, high, fewer = 0.0, len(walls.faces), np.inf, 0  # errors and what they leave
+    reached, least = None, walls
+    for _ in range(MOST_ERRORS):
+        result = within(walls, [original], error, count_round) or walls
+        left = len(result.faces)
+        if left <= triangles:
+            reached, high, fewer = result, error, left
+        elif left < len(walls.faces) or not low:
+            low, more, least = error, left, min(least, result, key=lambda one: len(one.faces))
+        else:  # an error so large that nothing is found within it
+            farthest = error
+        if triangles < MARGIN * left <= MARGIN * triangles or min(high, farthest) < CLOSE * low:
+            break
+        # what is left falls about as a power of the error
+        if reached and low:
+            share = np.log(more / triangles) / np.log(more / fewer)
+            error = float(low * (high / low) ** np.clip(share, 0.15, 0.85))
+        elif reached:
+            error = high * max(fewer / triangles, 1 / STRIDE)
+        else:
+            error = min(low * min(more / triangles, STRIDE), (low * farthest) ** 0.5)
+    if reached:
+        return reached
+    steps = [{"triangles": float(triangles)}] * 5  # whatever the distance
+    exact = collapsed(least, [steps], [original], np.inf, count_round)
+    return exact if exact and len(exact.faces) <= triangles else least
+
+
 def collapse_edges(
-    mesh: Mesh, kept: NDArray[np.bool_], *, distance: float = 0.0, triangles: float = 0
-) -> Mesh:
+    walls: Walls, held: BoolArray, *, distance: float = 0.0, triangles: float = 0
+) -> tuple[Walls, BoolArray]:
     """Collapse the edges whose new vertex is within a distance of the planes around it.
 
     That is the root of the sum of squared distances, in world units. Or, without a distance, those
     until no more than a number of triangles is left, unless the shape does not allow it. The
-    triangles that are ``kept``, (m,), stay as they are, with their vertices; open edges stay, too.
-    The others are a mesh of its own, whose open edges pyfqmr keeps: there it is joined to the kept
-    triangles again.
+    vertices ``held``, (n,), stay where they are, and open edges; also returned is which are held.
+
+    pyfqmr keeps open edges and the order of triangles. So a vertex is held by a triangle of its
+    own, and after the triangles of each pair of labels comes one apart from all others.
     """
-    target = max(int(triangles) - int(np.count_nonzero(kept)), 0)
-    options: dict[str, Any] = {"target_count": target, "update_rate": 1}
+    from pyfqmr import Simplify
+
+    if not len(walls.faces):
+        return walls, held
+    pair, pins = walls.sides @ np.array([1 << 16, 1]), np.flatnonzero(held)
+    order = np.argsort(pair, kind="stable")
+    last = np.flatnonzero(np.diff(pair[order], append=-1))
+    unit = distance or mean_side(walls)  # the length that pyfqmr's thresholds have
+    middle = walls.vertices.mean(0, dtype=np.float64)
+    scaled = (walls.vertices - middle) / unit
+    tips = scaled[np.tile(pins, 2)] + np.repeat(ALONE[1:], len(pins), axis=0)
+    marks = np.tile(ALONE, (len(last), 1)) + 3 * np.repeat(np.arange(len(last)), 3)[:, None]
+    points = np.concatenate([scaled, tips, marks + scaled.max(0) + 2])
+    one, other = len(scaled) + np.arange(len(tips)).reshape(2, -1)
+    mark = np.arange(len(points) - len(marks), len(points)).reshape(-1, 3)
+    faces = np.insert(walls.faces[order], last + 1, mark, axis=0)
+    faces = np.concatenate([faces, np.stack([pins, one, other], 1)]).astype(np.int32)
+    options: dict[str, Any] = {"target_count": int(triangles) + len(last) + len(pins)}
     if distance:
-        rounds, rise = FEW_ROUNDS if len(mesh.faces) > LARGE else ROUNDS
+        rounds, rise = FEW_ROUNDS if len(walls.faces) > LARGE else ROUNDS
         options = {"target_count": 0, "max_iterations": rounds}
         options |= {"alpha": rounds**-rise, "K": 1, "aggressiveness": rise}  # to the distance
-    unit = distance or mean_side(mesh)  # the length that pyfqmr's thresholds have
-    middle = mesh.vertices.mean(0, dtype=np.float64)
-    scaled = (mesh.vertices - middle) / unit
-    is_used = np.bincount(mesh.faces[~kept].ravel(), minlength=len(scaled)) > 0
-    faces, moved = (np.cumsum(is_used, dtype=np.int32) - 1)[mesh.faces[~kept]], scaled[is_used]
-    if len(faces):
-        with ONE_AT_A_TIME:
-            library = Simplify()
-            library.setMesh(moved, faces)
-            library.simplify_mesh(preserve_border=True, verbose=False, **options)
-            moved, faces, _ = library.getMesh()
-    held = np.unique(mesh.faces[kept])
-    _, found, at = np.intersect1d(row_keys(moved), row_keys(scaled[held]), return_indices=True)
-    vertices = (moved * unit + middle).astype(mesh.vertices.dtype)
-    vertices[found] = mesh.vertices[held[at]]
-    extra, number = np.delete(held, at), np.full(len(scaled), -1, np.int32)
-    number[held[at]], number[extra] = found, len(moved) + np.arange(len(extra))
-    faces = np.concatenate([faces.astype(np.int32), number[mesh.faces[kept]]])
-    return Mesh(np.concatenate([vertices, mesh.vertices[extra]]), faces)
+    with ONE_AT_A_TIME:
+        library = Simplify()
+        library.setMesh(points, faces)
+        library.simplify_mesh(preserve_border=True, verbose=False, update_rate=1, **options)
+        moved, faces, _ = library.getMesh()
+    count = len(moved) - len(tips) - len(marks)
+    faces, pinned = np.split(faces.astype(np.int32), [len(faces) - len(pins)])
+    is_mark = faces[:, 0] >= count
+    sides = walls.sides[order[last]][np.cumsum(is_mark)[~is_mark]]
+    vertices = (moved[:count] * unit + middle).astype(walls.vertices.dtype)
+    _, same, old = np.intersect1d(row_keys(moved[:count]), row_keys(scaled), return_indices=True)
+    vertices[same] = walls.vertices[old]
+    held = np.zeros(count, bool)
+    held[pinned[:, 0]] = True
+    return Walls(vertices, faces[~is_mark], sides), held
 
 
-def turn_edges(mesh: Mesh, held: NDArray[np.bool_], distance: float) -> Mesh:
+def turn_edges(walls: Walls, held: BoolArray, distance: float) -> Walls:
     """Turn the longest edges of slivers that are lower than a distance, where that makes none.
 
-    So the surface moves by less than the distance. The triangles ``held``, (m,), stay.
+    So the surface moves by less than the distance. Triangles whose corners are all ``held``, (n,),
+    stay.
     """
-    points, faces, count = mesh.vertices.astype(np.float64), mesh.faces.copy(), len(mesh.vertices)
+    points, faces, count = walls.vertices.astype(np.float64), walls.faces.copy(), len(held)
+    kept = np.asarray(held[faces].all(1))
     for _ in range(4):  # not all edges can be turned at once
         corners = points[faces]
-        thin = np.flatnonzero((smallest_angles(corners) < THIN) & ~held)
+        thin = np.flatnonzero((smallest_angles(corners) < THIN) & ~kept)
         if len(thin) <= FEW_SLIVERS * len(faces):
             break
         sides = np.linalg.norm(corners[thin] - np.roll(corners[thin], -1, axis=1), axis=2)
-        solid, flat = Solid(Mesh(points, faces)), faces.ravel()
-        normals = solid.normals()
+        normals, flat = face_normals(points, faces), faces.ravel()
         is_low = np.linalg.norm(normals[thin], axis=1) < distance * sides.max(1, initial=0)
         if not is_low.any():
             break
-        half, opposite = (3 * thin + sides.argmax(1))[is_low], solid.mesh.pair_edges()[0]
-        half = half[(opposite[half] >= 0) & ~held[opposite[half] // 3]]
+        half, opposite = (3 * thin + sides.argmax(1))[is_low], Mesh(points, faces).pair_edges()[0]
+        half = half[(opposite[half] >= 0) & ~kept[opposite[half] // 3]]
         one, other = half // 3, opposite[half] // 3
         a, b, c = (flat[3 * one + (half + turn) % 3] for turn in range(3))
         d = flat[3 * other + (opposite[half] + 2) % 3]
         new = np.stack([c, a, d, d, b, c], axis=1).reshape(-1, 2, 3)
         better = smallest_angles(points[new.reshape(-1, 3)]).reshape(-1, 2).min(1) > THIN
-        after = Solid(Mesh(points, new.reshape(-1, 3))).normals().reshape(-1, 2, 3)
+        after = face_normals(points, new.reshape(-1, 3)).reshape(-1, 2, 3)
         lengths = np.linalg.norm(after, axis=2) * np.linalg.norm(normals[other], axis=1)[:, None]
         steady = (np.einsum("nij,nj->ni", after, normals[other]) > STEADY * lengths).all(1)
         edges = flat.astype(np.int64) * count + np.roll(faces, -1, axis=1).ravel()
@@ -279,22 +315,4 @@ def turn_edges(mesh: Mesh, held: NDArray[np.bool_], distance: float) -> Mesh:
                 faces[[one[row], other[row]]] = new[row]
         if not taken:
             break
-    return Mesh(mesh.vertices, faces)
-
-
-def irregular_places(mesh: Mesh) -> NDArray[np.float64]:
-    """Return where a mesh is no closed manifold, (n, 6): the two ends of an edge, or a point twice.
-
-    These are the edges, in the direction of their triangle, without exactly one triangle that
-    passes them in the other direction, and the vertices at which several fans of triangles meet, or
-    that are at the position of another one, or at which two triangles have the same three corners.
-    """
-    positions, faces = mesh.vertices.astype(np.float64), mesh.faces
-    opposite = mesh.pair_edges()[0]
-    unpaired, points = opposite < 0, [np.flatnonzero(mesh.count_fans(opposite) > 1)]
-    for rows in (positions, np.sort(faces, axis=1).astype(np.float64)):
-        _, inverse, uses = np.unique(row_keys(rows), return_inverse=True, return_counts=True)
-        points.append(np.flatnonzero(uses[inverse] > 1))
-    points[2] = faces[points[2]].ravel().astype(np.intp)
-    sides = (faces.ravel()[unpaired], np.roll(faces, -1, 1).ravel()[unpaired])
-    return np.concatenate([positions[np.concatenate([end, *points])] for end in sides], axis=1)
+    return replace(walls, faces=faces)
