@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import sys
 import zipfile
 from pathlib import Path
 
@@ -21,11 +22,9 @@ from super_sdf.options import MESH_FORMATS, OPTIONS, Options
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def here(folder):
     """A folder of its own with a good grid in it."""
-    monkeypatch.chdir(tmp_path)
     np.save("in.npy", ball().values)
-    return tmp_path
 
 
 def test_the_main_job(here, command):
@@ -214,3 +213,9 @@ def test_wrong_values_are_named_in_lists_by_their_names(here, command):
     Path("list.jsonl").write_text('{"in": "in.npy", "simplify": -1}')
     _, _, err = command("batch", "list.jsonl", "--out", "out", "--simplify", "0.5")
     assert "simplify is -1: give a number" in err and "--simplify" not in err
+
+
+def test_the_progress_bar_says_that_it_reads_and_runs_to_100_percent(here, command, monkeypatch):
+    monkeypatch.setattr(type(sys.stderr), "isatty", lambda self: True, raising=False)
+    code, _, err = command("upsample", "in.npy", "out.ply", "--spacing", "1")
+    assert code == 0 and err.index("reading") < err.index("upsampling") < err.index("100%")

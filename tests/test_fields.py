@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ball, refusal, trilinear
+from conftest import ball, cut_ball, refusal, trilinear
 from numpy.typing import ArrayLike
 
 from super_sdf import (
@@ -41,12 +41,6 @@ def plane() -> SdfGrid:
 def to_plane(points: np.ndarray) -> np.ndarray:
     """Return the distances of points (..., 3) from the plane."""
     return (points - ORIGIN - 1.6) @ NORMAL
-
-
-def cut_ball() -> SdfGrid:
-    """Return a ball that leaves its grid on three sides, with voxels inside that have no block."""
-    ijk = np.indices((14, 15, 16)).astype(np.float64)
-    return SdfGrid.trusted(np.linalg.norm(ijk - 2.3, axis=0) * 0.3 - 1.8, 0.3, (1.0, 2.0, 3.0))
 
 
 def tip() -> SdfGrid:

@@ -1,7 +1,6 @@
 """The library says what the command says: what it refuses, in one line, and what it takes."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from super_sdf import (
 )
 from super_sdf.errors import GridError, OptionError
 
-ROOT = Path(__file__).parent.parent
 VALUES = ball(20, 6.0).values
 
 

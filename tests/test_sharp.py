@@ -96,12 +96,6 @@ def test_the_command_takes_a_mesher_and_says_which(folder, command):
     assert command("upsample", "in.npy", "x.ply", "--mesher", "dual", *words)[0] == 2
 
 
-def test_the_rule_of_the_package_has_a_weight_for_each_evidence():
-    rule = json.loads(features.RULE.read_text())
-    assert len(features.load_rule().weights) == len(rule["weights"]) == 10
-    assert features.load_rule().share(np.zeros((1, 10))) == np.clip(rule["bias"], 0, 1)
-
-
 @pytest.fixture
 def features_everywhere():
     """Let every patch be a feature: fans and turned sides, ambiguous faces among them."""
