@@ -39,11 +39,11 @@ def test_the_sign_is_negative_inside_in_the_end(inside, flips):
 REFUSED = {
     "every value is 3: a constant field has no surface": np.full((4, 4, 4), 3.0),
     "no value is below 0 (the smallest is 0.5): they look like densities: give the level of their "
-    "surface, such as level=0.8, inside='negative'": np.abs(torus(8))
+    "surface, such as level=0.8, inside='positive'": np.abs(torus(8))
     + 0.5
     - np.abs(torus(8)).min(),
     "no value is above 0 (the largest is -1): they look like densities: give the level of their "
-    "surface, such as level=-4.5, inside='negative'": (-1 - np.indices((3, 3, 3)).sum(0)),
+    "surface, such as level=-3.5, inside='positive'": (-1 - np.indices((3, 3, 3)).sum(0)),
     "no value is finite: there is no surface": np.full((3, 3, 3), np.nan),
     "values have shape (4, 4): give three axes (x, y, z)": np.zeros((4, 4)),
     "values have shape (4, 1, 4): give at least 2 samples on each axis": np.zeros((4, 1, 4)),

@@ -15,9 +15,10 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import without_device
+from ..arrays import CORNERS, without_device
 from ..errors import GridError, OptionError, OptionTypeError, seen
 from ..grid.derived import sample_near
+from ..grid.look import ORDINARY
 from ..grid.samples import as_triple, check_spacing
 from ..grid.sdf_grid import SdfGrid, check_grid, make_grid
 
@@ -103,9 +104,13 @@ class DistanceFunction:
         if not isinstance(reach, Real) or not reach > 0:
             raise OptionError(f"reach is {seen(reach)}: give a number greater than 0, or infinity")
 
+        corners = self(low + step * (np.array(shape) - 1) * CORNERS)
+        largest = np.abs(corners[np.isfinite(corners)]).max(initial=0)
+        scale = largest if largest and not ORDINARY[0] < largest < ORDINARY[1] else 1.0
+
         def at(indices: NDArray[Any]) -> Numbers:
-            """Return the values at samples (n, 3) of the lattice."""
-            return self(low + step * indices)
+            """Return the values at samples (n, 3) of the lattice, in numbers of usual size."""
+            return self(low + step * indices) / scale
 
         samples, cut = sample_near(at, tuple(shape), step, float(reach))
         if not ((samples < 0).any() and (samples > 0).any()):  # it may be steeper than seen

@@ -5,6 +5,7 @@ What the user says of the values wins, then what the file says; the rest is reco
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -171,7 +172,7 @@ def interpret(
     if wanted.level is not None:
         return _of_level(case)
     if wanted.field == MASK:
-        return _of_sides(case if case.look.is_finite else _with_known(case, None), {})
+        return _of_sides(case if case.look.is_finite else _with_known(case), {})
     given = None if steps is None else np.array(steps_of(steps))
     answer = Answer(wanted.field, "", {"cut": cut_values(case.look), "spacing": given})
     if wanted.field == AUTO:
@@ -195,8 +196,8 @@ def _as_recognised(case: Case, answer: Answer) -> Taken:
             side = "no value is {} 0 (the {} is {:.6g}): ".format(*which)
         side = "no solid is chosen: " if answer.kind == "labels" else side
         raise GridError(side + said)
-    if not case.look.is_finite or "unknown_value" in facts:
-        case = _with_known(case, facts.get("unknown_value"))
+    if not case.look.is_finite or "unknown_values" in facts:
+        case = _with_known(case, facts.get("unknown_values", ()))
     if answer.kind == MASK:
         if "two values" not in answer.why:
             case.notes.append(f"the values are {answer.why}")
@@ -216,12 +217,21 @@ def _as_recognised(case: Case, answer: Answer) -> Taken:
         if wanted.field != NOISY:
             case.notes.append(f"values taken as noisy (--field noisy): {answer.why}{said}")
         return case.taken(case.spacing, Field(NOISY, exact=NONE_EXACT, network=NOISY), facts)
+    if slope := facts.get("slope"):
+        case.notes.append(
+            f"the values change by {slope:.4g} of a spacing from sample to sample, distances by 1: "
+            f"they are divided by that (if the spacing is wrong, give --spacing)"
+        )
+        samples, look = changed(case.samples, lambda values: values / slope), case.look
+        look = replace(look, low=look.low / slope, high=look.high / slope)
+        case = replace(case, samples=samples, look=look)
+        facts = facts | {"cut": [x / slope for x in facts["cut"]]}
     return _of_distances(case, facts)
 
 
-def _with_known(case: Case, value: float | None) -> Case:
+def _with_known(case: Case, values: Sequence[float] = ()) -> Case:
     """Return samples of which unknown ones are filled in."""
-    known = with_known(case.samples, case.look, value, case.notes)
+    known = with_known(case.samples, case.look, values, case.notes)
     look = replace(look_at(known.samples), low=known.extremes[0], high=known.extremes[1])
     return replace(case, samples=known.samples, look=look, known=known)
 
@@ -327,7 +337,7 @@ def _of_level(case: Case) -> Taken:
     if len(look.few) == 2 or wanted.field == MASK:
         return _of_mask(case, changed(case.samples, partial(np.less, 0), np.bool_))
     if not look.is_finite:
-        case = _with_known(case, None)
+        case = _with_known(case)
     spacing = case.spacing_or(1, "since densities show none (give --spacing)")
     return _of_spline(replace(case, spacing=spacing), {}, DENSITY)
 

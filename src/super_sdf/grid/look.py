@@ -363,7 +363,7 @@ def which_level(look: Look, *, signed: bool = False, shift: float = 0.0, unit: f
         level = float(beside + values[at]) / 2
     outside = border_share(look, lambda x: x / unit > level - shift) > 0.9
     option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
-    other = "; or --field smooth, if it is at 0" if signed else ""
+    other = " (or --field smooth, if it is at 0)" if signed else ""
     return f"they look like densities: give the level of their surface, such as {option}{other}"
 
 

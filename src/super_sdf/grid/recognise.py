@@ -66,6 +66,7 @@ CONTRADICTIONS = 0.003  # exact and cut off 0; noise of .05 voxel from .009; oth
 STRAIGHT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
 EXACT = 0.02  # spacings, and share of a slope: the error of differences of exact distances
 SAME_UNIT = 0.01  # from 1: exact to .002; saturating and smooth unions from .019
+ANOTHER_UNIT = 0.05  # from 1: up to this, values are divided by their slope, with a note
 MOST_DIGIT = 0.12  # spacings: the last digit of rounded distances
 MATTERS = 3.0  # spacings: values farther from 0 may be anything
 NARROW = 4.5  # spacings up to which values that are cut off have too few slopes to judge
@@ -287,24 +288,28 @@ def _side_of_zeros(look: Look) -> int:
 
 
 def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
-    """Return a look without the value of many samples to which the others jump, if there is one."""
+    """Return a look without values of many samples to which the others jump, if there are some."""
     if not look.low < 0 < look.high:
         return look
     shares = {look.low: look.at_ends[0], look.high: look.at_ends[1], **look.common}
+    frequent = [value for value, share in shares.items() if share >= CUT]
     pairs = look.all_pairs * look.scale
-    change = np.abs(pairs[0] - pairs[1])
-    at_ends = np.isin(pairs, (look.low, look.high)).all(0)
-    for value, share in shares.items():
-        at = (pairs == value).any(0)
-        if share < CUT or not (at & ~at_ends).any() or at.all():
-            continue
-        jumps = change[at & ~at_ends] > JUMP * np.quantile(change[~at], 0.99)
-        if jumps.mean() > 0.5:
-            facts["unknown_value"] = value
-            facts["cut"] = [x for x in facts["cut"] if x != value]
-            return look.without(value / look.scale)
-        if jumps.mean() > MIXED and value in facts["cut"]:
+    change, is_frequent = np.abs(pairs[0] - pairs[1]), np.isin(pairs, frequent)
+    usual = change[~is_frequent.any(0)]
+    found = []
+    for value in frequent if len(usual) else ():
+        steps = change[(pairs == value).any(0) & ~is_frequent.all(0)]
+        jumps = float((steps > JUMP * np.quantile(usual, 0.99)).mean()) if len(steps) else 0.0
+        if jumps > 0.5:
+            found.append(value)
+        elif jumps > MIXED and value in facts["cut"]:
             facts["perhaps_unknown"] = value
+    if found:
+        facts["unknown_values"] = found
+        facts["cut"] = [x for x in facts["cut"] if x not in found]
+        facts.pop("perhaps_unknown", None)
+    for value in found:
+        look = look.without(value / look.scale)
     return look
 
 
@@ -405,11 +410,14 @@ def _distances(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any
         shown = ",".join(f"{x:.4g}" for x in given * unit * look.scale)
         said = f"the values show another spacing along each axis: --spacing {shown}"
         return Answer("distance", "", facts, said)
-    if given is not None and abs(unit * look.scale - 1) > facts["error"]:
+    off = 0.0 if given is None else abs(float(unit) * look.scale - 1)
+    if facts["error"] < off <= ANOTHER_UNIT:
+        facts["slope"] = float(unit) * look.scale
+    if off > ANOTHER_UNIT:
         scale = 1 / (unit * look.scale)
         power, short = 10.0 ** np.round(np.log10(scale)), float(f"{scale:.2g}")
         scale = next((x for x in (power, short) if abs(scale / x - 1) < 2e-3), scale)
-        shown = ",".join(f"{x:.4g}" for x in np.unique(given) * unit * look.scale)
+        shown = ",".join(f"{x:.4g}" for x in np.unique(steps) * unit * look.scale)
         said = (
             "they are distances in another unit than the spacing: multiply the values, --scale "
             f"{scale:.6g} (or the spacing is wrong: they show {shown})"

@@ -8,7 +8,7 @@ small; else the surface ends there.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -43,14 +43,16 @@ class Known(NamedTuple):
     why_open: str
 
 
-def with_known(samples: SampleArray, look: Look, value: float | None, notes: list[str]) -> Known:
-    """Return samples without unknown ones; a ``value`` stands for these, too."""
-    which = ""
-    if value is not None:
-        known = changed(samples, lambda planes: np.where(planes == value, np.nan, planes))
+def with_known(
+    samples: SampleArray, look: Look, values: Sequence[float], notes: list[str]
+) -> Known:
+    """Return samples without unknown ones; some ``values`` stand for these, too."""
+    which, named = "", " or ".join(f"{value:g}" for value in values)
+    if values:
+        known = changed(samples, lambda planes: np.where(np.isin(planes, values), np.nan, planes))
         finite = [plane[np.isfinite(plane)] for plane in known]
         low, high = (float(end(np.concatenate(finite))) for end in (np.min, np.max))
-        which = f" (those that are exactly {value:g} are taken as such)"
+        which = f" (those that are exactly {named} are taken as such)"
         samples = known
     else:
         low, high = look.low, look.high
@@ -58,9 +60,9 @@ def with_known(samples: SampleArray, look: Look, value: float | None, notes: lis
         _check_infinite(samples)
     regions = Regions(samples, np.isnan)
     count = int(regions.size.sum())
-    if value is not None:
+    if values:
         notes.append(
-            f"{count:,} samples are exactly {value:g}, where no distance is: they are taken as "
+            f"{count:,} samples are exactly {named}, where no distance is: they are taken as "
             "unknown (write NaN where nothing was seen)"
         )
     outer = int(regions.size[regions.positive & ~regions.unsure].sum())
@@ -74,7 +76,7 @@ def with_known(samples: SampleArray, look: Look, value: float | None, notes: lis
     if regions.size[small].sum() > MOST_KNOWN * np.prod(samples.shape, dtype=float):
         small[:] = False
     unsure = regions.unsure & ~small
-    outside = low if border_share(look, lambda x: (x < 0) & (x != value)) > 0.5 else high
+    outside = low if border_share(look, lambda x: (x < 0) & ~np.isin(x, values)) > 0.5 else high
 
     def known_of(planes: NDArray[Any], first: int) -> NDArray[Any]:
         planes = np.array(planes)

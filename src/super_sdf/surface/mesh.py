@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import IntArray
-from ..errors import GridError, OptionTypeError, seen
+from ..errors import GridError, MeshError, OptionTypeError, seen
 from ..grid.sdf_grid import SdfGrid
 from ..threads import chunks_of
 
@@ -157,9 +157,13 @@ class Mesh:
 
 
 def check_mesh(mesh: Any) -> None:
-    """Raise OptionTypeError if ``mesh`` is not a ``Mesh``."""
+    """Raise OptionTypeError if ``mesh`` is not a ``Mesh``, MeshError if a face has no vertex."""
     if not isinstance(mesh, Mesh):
         raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
+    faces, count = mesh.faces, len(mesh.vertices)
+    if len(faces) and not 0 <= faces.min() <= faces.max() < count:
+        wrong = next(n for n in (faces.max(), faces.min()) if not 0 <= n < count)
+        raise MeshError(f"a face names vertex {wrong}, of {count}: give 0 to {count - 1}")
 
 
 def row_keys(rows: NDArray[np.float64]) -> NDArray[np.uint64]:
