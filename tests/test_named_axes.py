@@ -16,13 +16,10 @@ CENTRE, RADIUS = np.array([1.3, 14.9, 105.2]), 3.1
 
 def sphere(order: str = "xyz", down: str = "") -> xarray.DataArray:
     """Return the distances to a sphere, axes in an order, along falling coordinates in ``down``."""
-    coordinates = {
-        name: first + step * np.arange(count)
-        for name, first, step, count in zip("xyz", FIRST, STEP, SHAPE)
-    }
-    places = np.stack(np.meshgrid(*coordinates.values(), indexing="ij"), axis=-1)
+    places = np.moveaxis(np.indices(SHAPE), 0, -1) * STEP + FIRST
+    coordinates = {"x": places[:, 0, 0, 0], "y": places[0, :, 0, 1], "z": places[0, 0, :, 2]}
     values = np.linalg.norm(places - CENTRE, axis=-1) - RADIUS
-    array = xarray.DataArray(values, coordinates, ["x", "y", "z"], name="sdf")
+    array = xarray.DataArray(values, coordinates, name="sdf")
     return array.isel(dict.fromkeys(down, slice(None, None, -1))).transpose(*order)
 
 

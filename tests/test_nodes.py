@@ -57,8 +57,8 @@ def test_a_pinned_node_of_two_voxels_is_pinned_in_both_and_counted_once():
     voxels = np.array([[1, 1, 1], [1, 1, 2]], np.int32)
     parts = share_parts(neighbour_table(voxels, (3, 3, 4)))
     patches = -np.ones((2, 27), np.float32)
-    blocks, rows = np.ones((27, 2), np.float32), np.arange(2, dtype=np.int32)
-    changed = pin_to_skipped(blocks, parts, 2, voxels, patches, rows, (3, 3, 4))
+    blocks = np.ones((27, 2), np.float32)
+    changed = pin_to_skipped(blocks, parts, 2, voxels, patches, (3, 3, 4))
     middle = (block_ijk(2) == 1).all(1)  # all other nodes touch a skipped voxel ...
     between = (block_ijk(2) == [1, 1, 2]).all(1)  # ... except the middle of the common face
     assert (blocks[~middle & ~between, 0] < 0).all() and (blocks[middle | between, 0] > 0).all()

@@ -7,6 +7,7 @@ from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
+from conftest import refusal
 
 from super_sdf.errors import GridError, SuperSdfError, WriteError
 from super_sdf.files import output
@@ -22,11 +23,9 @@ def make(path, *, force=False, meanwhile=lambda: None):
         meanwhile()
 
 
-def refusal(path, *, force=False):
+def why(path, *, force=False):
     """Return why a file cannot be made there, before the work."""
-    with pytest.raises(WriteError) as caught:
-        check_free(Path(path), force=force)
-    return str(caught.value)
+    return refusal(WriteError, check_free, Path(path), force=force)
 
 
 @pytest.mark.parametrize("has_links", [True, False])
@@ -52,7 +51,7 @@ def test_by_force_a_link_stays_one_and_what_it_leads_to_is_written(there):
     if there:
         Path("disk/there.ply").write_text(there)
     os.symlink("disk/there.ply", "out.ply")
-    assert refusal("out.ply") == "out.ply exists: remove it or use force=True"
+    assert why("out.ply") == "out.ply exists: remove it or use force=True"
     make("out.ply", force=True)
     assert os.readlink("out.ply") == "disk/there.ply"
     assert Path("disk/there.ply").read_text() == "mine" and os.listdir("disk") == ["there.ply"]
@@ -67,7 +66,7 @@ def test_a_file_that_is_replaced_keeps_its_mode_and_a_protected_one_stays(name):
     Path(name).write_text("old")
     with pytest.raises(WriteError, match="is write-protected: allow writing to it, or give ano"):
         make(name, force=True, meanwhile=lambda: os.chmod(name, 0o444))
-    assert "is write-protected" in refusal(name, force=True)  # also for root
+    assert "is write-protected" in why(name, force=True)  # also for root
     assert Path(name).read_text() == "old" and os.listdir() == [name]
 
 
@@ -79,20 +78,19 @@ def test_a_file_is_apart_from_another_only_if_it_is_another():
     check_apart("own.ply", ["grid.npy", "none.npy"])
     check_apart("none.npy", ["none.npy"])
     for name in ("soft.ply", "hard.ply", "../" + Path.cwd().name + "/grid.npy"):
-        with pytest.raises(WriteError) as caught:
-            check_apart(name, ["own.ply", "grid.npy"])
-        assert str(caught.value) == f"{name} is the same file as grid.npy: give another file"
+        said = refusal(WriteError, check_apart, name, ["own.ply", "grid.npy"])
+        assert said == f"{name} is the same file as grid.npy: give another file"
 
 
 def test_places_where_no_file_can_be_are_named():
     os.symlink("round.ply", "round.ply")
     os.symlink("no/there.ply", "out.ply")
     os.mkfifo("pipe.ply")
-    assert refusal("round.ply", force=True).startswith("round.ply cannot be written: Too many le")
-    assert refusal("out.ply", force=True).endswith("/no is not a folder: make it first")
-    assert refusal("pipe.ply", force=True) == "pipe.ply is not a regular file: give another name"
-    assert refusal("x" * 300) == f"{'x' * 300} cannot be written: File name too long"
-    assert refusal("a\0b").endswith(" cannot be written: embedded null byte")
+    assert why("round.ply", force=True).startswith("round.ply cannot be written: Too many le")
+    assert why("out.ply", force=True).endswith("/no is not a folder: make it first")
+    assert why("pipe.ply", force=True) == "pipe.ply is not a regular file: give another name"
+    assert why("x" * 300) == f"{'x' * 300} cannot be written: File name too long"
+    assert why("a\0b").endswith(" cannot be written: embedded null byte")
 
 
 @pytest.mark.parametrize("target", ["out.ply", "x" * 250 + ".ply"])

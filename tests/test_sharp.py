@@ -12,7 +12,6 @@ from test_isosurface import dense_field
 from lab.methods import sharp_isosurface
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.surface.sharp import features
-from super_sdf.surface.sharp.folds import intersecting, without_folds
 from super_sdf.truth.solid import Solid, read_mesh
 
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
@@ -152,45 +151,15 @@ def test_a_blade_and_a_gap_do_not_intersect():
             assert intersections(sharp_isosurface(field, 0.25, 0.0)) == 0
 
 
-def test_features_of_a_box_along_the_lattice_are_kept(monkeypatch):
-    """Its triangles lie in common planes, and some of its vertices on nodes."""
-    kept = []
-
-    def counting(*of):
-        kept.append((len(of[1].feature), len(without_folds(*of).feature)))
-        return without_folds(*of)
-
-    monkeypatch.setattr(features, "without_folds", counting)
-    box = box_distance(4 * np.array([3.0, 2.5, 2.0]), 49, 24.5, np.eye(3)) / 4
-    sharp_isosurface(box.astype(np.float32), 0.25, 0.0)
-    assert kept[0][0] == kept[0][1] > 100
-
-
-def test_the_true_distance_is_meshed_on_its_edges():
-    """Of a dense field, as for the bound in evaluations."""
-    half = np.array([3.1, 2.5, 2.1])
-    lattice = turned_box(4 * half, 49).values.astype(np.float32) / 4
-    mesh = sharp_isosurface(lattice, 0.25, 0.0)
-    assert mesh.is_closed() and mesh.volume() == pytest.approx(8 * half.prod(), rel=1e-3)
+@pytest.mark.parametrize("turn, half", [(TURN, [3.1, 2.5, 2.1]), (np.eye(3), [3.0, 2.5, 2.0])])
+def test_the_true_distance_is_meshed_on_its_edges(turn, half):
+    """Of a dense field; also along the lattice, where triangles share planes, vertices nodes."""
+    lattice = box_distance(4 * np.array(half), 49, 49 / 2 + 0.13 * (turn is TURN), turn) / 4
+    mesh = sharp_isosurface(lattice.astype(np.float32), 0.25, 0.0)
+    assert mesh.is_closed() and mesh.volume() == pytest.approx(8 * np.prod(half), rel=1e-3)
+    local = (mesh.vertices - (49 / 2 + 0.13 * (turn is TURN)) / 4) @ turn
     for signs in np.indices((2, 2, 2)).reshape(3, 8).T * 2 - 1:
-        corner = TURN @ (half * signs) + (49 / 2 + 0.13) / 4
-        assert np.linalg.norm(mesh.vertices - corner, axis=1).min() < 0.03
-
-
-# A triangle, and others over it: beside it, through it, flat on it, at a common corner.
-PAIRS = [
-    ([[1.0, 1, -1], [1, 1, 1], [2, 2, 1]], False),
-    ([[0.2, 0.2, -1], [0.2, 0.2, 1], [2, 2, 1]], True),
-    ([[0.1, 0.1, 0.01], [0.9, 0.1, 0.01], [0.1, 0.9, 0.01]], False),
-    ([[0.0, 0, 0], [1, 1, 1], [0.5, 0.5, -1]], True),
-    ([[0.0, 0, 0], [-1, 0, 1], [-1, 0.5, -1]], False),
-    ([[0.0, 0, 0], [-1, 0, 0], [0, -1, 0]], False),
-]
-
-
-@pytest.mark.parametrize("corners, want", PAIRS)
-def test_which_triangles_intersect(corners, want):
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], *corners])
-    second = np.array([[0 if not any(corners[0]) else 3, 4, 5]])
-    for pair in ((np.array([[0, 1, 2]]), second), (second, np.array([[0, 1, 2]]))):
-        assert len(intersecting(points, *pair)[0]) == want
+        assert np.linalg.norm(local - half * signs, axis=1).min() < 0.03
+    for axis in range(3):
+        across = np.delete(np.abs(local) - half, axis, 1)
+        assert (np.linalg.norm(across, axis=1) < 0.03).sum() > 16 * half[axis]

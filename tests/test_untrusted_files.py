@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import bz2
-import json
 import os
+import socket
 import zlib
 from pathlib import Path
 
@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
-import zarr
-from conftest import ball, refusal
-from test_formats import affine_of, sampled, save_vti, text_sdf
+import trimesh
+from conftest import refusal
+from placed import CUBES, sampled, save, text_sdf
 
 from super_sdf import read_grid
-from super_sdf.errors import GridError, SuperSdfError
-from super_sdf.files.readers.zarr import CODECS
+from super_sdf.errors import FileError, SuperSdfError
+from super_sdf.truth.solid import read_mesh
 
-VALUES = sampled(affine_of(np.eye(3)))
+VALUES = sampled(CUBES)
 RAW = VALUES.ravel("F").tobytes()
 MHA = (
     "ObjectType = Image\nNDims = 3\nBinaryData = True\nDimSize = 24 20 17\n"
@@ -29,13 +29,9 @@ MHA = (
 )
 NRRD = "NRRD0004\ntype: float\ndimension: 3\nsizes: 24 20 17\nendian: little\nspacings: .5 .5 .5\n"
 
+APART = "which is not in its folder: put both into one folder"
+
 pytestmark = pytest.mark.usefixtures("folder")
-
-
-@pytest.fixture(scope="module")
-def values():
-    """Return a ball, (z, y, x), in a shape that no chunk divides."""
-    return ball(shape=(30, 26, 22), radius=7.3).values
 
 
 def write(name: str, *parts: str | bytes) -> str:
@@ -54,9 +50,9 @@ def nrrd_file(*lines: str, data: bytes = RAW) -> str:
     return write("a.nrrd", NRRD, *(f"{line}\n" for line in lines), "\n", data)
 
 
-def said_of(path, kind=SuperSdfError, **options):
+def said_of(path, **options):
     """Return the one line with which a file is refused."""
-    said = refusal(kind, read_grid, path, **options)
+    said = refusal(SuperSdfError, read_grid, path, **options)
     assert path.split(":")[0] in said and len(said) < 500
     return said
 
@@ -94,14 +90,14 @@ def test_sizes_that_no_file_has_are_refused_at_once(size, first):
     write("a.nrrd", NRRD.replace("24 20 17", huge), "encoding: gzip\n\n", RAW)
     write("a.sdf", f"{huge}\n0 0 0\n1\n1 2 3\n")
     write("b.sdf", f"#sdf 1\ndim {huge}\ndata\n1234")
-    save_vti("a.vti", affine_of(np.eye(3)))
+    save("a.vti", CUBES)
     write("a.vti", Path("a.vti").read_bytes().replace(b"7 23", b"7 99999999"))
     for name in ("a.mha", "a.nrrd", "a.sdf", "b.sdf", "a.vti"):
         said_of(name)
 
 
 def test_what_is_loaded_whole_is_refused_if_it_would_not_fit():
-    tifffile.imwrite("a.tif", VALUES.T, photometric="minisblack")
+    save("a.tif")
     said = "a.tif, 17 x 20 x 24 float32, 32,640 bytes, is loaded whole, which takes 0 MB of memory"
     assert said_of("a.tif", max_memory=1000).startswith(said)
     np.savez_compressed("bomb.npz", values=np.zeros((200, 200, 200), np.float32))
@@ -114,24 +110,21 @@ def test_damaged_numpy_files_are_a_line():
     said = said_of(write("a.npy", whole[:-40]))
     assert said == "a.npy cannot be read as NumPy: mmap length is greater than file size"
     said_of(write("a.npy", whole[:60]))
-    np.save("a.npy", np.array([{}]), allow_pickle=True)
+    np.save("a.npy", np.array([[[{}]]]), allow_pickle=True)
     assert "values have dtype object: give floating" in said_of("a.npy")
     np.savez("a.npz", values=VALUES)
     whole = bytearray(Path("a.npz").read_bytes())
     whole[9000] ^= 1
     assert "CRC" in said_of(write("a.npz", bytes(whole)))
     said_of(write("a.npz", bytes(whole[:9000])))
-    text = text_sdf(affine_of(np.eye(3)))
-    assert "is no .sdf grid, or truncated" in said_of(write("a.sdf", text[: len(text) // 2]))
+    half = text_sdf()[:9999]
+    assert "is no .sdf grid, or truncated" in said_of(write("a.sdf", half))
 
 
 # Data in other files
 
 
-DETACHED = {
-    "a.mhd": lambda data: write("a.mhd", MHA, f"ElementDataFile = {data}\n"),
-    "a.nhdr": lambda data: write("a.nhdr", NRRD, f"encoding: raw\ndata file: {data}\n"),
-}
+DETACHED = {"a.mhd": MHA + "ElementDataFile = ", "a.nhdr": NRRD + "encoding: raw\ndata file: "}
 
 
 @pytest.mark.parametrize("name", DETACHED)
@@ -144,22 +137,28 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
     os.symlink("/dev/zero", "zero.raw")
     os.symlink("../out.raw", "link.raw")
     os.symlink("..", "up")
-    elsewhere = ": put both into one folder"
+    above = ("../out.raw", "below/../../out.raw", "link.raw", "up/out.raw")
     for data, said in {
-        str(tmp_path / "out.raw"): elsewhere,
-        "../out.raw": elsewhere,
-        "below/../../out.raw": elsewhere,
-        "link.raw": elsewhere,
-        "up/out.raw": elsewhere,
+        **dict.fromkeys((str(tmp_path / "out.raw"), *above), APART),
         "pipe.raw": "pipe.raw is a named pipe: give a file",
         "zero.raw": "zero.raw is a device: give a file",
         "none.raw": "none.raw does not exist",
         "below": "below is a folder: give a file",
     }.items():
-        DETACHED[name](data)
+        write(name, DETACHED[name], f"{data}\n")
         assert said_of(name).endswith(said)
-    DETACHED[name]("below/a.raw")
+    write(name, DETACHED[name], "below/a.raw\n")
     assert read_grid(name, spacing=0.5).shape == (24, 20, 17)
+
+
+@pytest.mark.parametrize("entry", ["datafile: ", " data file : ", "data file:="])
+def test_a_nrrd_file_names_its_data_once_and_beside_it(entry, tmp_path):
+    write("a.raw", RAW)
+    other = f"{entry}{tmp_path.parent}/a.raw\n"
+    write("a.nhdr", DETACHED["a.nhdr"], "a.raw\n", other)
+    assert said_of("a.nhdr").startswith("a.nhdr")
+    write("a.nhdr", NRRD, "encoding: raw\n", other)
+    assert said_of("a.nhdr").endswith(APART)
 
 
 def test_lists_and_patterns_of_metaimage_are_what_itk_reads():
@@ -181,151 +180,94 @@ def test_lists_and_patterns_of_metaimage_are_what_itk_reads():
     assert "its data file is 'p%099999d.raw 3 19 1': give " in said_of("pattern.mhd")
 
 
-def read(path, **options):
-    """Return the values of a file in the order of the file."""
-    return read_grid(path, spacing=1, **options).values.T
-
-
-def store(values, path="a.zarr", **layout):
-    """Write a Zarr array in chunks of 8 x 8 x 8, without a name for its group."""
-    about = {"shape": values.shape, "dtype": values.dtype, "chunks": (8, 8, 8), **layout}
-    array = zarr.create_array(path, **about)
-    array[:] = values
-    return array
-
-
-def edited(path, change):
-    """Change the JSON document in a file."""
-    found = json.loads(Path(path).read_text())
-    change(found)
-    Path(path).write_text(json.dumps(found))
-
-
-def test_numbers_of_hdf5_in_other_files_are_refused(values):
-    raw = values.astype("<f4").tobytes()
-    Path("b.raw").write_bytes(raw)
+def test_numbers_of_hdf5_in_other_files_are_refused():
+    write("b.raw", RAW)
     with h5py.File("a.h5", "w") as file:
-        about = {"shape": values.shape, "dtype": "<f4"}
-        file.create_dataset("d", **about, external=[("b.raw", 0, len(raw))])
+        file.create_dataset("d", VALUES.shape, "<f4", external=[("b.raw", 0, len(RAW))])
     said = "a.h5: the numbers of /d are in other files: save them in this one"
     assert said_of("a.h5") == said
 
 
-def test_links_and_pipes_in_a_store(values):
-    store(values)
-    chunk = Path("a.zarr/c/0/0/0")
-    chunk.rename("a.zarr/first")
-    chunk.symlink_to(Path("a.zarr/first").resolve())
-    assert np.array_equal(read("a.zarr"), values)
-    Path("a.zarr/first").rename("elsewhere")
-    chunk.unlink()
-    chunk.symlink_to(Path("elsewhere").resolve())
-    assert said_of("a.zarr") == (
-        "a.zarr names the file 'c/0/0/0', which is not in its folder: put both into one folder"
-    )
-    chunk.unlink()
-    os.mkfifo(chunk)
-    assert said_of("a.zarr") == "a.zarr/c/0/0/0 is a named pipe: give a file"
-
-
-def ome_set(values, other):
-    """Write an OME-TIFF whose second half of pages is said to be in another file."""
-    half = len(values) // 2
-    z, y, x = values.shape
+def ome_set(other):
+    """Write an OME-TIFF whose pages from the tenth on are said to be in another file."""
     text = (
         '<OME xmlns="http://www.openmicroscopy.org/Schemas/OME/2016-06" UUID="urn:uuid:1">'
-        f'<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYZTC" Type="float" '
-        f'SizeX="{x}" SizeY="{y}" SizeZ="{z}" SizeC="1" SizeT="1">'
+        '<Image ID="Image:0"><Pixels ID="Pixels:0" DimensionOrder="XYZTC" Type="float" '
+        'SizeX="24" SizeY="20" SizeZ="17" SizeC="1" SizeT="1">'
         '<Channel ID="Channel:0" SamplesPerPixel="1"/>'
-        f'<TiffData FirstZ="0" IFD="0" PlaneCount="{half}">'
+        '<TiffData FirstZ="0" IFD="0" PlaneCount="9">'
         '<UUID FileName="a.ome.tif">urn:uuid:1</UUID></TiffData>'
-        f'<TiffData FirstZ="{half}" IFD="0" PlaneCount="{z - half}">'
+        '<TiffData FirstZ="9" IFD="0" PlaneCount="8">'
         f'<UUID FileName="{other}">urn:uuid:2</UUID></TiffData></Pixels></Image></OME>'
     )
     about = {"photometric": "minisblack", "metadata": None, "contiguous": False}
-    for name, part in (("a.ome.tif", values[:half]), ("b.ome.tif", values[half:])):
-        own = text if name == "a.ome.tif" else text.replace("urn:uuid:1", "urn:uuid:2", 1)
+    for name, own, part in (
+        ("a.ome.tif", text, VALUES.T[:9]),
+        ("b.ome.tif", text.replace("urn:uuid:1", "urn:uuid:2", 1), VALUES.T[9:]),
+    ):
         with tifffile.TiffWriter(name) as file:
-            for page in part:
-                file.write(page, description=own, **about)
-                own = None
+            for number, page in enumerate(part):
+                file.write(page, description=None if number else own, **about)
 
 
-def test_files_of_an_ome_set_are_read_beside_the_file(values, tmp_path):
-    ome_set(values, "b.ome.tif")
-    assert np.array_equal(read("a.ome.tif"), values)
+def test_files_of_an_ome_set_are_read_beside_the_file(tmp_path):
+    ome_set("b.ome.tif")
+    assert np.array_equal(read_grid("a.ome.tif", spacing=0.5).values, VALUES)
     for name in ("../b.ome.tif", str(tmp_path.parent / "b.ome.tif")):
-        ome_set(values, name)
-        assert said_of("a.ome.tif") == (
-            f"a.ome.tif names the file {name!r}, which is not in its folder: put both into one "
-            "folder"
-        )
+        ome_set(name)
+        assert said_of("a.ome.tif").endswith(f"names the file {name!r}, {APART}")
     os.mkfifo("pipe.tif")
-    ome_set(values, "pipe.tif")
+    ome_set("pipe.tif")
     assert said_of("a.ome.tif").endswith("pipe.tif is a named pipe: give a file")
 
 
-# Parts that are not stored
+# What is no regular file
 
 
-@pytest.mark.parametrize("kind", ["hdf5", "2", "3", "zip"])
-def test_chunks_that_are_not_stored_are_counted(values, kind):
-    """The last of 4 layers of chunks: 0 there is the surface, another fill value is as good."""
-    path = {"hdf5": "a.h5", "zip": "a.zarr.zip"}.get(kind, "a.zarr")
-    for fill in (0, 9):
-        whole = np.where(np.arange(len(values))[:, None, None] < 24, values, np.float32(fill))
-        if kind == "hdf5":
-            with h5py.File(path, "w") as file:
-                about = {"shape": values.shape, "dtype": values.dtype, "chunks": (8, 8, 8)}
-                file.create_dataset("d", **about, fillvalue=fill)[:24] = values[:24]
-        elif kind == "zip":
-            with zarr.storage.ZipStore(path, mode="w") as zipped:
-                store(whole, zipped, fill_value=fill)
-        else:
-            store(whole, path, fill_value=fill, zarr_format=int(kind), overwrite=True)
-        if fill:
-            assert np.array_equal(read(path, field="distance"), whole)
-        else:
-            assert said_of(path, GridError, spacing=1) == (
-                f"{path}: 12 of its chunks are not stored and read as 0, which is the surface: "
-                "write them all, or give the array a fill value other than 0 (NaN for unknown)"
-            )
-
-
-# Codecs
-
-
-PICKLE = {"name": "pickle"}
-PICKLE_AT = {
-    "compressor": lambda about: about.update(compressor={"id": "pickle"}),
-    "filters": lambda about: about.update(filters=[{"id": "pickle"}]),
-    "codecs": lambda about: about["codecs"].append(PICKLE),
-    "a bare name": lambda about: about["codecs"].append("pickle"),
-    "within a shard": lambda about: about["codecs"][0]["configuration"]["codecs"].append(PICKLE),
-    "index of a shard": (
-        lambda about: about["codecs"][0]["configuration"]["index_codecs"].append(PICKLE)
-    ),
+WHAT_IS_WRONG = {
+    "folder.npy": "is a folder: give a file",
+    "pipe.npy": "is a named pipe: give a file",
+    "socket.npy": "is a socket: give a file",
+    "zero.npy": "is a device: give a file",
+    "loop.npy": "cannot be read: Too many levels of symbolic links",
+    "dangling.npy": "does not exist",
+    "missing.npy": "does not exist",
+    "file/in.npy": "does not exist: the path before its last / is not a folder",
+    "n" * 300 + ".npy": "cannot be read: File name too long",
+    "a\0.npy": "is not a valid file name",
+    "a\ud800.npy": "is not a valid file name",
 }
 
 
-@pytest.mark.parametrize("place", PICKLE_AT)
-def test_a_codec_that_is_not_in_the_list_is_refused_by_its_name(values, place):
-    version = 2 if place in ("compressor", "filters") else 3
-    store(values, zarr_format=version, **({"shards": (16, 16, 16)} if "shard" in place else {}))
-    edited("a.zarr/.zarray" if version == 2 else "a.zarr/zarr.json", PICKLE_AT[place])
-    assert said_of("a.zarr") == (
-        "a.zarr names the codec 'pickle', which is not among those that are read "
-        f"({', '.join(sorted(CODECS))}): store it with one of these"
-    )
+@pytest.mark.parametrize("name", WHAT_IS_WRONG, ids=ascii)
+def test_what_is_no_regular_file_is_named_as_grid_and_as_mesh(name):
+    Path("folder.npy").mkdir()
+    os.mkfifo("pipe.npy")
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind("socket.npy")
+    for link, end in {"zero": "/dev/zero", "loop": "loop.npy", "dangling": "nothing.npy"}.items():
+        Path(f"{link}.npy").symlink_to(end)
+    write("file")
+    shown = name if name.isprintable() else repr(name)
+    assert refusal(FileError, read_grid, name) == f"{shown} {WHAT_IS_WRONG[name]}"
+    if name in ("folder.npy", "pipe.npy", "zero.npy", "loop.npy", "dangling.npy"):
+        Path("a.ply").symlink_to(name)
+        assert refusal(FileError, read_mesh, "a.ply") == f"a.ply {WHAT_IS_WRONG[name]}"
 
 
-@pytest.mark.parametrize("path", ["../a", "a//b", "./a", "c"])
-def test_metadata_of_an_image_names_an_array_of_the_store(values, path):
-    zarr.open_group("i.zarr", mode="w")
-    store(values, "i.zarr/a")
-    image = {"multiscales": [{"axes": list("zyx"), "datasets": [{"path": path}]}]}
-    edited("i.zarr/zarr.json", lambda about: about["attributes"].update(ome=image))
-    assert said_of("i.zarr") == (f"i.zarr is damaged: its metadata names no array at {path!r}")
+def test_links_to_files_are_read_unless_they_may_not_be(monkeypatch):
+    np.save("file", VALUES)
+    Path("link.npy").symlink_to("file.npy")
+    assert np.array_equal(read_grid("link.npy", spacing=0.5).values, VALUES)
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may read everything
+    assert said_of("link.npy") == "link.npy cannot be read: permission denied"
+
+
+def test_a_mesh_that_names_a_pipe_is_read_without_it():
+    os.mkfifo("pipe.mtl")
+    box = trimesh.creation.box().export(file_type="obj")
+    write("cube.obj", f"mtllib pipe.mtl\nusemtl red\n{box}")
+    assert len(read_mesh("cube.obj").faces) == 12
 
 
 # Where ITK places a MetaImage

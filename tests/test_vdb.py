@@ -14,7 +14,7 @@ from conftest import refusal
 from super_sdf import read_grid
 from super_sdf.errors import FileError, GridError
 from super_sdf.files.grids import open_volume
-from super_sdf.files.vdb_writer import ACTIVE_MASK, ZIP
+from super_sdf.files.readers.vdb import ACTIVE_MASK, ZIP
 
 DATA = Path(__file__).parent / "data"
 

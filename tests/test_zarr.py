@@ -1,45 +1,53 @@
 """Zarr stores of both formats, however they are chunked; OME-NGFF metadata; ``info`` of a file."""
 
 import json
+import os
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import zarr
-from conftest import ball
+from conftest import ball, refusal
 
 from super_sdf import read_grid
+from super_sdf.errors import GridError, SuperSdfError
+from super_sdf.files.readers.zarr import CODECS
 
-SHAPE = (30, 26, 22)  # x, y, z
-MODEL = ("--quality", "fast", "--spacing", "1", "-q")
-
+SHAPE = (30, 26, 22)  # x, y, z: no chunk divides them
+VALUES = ball(shape=SHAPE, radius=7.3).values
 
 pytestmark = pytest.mark.usefixtures("folder")
 
 
-@pytest.fixture(scope="module")
-def values():
-    return ball(shape=SHAPE, radius=7.3).values
-
-
-def store(path, array, version=3, name=None, **layout):
+def store(path, array=VALUES.T, version=3, name=None, **layout):
     """Write an array as a Zarr array, or below a group."""
-    about = {"shape": array.shape, "dtype": array.dtype, **layout}
-    about.setdefault("chunks", (8,) * array.ndim)
-    made = zarr.create_array(path, name=name, zarr_format=version, **about)
-    made[:] = array
-    return made
+    about = {"shape": array.shape, "dtype": array.dtype, "chunks": (8,) * array.ndim, **layout}
+    zarr.create_array(path, name=name, zarr_format=version, **about)[:] = array
 
 
-def test_a_store_in_a_zip_file(values, command):
+def edited(path, change):
+    """Change the JSON document in a file."""
+    found = json.loads(Path(path).read_text())
+    change(found)
+    Path(path).write_text(json.dumps(found))
+
+
+def said_of(path, kind=SuperSdfError):
+    """Return the one line with which a file is refused."""
+    return refusal(kind, read_grid, path, spacing=1)
+
+
+def test_a_store_in_a_zip_file():
     with zarr.storage.ZipStore("a.zarr.zip", mode="w") as zipped:
-        store(zipped, values.T, name="deep/field")
-    np.testing.assert_array_equal(read_grid("a.zarr.zip", spacing=1).values, values)
-    np.testing.assert_array_equal(read_grid("a.zarr.zip:/deep/field", spacing=1).values, values)
+        store(zipped, name="deep/field")
+    for path in ("a.zarr.zip", "a.zarr.zip:/deep/field"):
+        np.testing.assert_array_equal(read_grid(path, spacing=1).values, VALUES)
     Path("b.zarr.zip").write_bytes(Path("a.zarr.zip").read_bytes()[:-40])
-    assert command("upsample", "b.zarr.zip", "o.ply")[2] == (
-        "Error: b.zarr.zip cannot be read as Zarr: File is not a zip file\n"
-    )
+    assert said_of("b.zarr.zip") == "b.zarr.zip cannot be read as Zarr: File is not a zip file"
+
+
+# Images of OME-NGFF
 
 
 def image(path, levels, axes="zyx", version="0.5", whole=()):
@@ -49,52 +57,58 @@ def image(path, levels, axes="zyx", version="0.5", whole=()):
     for number, (array, steps) in enumerate(levels):
         about = {"shape": array.shape, "dtype": array.dtype, "chunks": (8,) * array.ndim}
         group.create_array(str(number), **about)[:] = array
-        datasets.append({"path": str(number), "coordinateTransformations": steps})
+        datasets.append({"path": str(number), "coordinateTransformations": transformations(steps)})
     kinds, in_space = {"t": "time", "c": "channel"}, {"type": "space", "unit": "micrometer"}
     named = [{"name": a, **({"type": kinds[a]} if a in kinds else in_space)} for a in axes]
-    about = {"axes": named, "datasets": datasets, "coordinateTransformations": list(whole)}
-    scales = {"multiscales": [about]}
+    about = {"axes": named, "datasets": datasets}
+    scales = {"multiscales": [about | {"coordinateTransformations": transformations(whole)}]}
     group.attrs.update(scales if version == "0.4" else {"ome": {"version": version, **scales}})
 
 
-def scale(*numbers):
-    return {"type": "scale", "scale": list(numbers)}
-
-
-def translation(*numbers):
-    return {"type": "translation", "translation": list(numbers)}
+def transformations(steps):
+    """Return (scale, translation) as OME-NGFF has it."""
+    return [{"type": name, name: each} for name, each in zip(("scale", "translation"), steps)]
 
 
 @pytest.mark.parametrize("version", ["0.4", "0.5"])
-def test_levels_of_an_image_and_their_transformations(values, version):
+def test_levels_of_an_image_and_their_transformations(version):
     """That of the whole image is applied last: 2 * (0.5 i + t) + 1."""
-    half = values[::2, ::2, ::2]
-    levels = [
-        (values.T, [scale(0.5, 0.5, 0.5), translation(3, 2, 1)]),
-        (half.T, [scale(1, 1, 1), translation(3, 2, 1)]),
-    ]
-    image("i.zarr", levels, version=version, whole=[scale(2, 2, 2), translation(1, 1, 1)])
-    fine, coarse = read_grid("i.zarr"), read_grid("i.zarr:/1")
-    assert fine.spacing == (1, 1, 1) and fine.origin == (3, 5, 7)
-    assert fine.notes[0] == "lengths are in the unit of its axes, micrometer"
-    np.testing.assert_array_equal(fine.values, values)
-    assert coarse.spacing == (2, 2, 2) and coarse.origin == (3, 5, 7)
-    np.testing.assert_array_equal(coarse.values, half)
-    assert read_grid("i.zarr:/0").origin == fine.origin
+    half = VALUES[::2, ::2, ::2]
+    levels = [(VALUES.T, ([0.5] * 3, [3, 2, 1])), (half.T, ([1, 1, 1], [3, 2, 1]))]
+    image("i.zarr", levels, version=version, whole=([2, 2, 2], [1, 1, 1]))
+    for path, step, values in (
+        ("i.zarr", 1, VALUES),
+        ("i.zarr:/0", 1, VALUES),
+        ("i.zarr:/1", 2, half),
+    ):
+        grid = read_grid(path)
+        assert grid.spacing == (step,) * 3 and grid.origin == (3, 5, 7)
+        assert grid.notes[0] == "lengths are in the unit of its axes, micrometer"
+        np.testing.assert_array_equal(grid.values, values)
 
 
-def test_axes_of_time_and_channel_have_length_one(values):
-    five = values.T[None, None]
-    image("i.zarr", [(five, [scale(9, 9, 1, 1, 1), translation(9, 9, 3, 2, 1)])], axes="tczyx")
+def test_axes_of_time_and_channel_have_length_one():
+    steps = [9, 9, 1, 1, 1], [9, 9, 3, 2, 1]
+    image("i.zarr", [(VALUES.T[None, None], steps)], axes="tczyx")
     grid = read_grid("i.zarr")
     assert grid.shape == SHAPE and grid.spacing == (1, 1, 1) and grid.origin == (1, 2, 3)
-    np.testing.assert_array_equal(grid.values, values)
+    np.testing.assert_array_equal(grid.values, VALUES)
 
 
-def test_info_of_a_file_prints_its_chunks(command, values):
-    store("a.zarr", values.T, chunks=(4, 4, 4), shards=(16, 8, 8))
-    said = command("info", "a.zarr")[1]
-    assert said.splitlines() == [
+@pytest.mark.parametrize("path", ["../a", "a//b", "./a", "c"])
+def test_metadata_of_an_image_names_an_array_of_the_store(path):
+    image("i.zarr", [(VALUES.T, ([1, 1, 1],))])
+
+    def rename(about):
+        about["attributes"]["ome"]["multiscales"][0]["datasets"][0]["path"] = path
+
+    edited("i.zarr/zarr.json", rename)
+    assert said_of("i.zarr") == f"i.zarr is damaged: its metadata names no array at {path!r}"
+
+
+def test_info_of_a_file_prints_its_chunks(command):
+    store("a.zarr", chunks=(4, 4, 4), shards=(16, 8, 8))
+    assert command("info", "a.zarr")[1].splitlines() == [
         "file: a.zarr",
         "format: Zarr",
         "shape: 30, 26, 22",
@@ -107,8 +121,77 @@ def test_info_of_a_file_prints_its_chunks(command, values):
         "chunks: 4, 4, 4",
         "shards: 16, 8, 8",
     ]
-    image("i.zarr", [(values.T, [scale(1, 1, 1), translation(3, 2, 1)])], version="0.4")
+    image("i.zarr", [(VALUES.T, ([1, 1, 1], [3, 2, 1]))], version="0.4")
     found = json.loads(command("info", "i.zarr", "--json")[1])
     assert found["spacing"] == [1, 1, 1] and found["origin"] == [1, 2, 3]
     assert found["chunks"] == [8, 8, 8] and found["zarr format"] == 2
     assert found["notes"] == ["lengths are in the unit of its axes, micrometer"]
+
+
+# Stores from elsewhere
+
+
+def test_links_and_pipes_in_a_store():
+    store("a.zarr")
+    chunk = Path("a.zarr/c/0/0/0")
+    chunk.rename("a.zarr/first")
+    chunk.symlink_to(Path("a.zarr/first").resolve())
+    assert np.array_equal(read_grid("a.zarr", spacing=1).values, VALUES)
+    Path("a.zarr/first").rename("elsewhere")
+    chunk.unlink()
+    chunk.symlink_to(Path("elsewhere").resolve())
+    assert said_of("a.zarr") == (
+        "a.zarr names the file 'c/0/0/0', which is not in its folder: put both into one folder"
+    )
+    chunk.unlink()
+    os.mkfifo(chunk)
+    assert said_of("a.zarr") == "a.zarr/c/0/0/0 is a named pipe: give a file"
+
+
+@pytest.mark.parametrize("kind", ["hdf5", "2", "3", "zip"])
+def test_chunks_that_are_not_stored_are_counted(kind):
+    """The last of 3 layers of chunks: 0 there is the surface, another fill value is as good."""
+    path = {"hdf5": "a.h5", "zip": "a.zarr.zip"}.get(kind, "a.zarr")
+    for fill in (0, 9):
+        whole = VALUES.T.copy()
+        whole[16:] = fill
+        if kind == "hdf5":
+            with h5py.File(path, "w") as file:
+                about = {"shape": whole.shape, "dtype": whole.dtype, "chunks": (8, 8, 8)}
+                file.create_dataset("d", **about, fillvalue=fill)[:16] = whole[:16]
+        elif kind == "zip":
+            with zarr.storage.ZipStore(path, mode="w") as zipped:
+                store(zipped, whole, fill_value=fill)
+        else:
+            store(path, whole, int(kind), fill_value=fill, overwrite=True)
+        if fill:
+            assert np.array_equal(read_grid(path, spacing=1, field="distance").values, whole.T)
+        else:
+            assert said_of(path, GridError) == (
+                f"{path}: 16 of its chunks are not stored and read as 0, which is the surface: "
+                "write them all, or give the array a fill value other than 0 (NaN for unknown)"
+            )
+
+
+PICKLE = {"name": "pickle"}
+PICKLE_AT = {
+    "compressor": lambda about: about.update(compressor={"id": "pickle"}),
+    "filters": lambda about: about.update(filters=[{"id": "pickle"}]),
+    "codecs": lambda about: about["codecs"].append(PICKLE),
+    "a bare name": lambda about: about["codecs"].append("pickle"),
+    "within a shard": lambda about: about["codecs"][0]["configuration"]["codecs"].append(PICKLE),
+    "index of a shard": (
+        lambda about: about["codecs"][0]["configuration"]["index_codecs"].append(PICKLE)
+    ),
+}
+
+
+@pytest.mark.parametrize("place", PICKLE_AT)
+def test_a_codec_that_is_not_in_the_list_is_refused_by_its_name(place):
+    version = 2 if place in ("compressor", "filters") else 3
+    store("a.zarr", version=version, **({"shards": (16, 16, 16)} if "shard" in place else {}))
+    edited("a.zarr/.zarray" if version == 2 else "a.zarr/zarr.json", PICKLE_AT[place])
+    assert said_of("a.zarr") == (
+        "a.zarr names the codec 'pickle', which is not among those that are read "
+        f"({', '.join(sorted(CODECS))}): store it with one of these"
+    )

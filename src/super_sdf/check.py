@@ -25,7 +25,7 @@ from .files.meshes import write_coloured_ply
 from .files.output import check_free
 from .grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from .options import LENGTHS, Options
-from .refine.band import Band, no_surface, plane_blocks, rescale, survey
+from .refine.band import Band, no_surface, rescale, survey
 from .refine.nodes import VoxelIndex
 from .surface.mesh import Mesh
 from .threads import check_bound, chunks_of, give_back, useful_threads
@@ -366,10 +366,10 @@ def find_strays(
     inside = ((nearest >= 0) & (nearest < grid.shape)).all(1)
     position, nearest = position[inside], nearest[inside]
     values = np.zeros(len(nearest))
-    for first, last in plane_blocks(grid.shape):
-        rows = np.flatnonzero((nearest[:, 0] >= first) & (nearest[:, 0] < last))
-        i, j, k = nearest[rows].T
-        values[rows] = rescale(grid, offset, first, last)[i - first, j, k]
+    for planes in chunks_of(grid.shape[0], grid.shape[1] * grid.shape[2]):
+        rows = np.flatnonzero((nearest[:, 0] >= planes.start) & (nearest[:, 0] < planes.stop))
+        some = rescale(grid, offset, planes.start, planes.stop)
+        values[rows] = some[tuple((nearest[rows] - np.array([planes.start, 0, 0])).T)]
     depth = np.abs(values) / 2 - np.linalg.norm(position - nearest, axis=1) - slack
     count, beyond = int((depth > STRAY).sum()), int((~inside).sum())
     return {"count": count, "beyond": beyond, "deepest": float(depth.max(initial=0))}

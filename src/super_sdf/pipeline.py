@@ -77,18 +77,17 @@ def refine_band(
     index = nodes.VoxelIndex(own_ijk, grid.shape)
     fit_to_spheres(blocks, parts, factor, spheres_of_band(band, threads), index, threads)
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
+    decoded = blocks[:, :-1]
     if grid.field.sides_only:
-        nodes.hold_sides(blocks, factor, patches, voxels)
-    pinned = nodes.pin_to_skipped(
-        blocks[:, :-1], parts, factor, own_ijk, patches, voxels, grid.shape
-    )
+        nodes.hold_sides(decoded, factor, patches[voxels, CENTRE])
+    pinned = nodes.pin_to_skipped(decoded, parts, factor, own_ijk, patches[voxels], grid.shape)
     steps.finish("nodes")
     unseen = grid.field.unseen
     return FineField(
         grid.shape,
         factor,
         own_ijk,
-        blocks[:, :-1],
+        decoded,
         parts,
         grid,
         band.offset,

@@ -11,7 +11,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray
-from ..errors import FileError, OptionError, OptionTypeError, SuperSdfError, check_modules, seen
+from ..errors import FileError, GridError, OptionError, OptionTypeError, check_modules, seen
 from ..grid.interpret import Field
 from ..grid.samples import SamplePlanes, in_blocks
 from ..grid.sdf_grid import SdfGrid
@@ -33,7 +33,7 @@ from ..surface.cap import check_all_seen, find_border_inside
 from ..threads import check_fits
 from .formats import check_regular_file
 from .output import check_free, naming, replacing
-from .vdb_writer import write_level_set
+from .readers.vdb import write_level_set
 
 VERSION = 1
 PLANES = 16  # of the fine lattice at a time
@@ -229,7 +229,7 @@ def read_field(path: str | Path) -> FineField:
         return _field_of(_read_arrays(path), path)
     except (FileError, MemoryError):
         raise
-    except SuperSdfError as error:  # a factor or a place that cannot be
+    except (GridError, OptionError) as error:  # a factor or a place that cannot be, say
         raise FileError(f"{path} is no refined field: {error}") from None
     except Exception as error:  # zipfile and NumPy raise over ten kinds of error on damaged files
         reason = str(error).splitlines() or [type(error).__name__]
@@ -239,11 +239,10 @@ def read_field(path: str | Path) -> FineField:
 def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of a file by their keys, which have the kinds and shapes of ``ARRAYS``."""
     if not zipfile.is_zipfile(path):  # NumPy would take it for a pickle
-        raise FileError(f"{path} is no refined field: it is no .npz archive")
+        raise GridError("it is no .npz archive")
     with np.load(path, allow_pickle=False) as archive:
-        missing = [key for key in ARRAYS if key not in archive.files]
-        if missing:
-            raise FileError(f"{path} is no refined field: it has no key {missing[0]!r}")
+        if missing := [key for key in ARRAYS if key not in archive.files]:
+            raise GridError(f"it has no key {missing[0]!r}")
         need = 3 * sum(each.file_size for each in archive.zip.infolist())
         check_fits(need, f"{path}, as a field,", "read it on a larger machine")
         if archive["version"] != VERSION:
@@ -261,10 +260,14 @@ def _read_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
     """Return the field of arrays, which are checked: a mesh of others would have holes."""
+
+    def damaged(key: str, said: str) -> FileError:
+        return FileError(f"{path}[{key}] is damaged: {said}")
+
     factor, (nx, ny, nz) = OPTIONS["factor"].check(int(arrays["factor"])), arrays["shape"].tolist()
-    shape = nx, ny, nz
+    shape, side = (nx, ny, nz), factor + 1
     if min(shape) < 2:
-        raise FileError(f"{path} is no refined field: its grid has the shape {shape}")
+        raise GridError(f"its grid has the shape {shape}")
     grid = SdfGrid.trusted(
         NoSamples(shape, str(path)),
         *(arrays["spacing"], arrays["origin"]),
@@ -275,26 +278,23 @@ def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
     for key in ("voxels", "sample_voxels", "border_inside"):
         number = arrays[key].astype(np.int64) @ (ny * nz, nz, 1)
         if (arrays[key] < 0).any() or (arrays[key] >= shape).any() or (np.diff(number) <= 0).any():
-            raise FileError(f"{path}[{key}] is damaged: its voxels are not in order in the grid")
+            raise damaged(key, "its voxels are not in order in the grid")
         arrays[key] = np.ascontiguousarray(arrays[key], np.int32)
     voxels, values = arrays["voxels"], arrays["values"]
-    side = factor + 1
     if values.shape != (len(voxels), side, side, side) or not len(voxels):
-        said = f"it has the shape {values.shape} for {len(voxels)} voxels"
-        raise FileError(f"{path}[values] is damaged: {said}")
-    parts = share_parts(neighbour_table(voxels, shape))
+        raise damaged("values", f"it has the shape {values.shape} for {len(voxels)} voxels")
 
     def in_half_voxels(world: NDArray[Any]) -> FloatArray:  # the float32 numbers that were written
         half = np.divide(world, grid.voxel_size / 2, dtype=np.float64)
         return np.ascontiguousarray(half, np.float32)
 
     blocks = in_half_voxels(values.reshape(len(voxels), -1).T)
-    plain = FineField(shape, factor, voxels, blocks, parts)
+    plain = FineField(shape, factor, voxels, blocks, share_parts(neighbour_table(voxels, shape)))
     if not (plain.values[plain.numbers] == blocks.T).all():  # NaN is not, either
-        raise FileError(f"{path}[values] is damaged: blocks differ at nodes that they share")
+        raise damaged("values", "blocks differ at nodes that they share")
     distances = in_half_voxels(arrays["sample_distances"])
-    return FineField(
-        *(shape, factor, voxels, blocks, parts),
+    return replace(
+        plain,
         spheres=SampleSpheres(shape, arrays["sample_voxels"], distances),
         grid=grid,
         offset=float(arrays["offset"]),

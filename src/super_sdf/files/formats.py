@@ -7,7 +7,6 @@ opening a named pipe may wait forever. Some files name others, which must lie be
 from __future__ import annotations
 
 import errno
-import glob
 import json
 import os
 import re
@@ -56,8 +55,8 @@ FORMATS = (
     GridFormat("npy", "NumPy", (".npy",), "numpy", axes="xyz"),
     GridFormat("npz", "NumPy", (".npz",), "numpy", axes="xyz", has_members=True),
     GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nibabel", "nifti"),
-    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "nrrd", "nrrd"),
-    GridFormat("metaimage", "MetaImage", (".mha", ".mhd"), "simpleitk", "metaimage"),
+    GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "headers", "nrrd"),
+    GridFormat("metaimage", "MetaImage", (".mha", ".mhd"), "headers", "metaimage"),
     GridFormat("vtk", "VTK image data", (".vti",), "vtk", "vti", has_members=True),
     GridFormat("tiff", "TIFF stack", (".tif", ".tiff"), "tifffile", "tiff", "zyx"),
     GridFormat("hdf5", "HDF5", (".h5", ".hdf5", ".hdf", ".ims"), "h5py", "hdf5", "zyx", True),
@@ -168,7 +167,8 @@ REASONS = {
 MARKS = ("zarr.json", ".zarray", ".zgroup")  # one of them makes a folder a Zarr store
 HEADERS = (".mhd", ".mha", ".nhdr", ".nrrd")  # text that may name data files, a line each
 LONGEST_HEADER = 1 << 20  # bytes, with a list of files
-NUMBER = re.compile(r"%0?\d*d")  # in a pattern of names
+META_DATA = re.compile(rb"^ElementDataFile *[=:] *([^\n]*)\n?", re.M)
+NRRD_DATA = re.compile(rb"^[ \t]*data ?file[ \t]*:=? *([^\n]*)\n?", re.M)
 WEIGHTS = re.compile(rb"\n\x08location\x12([\x01-\x7f])")  # of a network: before a name, its length
 
 
@@ -209,22 +209,44 @@ def check_beside(path: Path, name: str) -> Path:
     raise FileError(f"{said}: put both into one folder")
 
 
-def data_files(path: Path, named: str, rest: bytes) -> list[Path]:
-    """Return the files with the data of a header: a name, ``NAME%03d.raw 1 20 1``, or ``LIST``.
+class Header(NamedTuple):
+    """A header in text, and the entry in it that names the files with its data."""
 
-    ``rest`` is what follows in the header: a list of names.
-    """
-    names = [named]
-    if named.upper().startswith("LIST"):
-        listed = rest.decode(errors="surrogateescape").splitlines()
-        names = [name for name in listed if name.strip()]
-    elif "%" in named:
-        pattern, *numbers = named.split()
-        if not re.fullmatch("[^%]*%0?[0-9]?d[^%]*", pattern) or len(numbers) < 2:
-            raise FileError(f"its data file is {seen(named)}: give NAME%03d.raw 1 20 1")
-        first, last, step = (int(number) for number in (*numbers, "1")[:3])
-        names = [pattern % number for number in range(first, last + 1, step)]
-    return [check_beside(path, name) for name in names]
+    before: bytes  # the entry
+    entry: str  # a name, ``NAME%03d.raw 1 20 1``, or ``LIST``
+    rest: bytes  # what follows the entry: with ``LIST``, a name in each line
+    start: int  # of the rest in the file, 0 if there is no entry
+
+    @property
+    def lists(self) -> bool:
+        """Whether a list follows."""
+        return self.entry.upper().startswith("LIST")
+
+    def names(self) -> list[str]:
+        """Return the names of the files with the data."""
+        if self.lists:
+            listed = self.rest.decode(errors="surrogateescape").splitlines()
+            return [name for name in listed if name.strip()]
+        if "%" in self.entry:
+            pattern, *numbers = self.entry.split()
+            if not re.fullmatch("[^%]*%0?[0-9]?d[^%]*", pattern) or len(numbers) < 2:
+                raise FileError(f"its data file is {seen(self.entry)}: give NAME%03d.raw 1 20 1")
+            first, last, step = (int(number) for number in (*numbers, "1")[:3])
+            return [pattern % number for number in range(first, last + 1, step)]
+        return [self.entry] * bool(self.entry)
+
+
+def split_header(path: Path) -> Header:
+    """Return the header at the beginning of a NRRD or MetaImage file."""
+    with path.open("rb") as file:
+        text = file.read(LONGEST_HEADER)
+    found = META_DATA.search(text)
+    if path.suffix.lower() in (".nrrd", ".nhdr"):  # after a blank line there is data
+        found = NRRD_DATA.search(re.split(rb"\n\r?\n", text, maxsplit=1)[0])
+    if not found:
+        return Header(text, "", b"", 0)
+    entry = found[1].decode(errors="surrogateescape").strip()
+    return Header(text[: found.start()], entry, text[found.end() :], found.end())
 
 
 def parse_json(text: str | bytes, what: str) -> Any:
@@ -258,8 +280,7 @@ def check_grid_file(path: str | Path) -> None:
 def files_of(path: str | Path) -> list[Path]:
     """Return the files that are read for a grid or a network: itself, and those that it names.
 
-    Of a Zarr folder they are all in it; of a pattern of names, all that fit it. Of what cannot be
-    read it is the file itself.
+    Of a Zarr folder they are all in it; of what cannot be read it is the file itself.
     """
     file, _ = split_member(path)
     if is_store(file):
@@ -280,11 +301,4 @@ def _names_in(file: Path) -> Iterator[str]:
         for match in WEIGHTS.finditer(content):
             yield os.fsdecode(content[match.end() : match.end() + match[1][0]])
     elif kind in HEADERS:
-        with file.open("rb") as header:
-            text = header.read(LONGEST_HEADER).partition(b"\0")[0]  # then there is data
-        for line in os.fsdecode(text).splitlines():
-            value = re.split("[=:]", line, maxsplit=1)[-1].strip()
-            yield from (line.strip(), value)
-            if NUMBER.search(value):
-                pattern = NUMBER.sub("*", glob.escape(value.split()[0]))
-                yield from glob.glob(pattern, root_dir=file.parent)
+        yield from split_header(file).names()

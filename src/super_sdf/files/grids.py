@@ -220,8 +220,6 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     """
     path = check_path(path, "path")
     with open_volume(path, describes=True) as (volume, _):
-        if len(volume.shape) != 3:
-            raise FileError(f"its array has shape {volume.shape}: give three axes")
         order, _, place = find_placement(volume, {})
     shape = [volume.shape[axis] for axis in order]
     facts: dict[str, Any] = {

@@ -1,28 +1,31 @@
-"""Mesh files: checks of a target, what a format can hold, and the fast formats, PLY and STL.
+"""Mesh files: a target is checked before the work starts, and only complete files appear.
 
-``scenes`` writes the other formats. A target is checked before the work starts, and only complete
-files appear. Far from the world origin float32 cannot tell neighbouring vertices apart: degenerate
-triangles, and a mesh that is no longer closed when a program reads it. So it is checked whether the
-numbers of a format can hold a mesh.
+Far from the world origin float32 cannot tell neighbouring vertices apart: degenerate triangles, and
+a mesh that is no longer closed when a program reads it. So it is checked whether the numbers of a
+format can hold a mesh. Text has enough digits to read back the same numbers: trimesh, which makes
+the .glb, writes .obj and .off with fixed decimals, and .3mf in millimetres alone, without colours.
 
-A new format is a name in ``options.MESH_FORMATS`` and a function ``write_NAME``.
+A new format is a name in ``options.MESH_FORMATS`` and a function ``write_NAME`` in ``WRITERS``.
 """
 
 from __future__ import annotations
 
+import html
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, TypeAlias
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, Triple
+from ..arrays import BoolArray, FloatArray, Triple, cross
+from ..arrays import unit as of_length_1
 from ..errors import FileError, MeshError, OptionError
-from ..options import MESH_FORMATS, OPTIONS, Unit, check_path
+from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
 from ..surface.mesh import Mesh, check_mesh
 from .output import check_free, replacing
 
@@ -33,6 +36,8 @@ STL_CHUNK = 1 << 18  # triangles at a time
 STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 PLY_HEADER_BYTES = 320  # padded, so that arrays of numbers can be mapped
+TEXT_CHUNK = 1 << 14  # rows of text at a time: Python numbers take ten times the memory
+GLB_MOST_BYTES = 2**32 - 1  # the length in the header has 32 bits
 
 Colour: TypeAlias = tuple[int, int, int]
 """Red, green and blue, from 0 to 255."""
@@ -151,12 +156,8 @@ def write_meshes(
             for mesh in meshes:
                 _check_holds(path, mesh, origin)
             complete[path] = stack.enter_context(replacing(path, force=force))
-            write: Any = {".ply": write_ply, ".stl": write_stl}.get(suffix)
-            if write is None:
-                from . import scenes
-
-                write = getattr(scenes, f"write_{suffix[1:]}")
-            write(parts, complete[path], replace(world, origin=origin))
+            with complete[path].open("wb") as file:
+                WRITERS[suffix](file, parts, replace(world, origin=origin))
         if before_rename:
             before_rename(complete)
         for path in files:
@@ -195,13 +196,12 @@ def _check_holds(path: Path, mesh: Mesh, origin: Triple) -> None:
         raise FileError(f"{said} of this mesh coincide; write .ply or .obj")
 
 
-def write_ply(parts: Parts, path: Path, world: World) -> None:
+def write_ply(file: IO[bytes], parts: Parts, world: World) -> None:
     """Write binary little-endian PLY."""
     (mesh,) = parts.values()
     kind = "double" if mesh.vertices.dtype == np.float64 else "float"
-    with path.open("wb") as file:
-        properties = [f"{kind} {axis}" for axis in "xyz"]
-        _write_ply(file, mesh.vertices, mesh.faces, properties, world.note, PLY_HEADER_BYTES)
+    properties = [f"{kind} {axis}" for axis in "xyz"]
+    _write_ply(file, mesh.vertices, mesh.faces, properties, world.note, PLY_HEADER_BYTES)
 
 
 def write_coloured_ply(
@@ -214,8 +214,7 @@ def write_coloured_ply(
 ) -> None:
     """Write binary PLY whose vertices also have ``residuals`` (n,) and ``colours`` (n, 3).
 
-    Positions are written as double. The file is complete or not at all; ``force`` replaces one
-    that exists.
+    Positions are double; ``force`` replaces a file that exists.
     """
     kind = [("position", "<f8", 3), ("residual", "<f4"), ("colour", "u1", 3)]
     rows = np.empty(len(residuals), kind)
@@ -249,19 +248,130 @@ def _write_ply(
     file.write(rows.data)
 
 
-def write_stl(parts: Parts, path: Path, world: World) -> None:
+def write_stl(file: IO[bytes], parts: Parts, world: World) -> None:
     """Write binary STL: each triangle stores its normal and the positions of its corners."""
     (mesh,) = parts.values()
     vertices, least = mesh.vertices.astype(np.float32, copy=False), np.finfo(np.float64).tiny
-    with path.open("wb") as file:
-        file.write(f"made by super-sdf {world.note}".ljust(80).encode("ascii"))
-        file.write(struct.pack("<I", len(mesh.faces)))
-        for first in range(0, len(mesh.faces), STL_CHUNK):
-            corners = vertices[mesh.faces[first : first + STL_CHUNK]]
-            sides = corners[:, 1:].astype(np.float64) - corners[:, :1]
-            sides /= np.maximum(np.abs(sides).max((1, 2), keepdims=True), least)  # at any scale
-            normals = np.cross(sides[:, 0], sides[:, 1])
-            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), least)
-            rows = np.zeros(len(corners), STL_ROW)
-            rows["normal"], rows["corners"] = normals, corners
-            file.write(rows.data)
+    file.write(f"made by super-sdf {world.note}".ljust(80).encode("ascii"))
+    file.write(struct.pack("<I", len(mesh.faces)))
+    for first in range(0, len(mesh.faces), STL_CHUNK):
+        corners = vertices[mesh.faces[first : first + STL_CHUNK]]
+        sides = corners[:, 1:].astype(np.float64) - corners[:, :1]
+        sides /= np.maximum(np.abs(sides).max((1, 2), keepdims=True), least)  # at any scale
+        rows = np.zeros(len(corners), STL_ROW)
+        rows["normal"], rows["corners"] = of_length_1(cross(sides[:, 0], sides[:, 1])), corners
+        file.write(rows.data)
+
+
+def write_obj(file: IO[bytes], parts: Parts, world: World) -> None:
+    """Write Wavefront OBJ, whose vertex indices start at 1."""
+    (mesh,) = parts.values()
+    file.write(f"# made by super-sdf {world.note}".rstrip().encode("ascii") + b"\n")
+    file.writelines(_lines("v %s %s %s\n", mesh.vertices))
+    file.writelines(_lines("f %d %d %d\n", mesh.faces, first=1))
+
+
+def write_off(file: IO[bytes], parts: Parts, world: World) -> None:
+    """Write OFF."""
+    (mesh,) = parts.values()
+    file.write(f"OFF\n{len(mesh.vertices)} {len(mesh.faces)} 0\n".encode("ascii"))
+    file.writelines(_lines("%s %s %s\n", mesh.vertices))
+    file.writelines(_lines("3 %d %d %d\n", mesh.faces))
+
+
+def _lines(line: str, rows: NDArray[Any], first: int = 0) -> Iterator[bytes]:
+    """Yield rows as text, which reads back as the same numbers; indices count from ``first``."""
+    line = line.replace("%s", "%r" if rows.dtype == np.float64 else "%.9g")
+    for start in range(0, len(rows), TEXT_CHUNK):
+        some = rows[start : start + TEXT_CHUNK]
+        if first:  # the last index may exceed 32 bits
+            some = some.astype(np.int64) + first
+        yield ((line * len(some)) % tuple(some.ravel().tolist())).encode("ascii")
+
+
+def write_glb(file: IO[bytes], parts: Parts, world: World) -> None:
+    """Write binary glTF, a node for each part.
+
+    Vertices are float32, relative to ``world.origin``; the nodes move them there, and scale them
+    from the unit to metres, those of glTF. FileError if a mesh has no triangle, which glTF does not
+    allow, or the file exceeds 4.29 GB.
+    """
+    import trimesh
+
+    library: Any = trimesh  # parts of it have no types
+    visual = library.visual
+    metres = LENGTHS[world.unit or "m"]
+    place = np.diag([metres, metres, metres, 1.0])
+    place[:3, 3] = metres * np.array(world.origin)
+    total = sum(12 * (len(mesh.vertices) + len(mesh.faces)) for mesh in parts.values())
+    if total > 0.999 * GLB_MOST_BYTES:  # there is a header, too
+        raise FileError(f"the mesh takes {total:,} bytes, .glb holds 4,294,967,295: give .ply")
+    scene = library.Scene()
+    for name, mesh in parts.items():
+        if not len(mesh.faces):
+            raise FileError("a mesh without triangles cannot be .glb: give .ply")
+        shown = None
+        if colour := world.colours.get(name):
+            rgb = np.array(colour) / 255  # of sRGB; a factor of glTF is linear
+            rgb = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+            factor = np.rint(255 * np.array([*rgb, 1])).astype(np.uint8)
+            look = visual.material.PBRMaterial(name, baseColorFactor=factor, metallicFactor=0)
+            shown = visual.TextureVisuals(material=look)
+        vertices = mesh.vertices - np.array(world.origin) if any(world.origin) else mesh.vertices
+        part = library.Trimesh(vertices, mesh.faces, process=False, visual=shown)
+        scene.add_geometry(part, name or "mesh", name or "mesh", transform=place)
+    file.write(scene.export(file_type="glb", include_normals=False))
+
+
+HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
+SCHEMAS = "http://schemas.openxmlformats.org/package/2006"
+MICROSOFT = "http://schemas.microsoft.com/3dmanufacturing"
+MIME = 'ContentType="application/vnd.'
+MEMBERS = {
+    "[Content_Types].xml": f'<Types xmlns="{SCHEMAS}/content-types">'
+    f'<Default Extension="rels" {MIME}openxmlformats-package.relationships+xml"/>'
+    f'<Default Extension="model" {MIME}ms-package.3dmanufacturing-3dmodel+xml"/></Types>\n',
+    "_rels/.rels": f'<Relationships xmlns="{SCHEMAS}/relationships"><Relationship '
+    f'Target="/3D/3dmodel.model" Id="rel0" Type="{MICROSOFT}/2013/01/3dmodel"/></Relationships>\n',
+}
+MODEL = f'<model unit="{{}}" xml:lang="en-US" xmlns="{MICROSOFT}/core/2015/02">\n<resources>'
+UNITS = {"um": "micron", "mm": "millimeter", "cm": "centimeter", "m": "meter", "in": "inch",
+         "ft": "foot"}  # fmt: skip
+COMPRESSION = 1  # the fastest level: higher ones save a tenth and take three times as long
+
+
+def write_3mf(target: IO[bytes], parts: Parts, world: World) -> None:
+    """Write 3MF, an object for each part, in a unit or the format's default, the millimetre.
+
+    Members opened by name have no date, so the same mesh always gives the same file.
+    """
+    with ZipFile(target, "w", ZIP_DEFLATED, compresslevel=COMPRESSION) as archive:
+        for member, text in MEMBERS.items():
+            with archive.open(member, "w") as file:
+                file.write((HEAD + text).encode("ascii"))
+        with archive.open("3D/3dmodel.model", "w", force_zip64=True) as file:
+            file.write((HEAD + MODEL.format(UNITS[world.unit or "mm"])).encode("ascii"))
+            for number, (name, mesh) in enumerate(parts.items(), 1):
+                quoted, shown = f'"{html.escape(name)}"', ""
+                named = f" name={quoted}" if name else ""
+                if name in world.colours:
+                    colour = "#{:02X}{:02X}{:02X}".format(*world.colours[name])
+                    material = len(parts) + number
+                    shown = f'<basematerials id="{material}"><base name={quoted} '
+                    shown += f'displaycolor="{colour}"/></basematerials>'
+                    named += f' pid="{material}" pindex="0"'
+                shown += f'<object id="{number}"{named} type="model"><mesh><vertices>\n'
+                file.write(shown.encode("utf-8"))
+                file.writelines(_lines('<vertex x="%s" y="%s" z="%s"/>\n', mesh.vertices))
+                file.write(b"</vertices><triangles>\n")
+                file.writelines(_lines('<triangle v1="%d" v2="%d" v3="%d"/>\n', mesh.faces))
+                file.write(b"</triangles></mesh></object>")
+            items = "".join(f'<item objectid="{n}"/>' for n in range(1, len(parts) + 1))
+            file.write(f"</resources><build>{items}</build></model>\n".encode("ascii"))
+
+
+WRITERS: dict[str, Callable[[IO[bytes], Parts, World], None]] = {
+    **{".ply": write_ply, ".stl": write_stl, ".obj": write_obj},
+    **{".off": write_off, ".glb": write_glb, ".3mf": write_3mf},
+}
+"""What writes meshes by their names (those without parts: the only one) to a file, by suffix."""

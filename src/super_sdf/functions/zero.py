@@ -41,6 +41,7 @@ REACHED = 0.25  # of the value at the start, above which the surface is not in r
 TURNED = 0.866  # cosine of 30 degrees
 LEAST_AREA = 0.02  # of triangles whose normals count, in squared fine spacings
 STAY = 1e-3  # weight of the vertex itself beside that of a plane, in least squares
+EXACT_TO = 2.0  # spacings from the surface: values that are cut off farther away are distances
 NEAR = 0.05  # fine spacings from the surface at which the planes' point is taken
 
 
@@ -69,9 +70,8 @@ def put_on_zero(
     margin = REACH / factor  # from the border of the grid, in spacings
     free: BoolArray = np.all((index > margin - 0.5) & (index < last - margin), axis=1)
     with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
-        points = put_on_surface(
-            value, start, mesh.faces, free, exact=grid.field.exact == (-np.inf, np.inf)
-        )
+        is_exact = np.abs(grid.field.exact).min() > EXACT_TO * grid.voxel_size
+        points = put_on_surface(value, start, mesh.faces, free, exact=is_exact)
         points = put_on_edges(value, points, mesh.faces, free)
     points = without_folds(points, start, mesh.faces, rounded)
     return Mesh((middle + fine * points).astype(kind), mesh.faces)

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from ..arrays import CORNERS, BoolArray, FloatArray, IntArray, Triple
 from ..threads import chunks_of
 from .look import Extremes, Floats
-from .samples import DerivedPlanes, SampleArray, SamplePlanes, in_spacings
+from .samples import DerivedPlanes, SampleArray, SamplePlanes, in_spacings, over_three
 
 REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
 
@@ -117,12 +117,7 @@ def without_inner_faces(values: SampleArray, inside: int, h: float) -> DerivedPl
     """
 
     def make(planes: NDArray[Any]) -> Floats:
-        near = planes * inside < 0
-        for axis in range(3):
-            source, grown = np.moveaxis(near, axis, 0), np.moveaxis(near.copy(), axis, 0)
-            grown[1:] |= source[:-1]
-            grown[:-1] |= source[1:]
-            near = np.moveaxis(grown, 0, axis)
+        near = over_three(planes * inside < 0, np.logical_or)
         deep = inside * np.maximum(np.abs(planes), h)
         return np.asarray(np.where(near, planes, deep), np.float64)
 

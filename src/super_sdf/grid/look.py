@@ -29,7 +29,7 @@ MOST_LABELS, FEW = 1000, 3  # different values that are listed; that are looked 
 ENOUGH = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
 AS_GOOD = 0.9  # of the largest mean step of neighbours over a level
-BORDER = 0.5, 0.4  # beyond half: so much of the border is on one side of a level, if of any
+GROWS = 2.0  # times the share of all samples, that of the border above a level of unsigned values
 SHARE, LEAST = 0.05, 20  # of the most steps over any level, and steps, that count
 MOST_NAMED = 8  # labels that a message lists
 TRIED = 4096  # samples whose different values are counted first
@@ -346,10 +346,12 @@ def which_level(look: Look, *, signed: bool = False, shift: float = 0.0, unit: f
     )
     faces = np.sort(look.faces[np.isfinite(look.faces)]) / unit + shift
     share = np.searchsorted(faces, levels) / max(len(faces), 1)  # of the border, below a level
-    for least in BORDER:
-        if (closed := (np.abs(share - 0.5) >= least) & (steps > 0)).any():
-            steps = np.where(closed, steps, 0)
-            break
+    middle = look.lines[:, 0, 2] * (look.scale / unit) + shift
+    inner = np.array([np.mean(middle < level) for level in levels])
+    # values that grow outwards: above are only the corners of the grid
+    grows = (1 - share > GROWS * (1 - inner)) & (share > 0.5)
+    if grows[steps.argmax()] and (all_above := share < 0.1).any():
+        steps = np.where(all_above, steps, 0)
     good = levels[steps >= AS_GOOD * steps.max()]
     level = _short_number(good)
     values = np.unique(np.append(pairs, [x + shift for x in (look.low, look.high)]))
@@ -359,7 +361,7 @@ def which_level(look: Look, *, signed: bool = False, shift: float = 0.0, unit: f
     if at < len(values) and values[at] == level:
         beside = values[at - 1] if at else values[at + 1]
         level = float(beside + values[at]) / 2
-    outside = border_share(look, lambda x: x / unit > level - shift) > 0.5
+    outside = border_share(look, lambda x: x / unit > level - shift) > 0.9
     option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
     other = "; or --field smooth, if it is at 0" if signed else ""
     return f"they look like densities: give the level of their surface, such as {option}{other}"

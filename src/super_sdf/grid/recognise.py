@@ -115,7 +115,7 @@ def recognise(
     if hint == "labels":
         return Answer("labels", "", facts, which_label(samples))
     if len(look.few) == 2:
-        if not _is_plane(look):
+        if not is_plane(look):
             return Answer("mask", "there are two values", facts)
         steps = np.full(3, look.high - look.low) if given is None else given
         return Answer("distance", "", facts | {"spacing": steps})
@@ -161,7 +161,7 @@ def cut_values(look: Look) -> list[float]:
 # Questions 1 to 3: masks and labels
 
 
-def _is_plane(look: Look) -> bool:
+def is_plane(look: Look) -> bool:
     """Return whether two values differ along an axis of two samples only: a plane is between."""
     if 2 not in look.shape or look.slabs[0].planes.dtype.kind in "iub":
         return False

@@ -232,6 +232,16 @@ def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
     return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
 
 
+def over_three(values: NDArray[Any], choose: np.ufunc) -> NDArray[Any]:
+    """Return the least, or the largest, of each sample and the 26 round it."""
+    for axis in range(3):
+        source, chosen = np.moveaxis(values, axis, 0), np.moveaxis(values.copy(), axis, 0)
+        choose(chosen[1:], source[:-1], out=chosen[1:])
+        choose(chosen[:-1], source[1:], out=chosen[:-1])
+        values = np.moveaxis(chosen, 0, axis)
+    return values
+
+
 def as_triple(number: ArrayLike, name: str) -> Triple:
     """Return one number or three as three finite floats; ``name`` is that in messages."""
     try:

@@ -15,6 +15,7 @@ from ..options import AUTO, FieldKind, Inside, Options
 from .derived import Resampled
 from .interpret import Field, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
+from .recognise import is_plane
 from .samples import (
     EQUAL_SPACING,
     STRAIGHT,
@@ -106,7 +107,7 @@ class SdfGrid:
         low, high = look.low, look.high
         if low == high:
             raise GridError(f"every value is {low:.6g}: a constant field has no surface")
-        if len(look.few) == 2:
+        if len(look.few) == 2 and not is_plane(look):
             raise GridError(f"the only values are {low:.6g} and {high:.6g}: {MASK_HINT}")
         below, steps = border_share(look, lambda x: x < 0), check_spacing(spacing)
         if below > 0.5:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..grid.derived import REACH, extremes_of_masks, mask_distances
+from ..grid.samples import over_three
 from ..grid.sdf_grid import SdfGrid
 from ..network.contract import Adapter
 from ..pipeline import refine_band
@@ -167,13 +168,3 @@ def at_walls(values: NDArray[Any]) -> BoolArray:
     """Return which samples do not have the same value as all that touch them."""
     differ: BoolArray = over_three(values, np.minimum) != over_three(values, np.maximum)
     return differ
-
-
-def over_three(values: NDArray[Any], choose: np.ufunc) -> NDArray[Any]:
-    """Return the least, or the largest, of each sample and the 26 round it."""
-    for axis in range(3):
-        source, chosen = np.moveaxis(values, axis, 0), np.moveaxis(values.copy(), axis, 0)
-        choose(chosen[1:], source[:-1], out=chosen[1:])
-        choose(chosen[:-1], source[1:], out=chosen[:-1])
-        values = np.moveaxis(chosen, 0, axis)
-    return values

@@ -9,8 +9,9 @@ surface, and was not cut off. If too many contradict others, the field is noisy,
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -18,10 +19,11 @@ from numpy.typing import NDArray
 
 from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError, NoSurfaceError
-from ..grid.samples import let_go, planes_at_once
+from ..grid.samples import let_go, over_three, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
-from ..threads import chunks_of, over_threads
+from ..threads import over_threads
 from .bounds import FARTHEST, TrustedSamples
+from .nodes import VoxelIndex
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
 # Patch values are clipped to this (3 h): samples that are farther from the surface do not matter to
@@ -35,9 +37,7 @@ LIPSCHITZ_SLACK = 0.1
 MAX_DISTANCE = 2.8  # of exact samples: those near the band's edge, 3, may have been truncated there
 MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
 MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
-# Planes are worked on in blocks of about this many samples, but of a few planes at least, since a
-# block also reads one plane more on either side.
-BLOCK_SAMPLES, BLOCK_PLANES = 1 << 18, 4
+BLOCK_SAMPLES = 1 << 18  # read at a time, about, and a plane more on either side
 # The largest difference between neighbours along an axis, and between a voxel's sample and that at
 # each place of its patch, (27,).
 MAX_STEP = 2 + LIPSCHITZ_SLACK
@@ -131,21 +131,17 @@ def survey(
             raise BandTooLargeError
     every = _Found(*map(np.concatenate, zip(*parts)))
     del parts, found
-    rows, patches = every[:5], every.patches
     whole = whole or _summary(every.figures, np.zeros((0, 0, 0), np.int64))
-    sample, exact = patches[:, CENTRE], np.zeros(len(patches), bool)
-    if not whole.is_noisy:
-        exact = exact_samples(patches, every.lipschitz, (whole.low, whole.high))
-        exact &= (sample > low) & (sample < high)
-    number, value = every.number[:0], every.value[:0]
-    if exact.any() and sees_beyond(limits):  # all trusted samples, in C order
+    exact, sample = _exact(every, whole), every.patches[:, CENTRE]
+    exact &= (sample > low) & (sample < high)
+    trusted = TrustedSamples(grid.shape, every.number[:0], every.value[:0])
+    # whether limits are beyond the band is the same for all parts of a grid
+    if exact.any() and (limits[0] < -HALF_BAND or limits[1] > HALF_BAND):
         own = np.ravel_multi_index(tuple(every.voxel_ijk[exact].T), grid.shape)
         number, value = np.append(own, every.number), np.append(sample[exact], every.value)
         order = np.argsort(number, kind="stable")
-        number, value = number[order], value[order]
-    ijk = np.array(np.unravel_index(number, grid.shape), np.int32)
-    trusted = TrustedSamples(grid.shape, ijk, value)
-    return Band(grid, offset, *rows, exact, limits, trusted, whole.leaves)
+        trusted = TrustedSamples(grid.shape, number[order], value[order])
+    return Band(grid, offset, *every[:5], exact, limits, trusted, whole.leaves)
 
 
 def summarise(grid: SdfGrid, offset: float = 0.0, threads: int = 1) -> BandSummary:
@@ -163,11 +159,6 @@ def _summary(figures: NDArray[np.float64], cells: NDArray[np.int64], side: int =
     told, noisy, low, high, leaves = figures.T
     ends = float(low.min()), float(high.max())
     return BandSummary(int(told.sum()), int(noisy.sum()), *ends, bool(leaves.any()), cells, side)
-
-
-def sees_beyond(limits: tuple[float, float]) -> bool:
-    """Return whether samples beyond the band can be exact: the same for all parts of a grid."""
-    return limits[0] < -HALF_BAND or limits[1] > HALF_BAND
 
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
@@ -202,43 +193,37 @@ def _found(
         if unseen is not None:
             hidden = np.asarray(unseen[first:last])
             inner, active = np.where(hidden, np.float32(FAR), inner), active & ~hidden
-        ijk = np.argwhere(active).astype(np.int32) + np.array([own.start, 0, 0], np.int32)
-        patches = np.empty((0, 27), np.float32)
-        if len(ijk):
-            start, stop = np.maximum(ijk.min(0) - 1, 0), ijk.max(0) + 2  # the rest is far away
-            patches = gather_patches(rescaled[tuple(map(slice, start, stop))], ijk - start)
-        voxel_ijk, centre = ijk + np.array([low, 0, 0], np.int32), patches[:, CENTRE]
+        ijk = np.argwhere(active).astype(np.int32)
+        patches = gather_patches(rescaled, ijk + np.array([own.start, 0, 0], np.int32))
+        ijk[:, 0] += first
         if is_checked and offset:
             _check_offset(grid, offset, patches)
 
         # Samples of a resampled grid are judged by samples alone: interpolated values do not tell
         # whether these are noisy. Interpolated values that contradict no others count as exact,
         # since thin parts need them (docs/guides/formats.md).
-        lipschitz, sampled = is_lipschitz(patches), on_samples(grid, voxel_ijk)
+        centre = patches[:, CENTRE]
+        lipschitz, sampled = is_lipschitz(patches), on_samples(grid, ijk)
         if grid.on_sample is not None:
             lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
-        if is_spline:
-            decoded = np.ones(len(patches), bool)
-        elif grid.field.sides_only:
-            decoded = has_both_sides(patches)
-        else:
-            # only a patch that can be distances proves, by a sample far from the surface, that
-            # the voxel holds none
-            decoded = (np.abs(centre) <= DECODE_LIMIT) | ~lipschitz
+        # Only a patch that can be distances proves, by a sample far from the surface, that the
+        # voxel holds none.
+        decoded: BoolArray = (np.abs(centre) <= DECODE_LIMIT) | ~lipschitz | is_spline
+        if grid.field.sides_only:
+            decoded = np.asarray((patches > 0).any(1) & (patches <= 0).any(1))
 
         faces = [rescaled[own, [0, -1]], rescaled[own, :, [0, -1]]]
         faces += [rescaled[0]] * (first == 0) + [rescaled[-1]] * (last == count)
         told, noisy = sampled.sum(), (sampled & ~lipschitz).sum()
         ends = centre.min(initial=np.inf), centre.max(initial=-np.inf)
         figures = np.array([[told, noisy, *ends, any((face <= 0).any() for face in faces)]], float)
-        number, value = np.zeros(0, np.int64), np.zeros(0, np.float32)
-        if sees_beyond(limits):
-            lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
-            found = (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
-            number, value = np.flatnonzero(found) + first * inner[0].size, inner[found]
-        return _Found(voxel_ijk, patches, lipschitz, sampled, decoded, number, value, figures)
+        lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
+        beyond = (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
+        number, value = np.flatnonzero(beyond) + first * inner[0].size, inner[beyond]
+        return _Found(ijk, patches, lipschitz, sampled, decoded, number, value, figures)
 
-    blocks = list(plane_blocks(grid.shape, planes_at_once(grid.samples)))
+    step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), planes_at_once(grid.samples))
+    blocks = [(first, min(first + step, count)) for first in range(0, count, step)]
     yield from over_threads(look, blocks, threads)
 
 
@@ -273,13 +258,8 @@ def rescale(
     rescaled = np.empty(planes.shape, np.float32)
     scale = 2.0 / grid.voxel_size
     limit = float(np.finfo(np.float32).max) / 4 / scale
-    is_huge = grid.low < offset - limit or grid.high > offset + limit
     for plane, out in zip(planes, rescaled):  # plane by plane: in cache, and no second copy
-        shifted = plane.astype(np.float64)
-        if is_huge:
-            np.clip(shifted, offset - limit, offset + limit, out=shifted)
-        if offset:
-            shifted -= offset
+        shifted = np.clip(plane.astype(np.float64) - offset, -limit, limit)
         np.multiply(shifted, scale, out=out, casting="same_kind")
     return rescaled
 
@@ -296,20 +276,8 @@ def is_active(rescaled: FloatArray) -> BoolArray:
     Where the input does, both voxels are added: a surface must pass between them.
     """
     above, below = rescaled >= HALF_BAND, rescaled <= -HALF_BAND
-    active = ~(above | below)
-    sides = above.view(np.uint8) | below.view(np.uint8) << 1  # of samples, then of edges ... cells
-    for axis in range(3):
-        lines = np.moveaxis(sides, axis, 0)
-        sides = np.moveaxis(lines[1:] | lines[:-1], 0, axis)
-    if (sides == 3).any():
-        for own, other in ((above, below), (below, above)):
-            near = other.copy()  # grown by one voxel in all 26 directions
-            for axis in range(3):
-                source, grown = (np.moveaxis(mask, axis, 0) for mask in (near.copy(), near))
-                grown[1:] |= source[:-1]
-                grown[:-1] |= source[1:]
-            active |= own & near
-    return active
+    jumps = over_three(above, np.logical_or) & over_three(below, np.logical_or)
+    return np.asarray(~(above | below) | jumps)
 
 
 def is_near(values: FloatArray) -> BoolArray:
@@ -319,17 +287,11 @@ def is_near(values: FloatArray) -> BoolArray:
     some of the 26 samples round them are on the other side. Where values are constant they are not.
     """
     change = np.zeros_like(values)
-    sides: NDArray[np.uint8] = 1 + (values > 0).view(np.uint8)  # of samples, then of ... cells
     for axis in range(3):
-        lines, cells = np.moveaxis(values, axis, 0), np.moveaxis(sides, axis, 0)
-        sides = np.moveaxis(np.bitwise_or(cells[1:], cells[:-1]), 0, axis)
+        lines = np.moveaxis(values, axis, 0)
         steps = np.pad(np.abs(np.diff(lines, axis=0)), ((1, 1), (0, 0), (0, 0)))
         change += np.moveaxis(np.maximum(steps[1:], steps[:-1]), 0, axis)
-    mixed = sides == 3
-    for axis in range(3):
-        mixed = np.pad(mixed, [(int(n == axis),) * 2 for n in range(3)])
-        both = np.moveaxis(mixed, axis, 0)
-        mixed = np.moveaxis(both[1:] | both[:-1], 0, axis)
+    mixed = over_three(values > 0, np.logical_or) & over_three(values <= 0, np.logical_or)
     return np.asarray((np.abs(values) < change) | mixed)
 
 
@@ -346,77 +308,42 @@ def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
             steep = np.abs(planes[border] - planes[inner]) > MAX_STEP
             planes[outer][steep] = planes[border][steep]
     np.clip(padded, -PATCH_LIMIT, PATCH_LIMIT, out=padded)
-    centre, steps = _flat_steps(voxel_ijk, rescaled.shape)
-    patches = np.empty((len(voxel_ijk), 27), np.float32)
-    for rows in chunks_of(len(voxel_ijk), 27):
-        for column, step in enumerate(steps):
-            patches[rows, column] = padded.ravel().take(centre[rows] + step)
-    return patches
+    strides = np.array([padded[0].size, padded.shape[2], 1])
+    around = ((voxel_ijk + 1) @ strides)[:, None] + NEIGHBOURHOOD @ strides
+    return np.asarray(padded.ravel().take(around))
 
 
-def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, ...]) -> IntArray:
+def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:
     """Return the neighbour table (V, 27) of voxels (V, 3), all different and in C order.
 
     It has their rows at the 27 places of ``NEIGHBOURHOOD`` round each, -1 where there is no voxel.
     As an index -1 is the last row, so append a row of zeros to the array that is gathered from.
     """
-    table = np.empty((len(voxel_ijk), 27), np.int32)
-    for first, last in plane_blocks(shape):
-        ends = [first - 1, first, last, last + 1]
-        start, low, high, stop = np.searchsorted(voxel_ijk[:, 0], ends)
-        at, steps = _flat_steps(voxel_ijk[start:stop] - np.array([first, 0, 0], np.int32), shape)
-        row_at = np.full((last - first + 2) * (shape[1] + 2) * (shape[2] + 2), -1, np.int32)
-        row_at[at] = np.arange(start, stop, dtype=np.int32)
-        for column, step in enumerate(steps):
-            np.take(row_at, at[low - start : high - start] + step, out=table[low:high, column])
+    table, index = np.empty((len(voxel_ijk), 27), np.int32), VoxelIndex(voxel_ijk, shape)
+    for place, step in enumerate(NEIGHBOURHOOD):
+        table[:, place] = index.find(voxel_ijk + step)
     return table
 
 
-def plane_blocks(shape: tuple[int, ...], least: int = BLOCK_PLANES) -> Iterator[tuple[int, int]]:
-    """Yield (start, stop) of blocks of ``BLOCK_SAMPLES`` samples or of ``least`` planes."""
-    step = max(BLOCK_SAMPLES // (shape[1] * shape[2]), least)
-    for start in range(0, shape[0], step):
-        yield start, min(start + step, shape[0])
-
-
-def _flat_steps(voxel_ijk: IntArray, shape: tuple[int, ...]) -> tuple[NDArray[np.int64], list[int]]:
-    """Return flat indices (V,) into the grid padded by one, and the 27 steps to neighbours."""
-    strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1], np.int64)
-    return (voxel_ijk + 1) @ strides, [int(step) for step in NEIGHBOURHOOD @ strides]
-
-
-def is_lipschitz(patches: FloatArray, places: Iterable[int] = range(27)) -> BoolArray:
+def is_lipschitz(patches: FloatArray, places: slice | NDArray[np.intp] = slice(None)) -> BoolArray:
     """Return which patches (V, 27) can be distances, (V,) bool: those that are 1-Lipschitz.
 
     This fails nearly everywhere in a noisy field, and in many places of a field that is not a
     distance. ``places`` are those of a patch that are compared with its centre.
     """
-    keeps = np.ones(len(patches), bool)
-    for rows in chunks_of(len(patches), 4 * 27):  # in cache
-        centre = patches[rows, CENTRE]
-        for column in places:
-            keeps[rows] &= np.abs(patches[rows, column] - centre) <= MAX_DIFFERENCE[column]
-    return keeps
+    apart = np.abs(patches[:, places] - patches[:, CENTRE, None])
+    return np.asarray((apart <= MAX_DIFFERENCE[places]).all(1))
 
 
-def has_both_sides(patches: FloatArray) -> BoolArray:
-    """Return in which patches (V, 27) samples lie on both sides of 0, (V,)."""
-    outside = patches > 0
-    return np.asarray(outside.any(1) & ~outside.all(1))
+def _exact(found: _Found, whole: BandSummary) -> BoolArray:
+    """Return which samples of a band can be taken as exact distances, (V,): see the module.
 
-
-def exact_samples(
-    patches: FloatArray, lipschitz: BoolArray, limits: tuple[float, float]
-) -> BoolArray:
-    """Return which samples of a band that is not noisy can be taken as exact distances, (V,) bool.
-
-    They contradict no neighbour, are near the surface, and were not cut off: a truncated sample is
-    one of the ``limits``, the lowest and the highest sample of the whole band, and has no neighbour
+    A truncated sample is the lowest or the highest of the ``whole`` band, and has no neighbour
     towards which the field is as steep as a distance.
     """
-    sample = patches[:, CENTRE]
-    exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE)
-    low, high = map(np.float32, limits)
+    patches, sample = found.patches, found.patches[:, CENTRE]
+    exact: BoolArray = found.lipschitz & (np.abs(sample) < MAX_DISTANCE) & (not whole.is_noisy)
+    low, high = np.float32(whole.low), np.float32(whole.high)
     at_limit = np.flatnonzero(exact & (sample == np.where(sample > 0, high, low)))
     slope = np.abs(patches[at_limit] - sample[at_limit, None]) / np.maximum(MAX_DIFFERENCE, 1)
     exact[at_limit] = slope.max(1) >= MIN_SLOPE

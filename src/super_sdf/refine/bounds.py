@@ -45,7 +45,7 @@ class TrustedSamples:
     """All samples whose spheres can be trusted: exact ones of the band, and some beyond it."""
 
     shape: tuple[int, int, int]  # samples of the grid along each axis
-    ijk: IntArray  # (3, n), the samples, in C order
+    number: NDArray[np.int64]  # (n,), of the samples in C order of the whole grid
     value: FloatArray  # (n,)
 
     def planes(self, first: int, last: int) -> FloatArray:
@@ -53,12 +53,13 @@ class TrustedSamples:
 
         Across, they reach ``REACH_OF_SAMPLES`` beyond the grid on either side.
         """
-        ny, nz = (count + 2 * REACH_OF_SAMPLES for count in self.shape[1:])
-        planes = np.full((last - first, ny, nz), np.nan, np.float32)
-        rows = slice(*np.searchsorted(self.ijk[0], [first, last]))
-        i, j, k = self.ijk[:, rows]
-        planes[i - first, j + REACH_OF_SAMPLES, k + REACH_OF_SAMPLES] = self.value[rows]
-        return planes
+        ny, nz = self.shape[1:]
+        planes = np.full((last - first, ny * nz), np.nan, np.float32)
+        rows = slice(*np.searchsorted(self.number, np.array([first, last]) * (ny * nz)))
+        planes.ravel()[self.number[rows] - first * (ny * nz)] = self.value[rows]
+        beyond = (REACH_OF_SAMPLES,) * 2
+        widths = (0, 0), beyond, beyond
+        return np.pad(planes.reshape(-1, ny, nz), widths, constant_values=np.nan)
 
 
 def keep_within_bounds(

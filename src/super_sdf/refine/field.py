@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,7 +18,6 @@ from ..errors import OptionError
 from ..grid.interpret import NONE_EXACT, Field
 from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
-from ..threads import chunks_of
 from .band import rescale
 from .nodes import (
     BARELY_INSIDE,
@@ -27,7 +27,6 @@ from .nodes import (
     block_ijk,
     number_parts,
     part_of_node,
-    part_sizes,
 )
 
 COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "pinned_nodes")
@@ -114,9 +113,9 @@ class FineField:
         can. The sign of ``pinned_nodes`` had to be changed to that of a voxel that holds no
         surface: if there are any, the input is not a distance field there, or the network failed.
         """
-        counts = self.found[0], self.found[1], len(self.voxel_ijk[own])
         pinned = 0 if self.pinned is None else int(self.pinned[own].sum())
-        return dict(zip(COUNTS, (*counts, self.parts.count_nodes(self.factor, own), pinned)))
+        nodes = self.parts.count_nodes(self.factor, own)
+        return dict(zip(COUNTS, (*self.found, len(self.voxel_ijk[own]), nodes, pinned)))
 
     @cached_property
     def numbers(self) -> IntArray:
@@ -124,7 +123,7 @@ class FineField:
 
         OptionError if there are more nodes than 32-bit numbers.
         """
-        starts, _ = number_parts(self.parts, part_sizes(self.factor))
+        starts, _ = number_parts(self.parts, self.factor)
         part, place = part_of_node(self.factor)
         return starts.T[:, part] + place
 
@@ -174,24 +173,28 @@ class FineField:
         return bool(self.blocks.size and self.blocks.min() <= 0 < self.blocks.max())
 
 
-def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> bool:
-    """Return whether the surface crosses the border of the fine lattice.
+def border_faces(
+    field: FineField, border: NDArray[Any] | None = None
+) -> Iterator[tuple[NDArray[np.intp], BoolArray]]:
+    """Yield voxels (n,) at each face of the fine lattice, and which nodes on it are inside, (m, n).
 
-    That is half a voxel beyond the outermost samples, which may all be outside. Of a part of a
-    grid, ``border`` (2, 3) are the whole grid's first voxels and those after its last ones, counted
-    from the first of the part.
+    Faces are half a voxel beyond the outermost samples, which may all be outside. Of a part of a
+    grid, ``border`` (2, 3) are the first voxels of the whole grid and those after its last ones,
+    counted from the first of the part.
     """
-    side = block_ijk(field.factor)
+    node_ijk = block_ijk(field.factor)
+    first, after = np.array([(0, 0, 0), field.shape]) if border is None else border
     for axis in range(3):
-        first, after = (0, field.shape[axis]) if border is None else border[:, axis]
-        for voxel, node in ((first, 0), (after - 1, field.factor)):
-            at_face = np.flatnonzero(field.voxel_ijk[:, axis] == voxel)
-            outer = np.flatnonzero(side[:, axis] == node)
-            for chunk in chunks_of(len(at_face), len(outer)):
-                inside = field.blocks[outer[:, None], at_face[chunk]] <= 0
-                if (inside.any(0) & ~inside.all(0)).any():
-                    return True
-    return False
+        for voxel, end in ((first[axis], 0), (after[axis] - 1, field.factor)):
+            rows = np.flatnonzero(field.voxel_ijk[:, axis] == voxel)
+            nodes = np.flatnonzero(node_ijk[:, axis] == end)
+            yield rows, field.blocks[nodes[:, None], rows] <= 0
+
+
+def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> bool:
+    """Return whether the surface crosses the border of the fine lattice: see ``border_faces``."""
+    faces = (inside for _, inside in border_faces(field, border))
+    return any((inside.any(0) & ~inside.all(0)).any() for inside in faces)
 
 
 class FineLattice(SamplePlanes):

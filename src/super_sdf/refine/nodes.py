@@ -29,8 +29,10 @@ BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
 LEAST_OF_MASK = np.float32(0.04)
 
 # The neighbours that share each part, the voxel itself included.
-IS_SHARED = ((NEIGHBOURHOOD == 0) | (NEIGHBOURHOOD[:, None] == NEIGHBOURHOOD)).all(2)
-SHARING = [np.flatnonzero(shared) for shared in IS_SHARED]
+SHARING = [
+    np.flatnonzero(((NEIGHBOURHOOD == 0) | (part == NEIGHBOURHOOD)).all(1))
+    for part in NEIGHBOURHOOD
+]
 
 
 def block_ijk(factor: int) -> IntArray:
@@ -62,13 +64,18 @@ def nodes_of_part(factor: int) -> list[NDArray[np.intp]]:
 
 
 def part_sizes(factor: int) -> NDArray[np.int64]:
-    """Return the number of nodes of each part, (27,)."""
-    return np.array([len(nodes) for nodes in nodes_of_part(factor)])
+    """Return the number of nodes of each part, (27,): of one voxel with factor 2, 1 of each."""
+    return np.asarray((factor - 1) ** (NEIGHBOURHOOD == 0).sum(1), np.int64)
 
 
 def seen_from(part: int, neighbour: int | np.integer[Any]) -> int:
     """Return the number that a shared part has in a neighbour: it is on the other side there."""
     return int((NEIGHBOURHOOD[part] - 2 * NEIGHBOURHOOD[neighbour] + 1) @ STRIDES)
+
+
+def within(voxel_ijk: NDArray[np.integer], shape: tuple[int, int, int]) -> BoolArray:
+    """Return which voxels (..., 3) are in a grid of a shape, (...,)."""
+    return np.asarray(((voxel_ijk >= 0) & (voxel_ijk < shape)).all(-1))
 
 
 class VoxelIndex:
@@ -89,8 +96,7 @@ class VoxelIndex:
             return np.full(voxel_ijk.shape[:-1], -1, np.int64)
         wanted = self._key_of(voxel_ijk)
         at = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
-        in_grid = ((voxel_ijk >= 0) & (voxel_ijk < self.shape)).all(-1)
-        return np.where(in_grid & (self.keys[at] == wanted), at, -1)
+        return np.where(within(voxel_ijk, self.shape) & (self.keys[at] == wanted), at, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,13 +123,13 @@ def share_parts(table: IntArray) -> SharedParts:
     return SharedParts(by_place, owner)
 
 
-def number_parts(parts: SharedParts, sizes: NDArray[np.int64]) -> tuple[IntArray, int]:
+def number_parts(parts: SharedParts, factor: int) -> tuple[IntArray, int]:
     """Return the number of the first node of each part, (27, D) int32, and the number of nodes.
 
-    They come in the order of the voxels that own them; ``sizes``, (27,), are the nodes per part.
-    OptionError if there are more nodes than 32-bit numbers.
+    They come in the order of the voxels that own them. OptionError if there are more nodes than
+    32-bit numbers.
     """
-    owned = parts.owner == CENTRE
+    owned, sizes = parts.owner == CENTRE, part_sizes(factor)
     count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
     starts = np.cumsum(owned * sizes[:, None].astype(np.int32), axis=0, dtype=np.int32)
     before = np.cumsum(starts[-1], dtype=np.int32) - starts[-1]  # of earlier voxels
@@ -172,16 +178,16 @@ def average_shared(
     map_threads(average, shared, worthwhile_threads(blocks.size, threads))
 
 
-def hold_sides(blocks: FloatArray, factor: int, patches: FloatArray, voxels: IntArray) -> None:
-    """Give every sample of a mask its side, whatever the network says.
+def hold_sides(blocks: FloatArray, factor: int, samples: FloatArray) -> None:
+    """Give every sample of a mask its side, whatever the network says, in ``blocks`` (Q, D).
 
-    A block's value at its sample is raised by adding a pyramid that is 0 on the faces of the block,
-    so that neighbouring blocks still agree. Lines between samples are the network's: it joins
-    slices of a thin vessel or plate across the line between two samples outside. The decoded rows
-    of ``patches`` (V, 27) are ``voxels``.
+    A block's value at its sample, of ``samples`` (D,), is raised by adding a pyramid that is 0 on
+    the faces of the block, so that neighbouring blocks still agree. Lines between samples are the
+    network's: it joins slices of a thin vessel or plate across the line between two samples
+    outside.
     """
-    sign = np.where(patches[voxels, CENTRE] > 0, np.float32(1), np.float32(-1))
-    missing = np.maximum(LEAST_OF_MASK - sign * blocks[len(blocks) // 2, :-1], 0)
+    sign = np.where(samples > 0, np.float32(1), np.float32(-1))
+    missing = np.maximum(LEAST_OF_MASK - sign * blocks[len(blocks) // 2], 0)
     wrong = np.flatnonzero(missing)
     pyramid = (1 - np.abs(block_offsets(factor))).prod(1).astype(np.float32)
     blocks[:, wrong] += pyramid[:, None] * (sign * missing)[wrong]
@@ -193,28 +199,22 @@ def pin_to_skipped(
     factor: int,
     voxel_ijk: IntArray,
     patches: FloatArray,
-    voxels: IntArray,
     shape: tuple[int, int, int],
 ) -> IntArray:
     """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
 
     A skipped voxel was not decoded, so it holds no surface, and all its nodes have the sign of its
-    sample. Once they do, no sign change reaches the boundary of the decoded voxels, and the
-    isosurface has no hole there. The decoded voxels (D, 3) are the rows ``voxels`` of the band,
-    with the samples ``patches`` (V, 27). Returned is how many nodes were changed that
-    each voxel owns, (D,).
+    sample. Once they do, no sign change reaches the boundary of the decoded voxels (D, 3), and the
+    isosurface has no hole there. ``patches`` (D, 27) are the samples round these. Returned is how
+    many nodes were changed that each voxel owns, (D,).
     """
     # the sign of each neighbour, 0 of decoded ones
     skipped: NDArray[np.int8] = np.zeros(parts.table.shape, np.int8)
-    inner = [(ijk != 0, ijk != n - 1) for ijk, n in zip(np.ascontiguousarray(voxel_ijk.T), shape)]
-    for place, step in enumerate(NEIGHBOURHOOD.tolist()):
-        is_skipped = parts.table[place] < 0
-        for along, way in zip(inner, step):
-            if way:
-                is_skipped &= along[way > 0]
-        at = np.flatnonzero(is_skipped)
-        skipped[place, at] = np.where(patches[voxels.take(at), place] > 0, 1, -1)
-    changed = np.zeros(len(voxels), np.int32)
+    for place, step in enumerate(NEIGHBOURHOOD):
+        at = np.flatnonzero(parts.table[place] < 0)
+        at = at[within(voxel_ijk[at] + step, shape)]
+        skipped[place, at] = np.where(patches[at, place] > 0, 1, -1)
+    changed = np.zeros(len(voxel_ijk), np.int32)
     for part, nodes in enumerate(nodes_of_part(factor)):
         sign = np.zeros(skipped.shape[1], np.int8)
         for signs in skipped[SHARING[part]]:

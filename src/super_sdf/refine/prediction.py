@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
-from ..grid.samples import cropped, in_spacings
+from ..grid.samples import cropped, in_spacings, over_three
 from ..network.contract import Adapter, decode
 from ..threads import chunks_of
 from .band import Band
@@ -134,13 +134,7 @@ def roughness(values: FloatArray) -> FloatArray:
             for step in range(5)
         )
         total += np.moveaxis(np.abs(e - 4 * d + 6 * c - 4 * b + a), 0, axis)
-    for axis in range(3):
-        lines = np.moveaxis(total, axis, 0)
-        largest = lines.copy()
-        np.maximum(largest[1:], lines[:-1], out=largest[1:])
-        np.maximum(largest[:-1], lines[1:], out=largest[:-1])
-        total = np.moveaxis(largest, 0, axis)
-    return total
+    return over_three(total, np.maximum)
 
 
 def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float32]) -> FloatArray:

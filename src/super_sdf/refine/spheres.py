@@ -18,16 +18,15 @@ not depend on how many are worked on together.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, FloatArray, IntArray
+from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, FloatArray, IntArray, inner
 from ..threads import chunks_of, map_chunks
 from .band import MAX_DISTANCE, MIN_SLOPE, Band
-from .nodes import SharedParts, VoxelIndex, number_parts
+from .nodes import SharedParts, VoxelIndex, number_parts, within
 
 BEYOND = 2.0  # samples this much farther than MAX_DISTANCE have spheres, too
 APART = np.maximum(2 * np.linalg.norm(NEIGHBOURHOOD, axis=1), 1).astype(np.float32)  # of samples
@@ -62,6 +61,21 @@ class Spheres(NamedTuple):
     distance: FloatArray  # (n,), signed
     direction: FloatArray  # (3, n), about the gradient of the field there, of length 1
 
+    def some(self, which: NDArray[Any] | slice) -> Spheres:
+        """Return some of them."""
+        return Spheres(self.centre[:, which], self.distance[which], self.direction[:, which])
+
+
+class Look(NamedTuple):
+    """The field at a place on each of n spheres."""
+
+    direction: FloatArray  # (3, n), from the place to the sample, or back for a sample inside
+    rows: IntArray  # (n,), the block that the place lies in, -1 if it was not decoded
+    place: FloatArray  # (3, n), the position in it, 0 to 1 along each axis
+    value: FloatArray  # (n,), the field
+    normal: FloatArray  # (3, n), its gradient, of length 1
+    clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
+
 
 class FootPoints(NamedTuple):
     """Foot points of samples, and the field's value there."""
@@ -70,31 +84,6 @@ class FootPoints(NamedTuple):
     place: FloatArray  # (3, n), the position in the block, 0 to 1 along each axis
     values: FloatArray  # (n,), the field there: the error, since it should be 0
     weights: FloatArray  # (n,), how far to trust it, 0 to 1
-
-
-class Look(NamedTuple):
-    """The field at a place on each of n spheres."""
-
-    direction: FloatArray  # (3, n), from the place to the sample, or back for a sample inside
-    aside: FloatArray  # (3, n), whole voxels from the sample to the block that the place lies in
-    rows: IntArray  # (n,), that block, -1 if it was not decoded
-    place: FloatArray  # (3, n), the position in it, 0 to 1 along each axis
-    value: FloatArray  # (n,), the field
-    normal: FloatArray  # (3, n), its gradient, of length 1
-    clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
-
-
-Columns = TypeVar("Columns", Spheres, FootPoints, Look)
-
-
-def _some(columns: Columns, which: NDArray[Any] | slice) -> Columns:
-    arrays: Any = [array[..., which] for array in columns]
-    return type(columns)(*arrays)
-
-
-def _joined(parts: Sequence[Columns]) -> Columns:
-    arrays: Any = [np.concatenate(each, -1) for each in zip(*parts)]
-    return type(parts[0])(*arrays)
 
 
 def fit_to_spheres(
@@ -113,14 +102,18 @@ def fit_to_spheres(
     """
     if not len(spheres.distance):  # in a noisy field, for example
         return
-    feet = find_foot_points(blocks, factor, spheres, index, threads)
-    correction = find_correction(feet, parts)
+
+    def touch(rows: slice) -> FootPoints:
+        return find_foot_points(blocks, factor, spheres.some(rows), index)
+
+    feet = map_chunks(touch, len(spheres.distance), TEMPORARIES, threads)
+    correction = find_correction(FootPoints(*map(_joined, zip(*feet))), parts)
 
     def subtract(rows: slice) -> None:
         blocks[:, rows] -= prolong(correction[:, rows], 2, factor)
 
     map_chunks(subtract, correction.shape[1], len(blocks), threads)
-    own = _some(spheres, np.abs(spheres.distance) < MAX_DISTANCE)
+    own = spheres.some(np.abs(spheres.distance) < MAX_DISTANCE)
     rows = index.find(own.centre.T)
     blocks[len(blocks) // 2, rows[rows >= 0]] = own.distance[rows >= 0]
 
@@ -143,24 +136,23 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
         slope = (sign[:, None] * patch - np.abs(own.distance)[:, None]) / APART
         found = np.asarray((size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND))
         found &= (slope >= MIN_SLOPE) & (patch > low) & (patch < high)
+        found &= within(own.centre.T[:, None] + NEIGHBOURHOOD, band.grid.shape)
         row, step = np.nonzero(found)
         centre = own.centre[:, row] + NEIGHBOURHOOD[step].T
-        in_grid = ((centre.T >= 0) & (band.grid.shape > centre.T)).all(1)
-        row, step = row[in_grid], step[in_grid]
-        beyond = Spheres(centre[:, in_grid], patch[row, step], own.direction[:, row])
+        beyond = Spheres(centre, patch[row, step], own.direction[:, row])
         return own, beyond, slope[row, step]
 
     parts = map_chunks(gather, len(exact), 4 * TEMPORARIES, threads) or [gather(slice(0))]
-    beyond = _joined([part[1] for part in parts])
+    own, beyond = (Spheres(*map(_joined, zip(*each))) for each in list(zip(*parts))[:2])
     slope = np.concatenate([part[2] for part in parts])
-    keys = VoxelIndex(beyond.centre.T, band.grid.shape).keys
+    keys = np.ravel_multi_index(tuple(beyond.centre), band.grid.shape)
     order = np.lexsort((-slope, keys))  # of equal samples the steepest
-    beyond = _some(beyond, order[np.diff(keys[order], prepend=-1) > 0])
-    return _joined([*(part[0] for part in parts), beyond])
+    beyond = beyond.some(order[np.diff(keys[order], prepend=-1) > 0])
+    return Spheres(*map(_joined, zip(own, beyond)))
 
 
 def find_foot_points(
-    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex, threads: int = 1
+    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex
 ) -> FootPoints:
     """Return the foot points of samples, leaving out those outside all blocks (Q, D + 1).
 
@@ -169,23 +161,18 @@ def find_foot_points(
     distance, since an error of the direction matters more. Spheres from beyond the band mostly
     touch edges, which linear cells cut off: that they are clear of them is no error.
     """
-
-    def search(rows: slice) -> FootPoints:
-        some = _some(spheres, rows)
-        found, size = _touch(blocks, factor, some, index), np.abs(some.distance)
-        clear = (size >= MAX_DISTANCE) & (found.clearance > 0)
-        unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
-        aligned = np.clip(_dot(found.direction, found.normal), 0, 1)
-        for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
-            aligned *= aligned
-        farther: FloatArray = np.maximum(size - np.float32(MAX_DISTANCE), 0)
-        penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
-        weights = aligned / penalty
-        values = np.clip(found.value, -MAX_ERROR, MAX_ERROR)
-        kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
-        return _some(FootPoints(found.rows, found.place, values, weights), kept)
-
-    return _joined(map_chunks(search, len(spheres.distance), TEMPORARIES, threads))
+    found, size = _touch(blocks, factor, spheres, index), np.abs(spheres.distance)
+    clear = (size >= MAX_DISTANCE) & (found.clearance > 0)
+    unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
+    aligned = np.clip(inner(found.direction, found.normal), 0, 1)
+    for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
+        aligned *= aligned
+    farther: FloatArray = np.maximum(size - np.float32(MAX_DISTANCE), 0)
+    penalty: FloatArray = (1 + unusual * unusual) * (1 + np.float32(FAR_PENALTY) * farther)
+    weights = aligned / penalty
+    values = np.clip(found.value, -MAX_ERROR, MAX_ERROR)
+    kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
+    return FootPoints(found.rows[kept], found.place[:, kept], values[kept], weights[kept])
 
 
 def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Look:
@@ -197,34 +184,29 @@ def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex)
     that gains nothing is taken back, and the next one is smaller.
     """
 
-    def look(which: NDArray[Any] | slice, direction: FloatArray, before: Look | None) -> Look:
+    def look(which: NDArray[Any] | slice, direction: FloatArray) -> Look:
         """Return what the field is where directions (3, n) meet some spheres."""
         distance = spheres.distance[which]
         half = distance * direction * np.float32(-0.5)
-        aside = np.rint(half)
-        if before is None:
-            rows = index.find((spheres.centre + aside.astype(np.int32)).T).astype(np.int32)
-        else:  # most places stay in their block
-            rows = before.rows[which]
-            other = np.flatnonzero((aside != before.aside[:, which]).any(0))
-            voxel = spheres.centre[:, which][:, other] + aside[:, other].astype(np.int32)
-            rows[other] = index.find(voxel.T)
+        aside = np.rint(half)  # whole voxels from the sample
+        voxel = spheres.centre[:, which] + aside.astype(np.int32)
+        rows = index.find(voxel.T).astype(np.int32)
         place = np.clip(half - aside + np.float32(0.5), 0, 1)
         value, gradient = sample_trilinear(blocks, rows, place, factor)
         outwards = np.copysign(np.float32(1), distance) * value
         clearance = np.where(rows >= 0, outwards, np.float32(np.inf))
-        return Look(direction, aside, rows, place, value, _unit(gradient), clearance)
+        return Look(direction, rows, place, value, _unit(gradient), clearance)
 
-    found = look(slice(None), spheres.direction.copy(), None)
+    found = look(slice(None), spheres.direction.copy())
     turn = np.full(len(spheres.distance), FIRST_TURN, np.float32)
     for _ in range(LOOKS - 1):
-        cosine = _dot(found.direction, found.normal)
+        cosine = inner(found.direction, found.normal)
         rest = np.flatnonzero((found.rows >= 0) & (cosine < SETTLED))
         if not len(rest):
             break
         direction, share = found.direction[:, rest], turn[rest]
         direction = _unit(direction + share * (found.normal[:, rest] - direction))
-        new = look(rest, direction, found)
+        new = look(rest, direction)
         better = new.clearance < found.clearance[rest]
         nearer, farther = np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
         turn[rest] = np.where(better, nearer, farther)
@@ -236,14 +218,13 @@ def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex)
 
 def _unit(vectors: FloatArray) -> FloatArray:
     """Return the vectors (3, n) scaled to length 1; 0 stays 0."""
-    length: FloatArray = np.maximum(np.sqrt(_dot(vectors, vectors)), np.float32(1e-6))
+    length: FloatArray = np.maximum(np.sqrt(inner(vectors, vectors)), np.float32(1e-6))
     return vectors / length
 
 
-def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the dot products of vectors (3, n), (n,)."""
-    product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-    return product
+def _joined(parts: tuple[NDArray[Any], ...]) -> NDArray[Any]:
+    """Return arrays joined along the last axis."""
+    return np.concatenate(parts, -1)
 
 
 def sample_trilinear(
@@ -284,16 +265,16 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
     there of the errors that are left each time. Where errors disagree, means are smaller. Errors
     are summed in the order of the samples, some at a time, to save memory.
     """
-    numbers, count = number_parts(parts, np.ones(27, np.int64))
+    numbers, count = number_parts(parts, 2)  # one node per part
     left, voxels = feet.values.copy(), numbers.shape[1]
     correction = np.zeros((len(numbers), voxels), np.float32)
 
     def nodes_round(rows: slice, cells: int) -> tuple[NDArray[np.intp], FloatArray]:
         """Return the 8 nodes round foot points, (8, n), and their trilinear weights there."""
-        low, within = _find_cell(feet.place[:, rows], cells)
+        low, inside = _find_cell(feet.place[:, rows], cells)
         step = STRIDES * (2 // cells)
         at = (step @ low + (CORNERS @ step)[:, None]) * voxels + feet.rows[rows]
-        upper = np.stack([1 - within, within])  # (2, 3, n)
+        upper = np.stack([1 - inside, inside])  # (2, 3, n)
         x, y, z = CORNERS.T
         shares: FloatArray = upper[x, 0] * upper[y, 1] * upper[z, 2]
         return numbers.ravel().take(at).astype(np.intp), shares
@@ -332,8 +313,6 @@ def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
     ((cells + 1)^3, n) become ((finer + 1)^3, n). If the copies of shared nodes were equal before,
     they are equal, bit for bit.
     """
-    if cells == finer:
-        return values
     block = values.reshape(*(cells + 1,) * 3, -1)
     for axis in range(3):
         source = np.moveaxis(block, axis, 0)

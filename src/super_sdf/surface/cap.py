@@ -16,17 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CORNERS, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
+from ..arrays import CORNERS, NEIGHBOURHOOD, FloatArray, IntArray
 from ..errors import GridError
 from ..grid.sdf_grid import SdfGrid
 from ..refine.band import neighbour_table, rescale
-from ..refine.field import FineField
+from ..refine.field import FineField, border_faces
 from ..refine.nodes import (
     BARELY_INSIDE,
     BARELY_OUTSIDE,
     SHARING,
     SharedParts,
-    block_ijk,
     nodes_of_part,
     seen_from,
     share_parts,
@@ -54,7 +53,10 @@ def close(field: FineField, *, cap: bool, border: IntArray | None = None) -> Fin
     border = np.array([(0, 0, 0), field.shape]) if border is None else border
     known = field.voxel_ijk
     filled = find_border_inside(field, border) if field.leaves else known[:0]
-    solid = np.concatenate([known[_reaches_border(field, border)], filled])
+    reaches = np.zeros(len(known), bool)
+    for rows, inside in border_faces(field, border):
+        reaches[rows] |= inside.any(0)
+    solid = np.concatenate([known[reaches], filled])
     if not len(solid):
         return field
     voxel_ijk = np.concatenate([known, filled, outer_voxels(solid, border)])
@@ -71,18 +73,6 @@ def close(field: FineField, *, cap: bool, border: IntArray | None = None) -> Fin
     blocks[:, known_at[~near]] = field.blocks[:, ~near]  # beside them
     _set_blocks(field.blocks[:, near], known_at[near], blocks, parts, field.factor)
     return replace(field, voxel_ijk=voxel_ijk, blocks=blocks, parts=parts)
-
-
-def _reaches_border(field: FineField, border: IntArray) -> BoolArray:
-    """Return which voxels have a node on the border of the grid that is inside, (D,)."""
-    found = np.zeros(len(field.voxel_ijk), bool)
-    node_ijk = block_ijk(field.factor)
-    for axis in range(3):
-        for voxel, end in ((border[0, axis], 0), (border[1, axis] - 1, field.factor)):
-            rows = np.flatnonzero(field.voxel_ijk[:, axis] == voxel)
-            nodes = np.flatnonzero(node_ijk[:, axis] == end)
-            found[rows] |= (field.blocks[nodes[:, None], rows] <= 0).any(0)
-    return found
 
 
 def find_border_inside(field: FineField, border: IntArray | None = None) -> IntArray:

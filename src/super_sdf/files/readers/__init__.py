@@ -73,9 +73,8 @@ class Request:
                 raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
             return same[0]
         if len(names) > 1:
-            raise FileError(
-                f"{self.path} holds several arrays, {listed}: give {self.path}:{names[0]}, say"
-            )
+            said = f"{self.path} holds several arrays, {listed}"
+            raise FileError(f"{said}: give {self.path}:{names[0]}, say")
         return names[0]
 
     def choose_array(self, shapes: Mapping[str, Sequence[int]], what: str) -> str:
@@ -91,11 +90,14 @@ class Request:
     def pick(
         self, shape: Sequence[int], kept: Sequence[int] | None = None, names: Sequence[str] = ()
     ) -> Index:
-        """Return which samples of an array are read; GridError if a number is missing.
+        """Return which samples of an array are read; GridError if an axis or a number is missing.
 
         ``kept`` are the axes in space. Without it, axes of length 1 are left out, and of those left
         the longest are in space.
         """
+        if len(shape) < 3:
+            said = f"{self.path} has shape {tuple(shape)}"
+            raise GridError(f"{said}: give a file of three axes (x, y, z)")
         if kept is None:
             by_length = sorted(range(len(shape)), key=lambda axis: (shape[axis], axis))
             kept = by_length[-3:]
@@ -146,7 +148,7 @@ class Volume:
     def shape(self) -> tuple[int, ...]:
         """Number of samples along each axis in space."""
         kept = (count for count, at in zip(self.stored, self.index) if isinstance(at, slice))
-        return tuple(map(int, kept)) if len(self.stored) >= 3 else tuple(self.stored)
+        return tuple(map(int, kept))
 
     def read(self) -> NDArray[Any]:
         """Return the samples along the axes in space."""
@@ -179,11 +181,16 @@ def triple(numbers: Any) -> Triple:
 
 
 def from_affine(matrix: NDArray[Any]) -> dict[str, Any]:
-    """Split an affine (3 or 4, 4) into spacing, origin and direction of the array's axes."""
+    """Split an affine, or the columns that are no origin, into spacing, origin and direction."""
     columns = np.asarray(matrix, np.float64)[:3, :3]
     lengths = np.linalg.norm(columns, axis=0)
-    direction = columns / np.where(lengths > 0, lengths, 1)
-    return {"spacing": triple(lengths), "origin": triple(matrix[:3, 3]), "direction": direction}
+    place = {"spacing": triple(lengths), "direction": columns / np.where(lengths > 0, lengths, 1)}
+    return {**place, "origin": triple(matrix[:3, 3]) if matrix.shape[1] > 3 else None}
+
+
+def kept_of(index: Index) -> list[int]:
+    """Return the axes of an array that are in space."""
+    return [axis for axis, at in enumerate(index) if isinstance(at, slice)]
 
 
 def axes_direction(axes: str) -> NDArray[np.float64]:

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
+from math import prod
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import FileError, GridError, seen
 from ...grid.samples import UNNAMED, even_steps
-from . import Index, Request, axes_direction, triple
+from . import Index, Request, axes_direction, kept_of, triple
 
-SPACE = "xyz"
+SPACE = ("x", "y", "z")
 STATED = ("spacing", "origin", "direction", "element_size_um")
 SIZES = re.compile(r"resolution|offset|voxel|pixel|extent|ext(min|max)\d|spacing|origin|size", re.I)
 """Names of attributes that may state sizes, of which only ``STATED`` are read."""
@@ -30,6 +31,11 @@ class Axis(NamedTuple):
     start: float | None = None  # position of the first sample
     alias: str = ""  # another name, by an attribute of its coordinates
     is_down: bool = False  # the file's coordinates grow downwards; step and start are those upwards
+
+
+def in_unit(unit: str) -> tuple[str, ...]:
+    """Return a note on the unit that a file states, if it does."""
+    return (f"lengths are in the unit that it states, {unit}",) * bool(unit)
 
 
 def one_unit(units: Sequence[str]) -> tuple[bool, tuple[str, ...]]:
@@ -74,21 +80,18 @@ def placed(
     ``order`` is that of axes that have no names. With ``beside``, attributes elsewhere in the file,
     notes say what was not taken from the file.
     """
-    if len(shape) < len(SPACE):
-        raise GridError(f"values have shape {tuple(shape)}: give three axes (x, y, z)")
     order = order or request.axes
     names = ["" if axis.name in UNNAMED else axis.name.strip().lower() for axis in axes]
-    aliases = [(axis.alias or name).strip().lower() for axis, name in zip(axes, names)]
-    names = aliases if _are_space(aliases) and not _are_space(names) else names
-    in_space = [n for n, name in enumerate(names) if name in tuple(SPACE)]
-    index = request.pick(shape, in_space if _are_space(names) else None, names)
-    kept = [n for n, at in enumerate(index) if isinstance(at, slice)]
+    aliases = [axis.alias.strip().lower() or name for axis, name in zip(axes, names)]
+    names = names if _space_in(names) or not _space_in(aliases) else aliases
+    index = request.pick(shape, _space_in(names), names)
+    kept = kept_of(index)
     named, notes = [names[axis] for axis in kept], list[str]()
-    if order == "zyx" and _are_space(names):
-        order = "".join(named)
-    elif any(named) and not _are_space(names):
+    if any(named) and not _space_in(names):
         listed = ", ".join(name or "?" for name in named)
         notes = [f"its axes are named {listed}: taken as {', '.join(order)}"]
+    elif any(named) and order == "zyx":
+        order = "".join(named)
     elif beside is not None and not any(named) and not request.axes_given:
         notes = ["its axes have no names: taken as z, y, x (--axes xyz is the other order)"]
     world = [axes[kept[order.index(name)]] for name in SPACE]
@@ -113,10 +116,7 @@ def placed(
         direction = said.reshape(3, 3) @ direction
     spacing = _stated(attributes, "element_size_um", spacing)
     if beside is not None and spacing is None:
-        unread = {n: each for n, each in {**beside, **attributes}.items() if SIZES.search(n)}
-        listed = ", ".join(f"{n} {seen(_plain(x))}" for n, x in unread.items() if n not in STATED)
-        note = f"it states {listed}, which is not read (give --spacing and --origin)"
-        told += (note,) * bool(listed)
+        told += _unread({**beside, **attributes})
     return {
         "spacing": spacing,
         "origin": _stated(attributes, "origin", starts),
@@ -124,19 +124,27 @@ def placed(
     }
 
 
-def _plain(said: Any) -> Any:
-    """Return an attribute as it is shown: letters that are stored one by one are a word."""
-    array = np.asarray(said)
-    if array.dtype.kind == "S":
-        return b"".join(array.ravel().tolist()).decode(errors="replace")
-    return array.tolist()
+def _unread(attributes: dict[str, Any]) -> tuple[str, ...]:
+    """Return a note on attributes that may state sizes; letters stored one by one are a word."""
+    unread = []
+    for name, said in attributes.items():
+        if SIZES.search(name) and name not in STATED:
+            array = np.asarray(said)
+            letters = array.ravel().tolist() if array.dtype.kind == "S" else None
+            word = b"".join(letters).decode(errors="replace") if letters else array.tolist()
+            unread.append(f"{name} {seen(word)}")
+    listed = ", ".join(unread)
+    return (f"it states {listed}, which is not read (give --spacing and --origin)",) * bool(listed)
 
 
-def _are_space(names: Sequence[str]) -> bool:
-    return sorted(name for name in names if name in tuple(SPACE)) == list(SPACE)
+def _space_in(names: Sequence[str]) -> list[int] | None:
+    """Return which names are x, y and z, None unless each is there once."""
+    found = [n for n, name in enumerate(names) if name in SPACE]
+    return found if sorted(names[n] for n in found) == list(SPACE) else None
 
 
 def _stated(attributes: dict[str, Any], name: str, default: Any) -> Any:
+    """Return three numbers that an attribute states."""
     if name not in attributes:
         return default
     try:
@@ -147,16 +155,18 @@ def _stated(attributes: dict[str, Any], name: str, default: Any) -> Any:
 
 
 def stored(
-    values: Any, attributes: dict[str, Any], none: Any = None, absent: int = 0, fill: Any = None
+    values: Any, attributes: dict[str, Any], none: Any = None, chunks: int = 0, fill: Any = None
 ) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
     """Return how a ``Volume`` loads an array of a file, its shape, and the type of the values.
 
     By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
-    plus ``add_offset``; ``none``, or ``_FillValue``, is no value. Chunks that are not stored,
-    ``absent`` in number, read as ``fill``: 0 is the background of masks and densities, but the
-    surface of signed distances, which are refused.
+    plus ``add_offset``; ``none``, or ``_FillValue``, is no value. If it has chunks, and fewer than
+    all are stored (``chunks``), the others read as ``fill``: 0 is the background of masks and
+    densities, but the surface of signed distances, which are refused.
     """
-    dtype = np.dtype(values.dtype)
+    dtype, absent = np.dtype(values.dtype), 0
+    if sizes := getattr(values, "chunks", None):
+        absent = prod(-(-n // of_chunk) for n, of_chunk in zip(values.shape, sizes)) - chunks
     is_packed = "scale_factor" in attributes or "add_offset" in attributes
     is_packed |= dtype.kind == "f" and "_FillValue" in attributes
     factor = float(np.ravel(attributes.get("scale_factor", 1))[0])
@@ -166,7 +176,7 @@ def stored(
 
     def load(index: Index) -> Any:
         numbers = np.asarray(values[index])
-        if absent and not fill and dtype.kind in "fi" and (numbers < 0).any():
+        if absent > 0 and not fill and dtype.kind in "fi" and (numbers < 0).any():
             raise GridError(
                 f"{absent:,} of its chunks are not stored and read as 0, which is the surface: "
                 "write them all, or give the array a fill value other than 0 (NaN for unknown)"

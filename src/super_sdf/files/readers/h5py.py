@@ -6,7 +6,6 @@ Axes are (z, y, x) unless dimension labels, scales, ``axistags`` or ``--axes`` s
 from __future__ import annotations
 
 import json
-from math import prod
 from typing import Any
 
 from ...errors import FileError
@@ -65,28 +64,25 @@ def _axes(values: Any) -> list[Axis]:
         places, about = None, {}
         if scale is not None and scale.shape == (count,):
             about = dict(scale.attrs)
-            _check_own(scale)
-            if NO_COORDINATES not in bytes(about.get("NAME", b"")):
-                places = scale[:]
+            is_bare = NO_COORDINATES in bytes(about.get("NAME", b""))
+            places = None if is_bare else _check_own(scale)[:]
         axes.append(measured(name, places, about))
     return axes
 
 
-def _check_own(values: Any) -> None:
-    """Raise FileError if the numbers of a dataset are in other files, which may be any."""
+def _check_own(values: Any) -> Any:
+    """Return a dataset; FileError if its numbers are in other files, which may be any."""
     if values.is_virtual or values.external:
         raise FileError(f"the numbers of {values.name} are in other files: save them in this one")
+    return values
 
 
 def _volume_of(values: Any, place: dict[str, Any]) -> Volume:
     """Return a dataset at its place."""
     _check_own(values)
-    absent, about = 0, {}
-    if values.chunks:
-        about = {"chunks": list(values.chunks)}
-        total = prod(-(-size // chunk) for size, chunk in zip(values.shape, values.chunks))
-        absent = total - values.id.get_num_chunks()
-    numbers = stored(values, dict(values.attrs), absent=absent, fill=values.fillvalue)
+    chunks = values.id.get_num_chunks() if values.chunks else 0
+    numbers = stored(values, dict(values.attrs), chunks=chunks, fill=values.fillvalue)
+    about = {"chunks": list(values.chunks)} if values.chunks else {}
     return Volume(*numbers, **place, about=about)
 
 

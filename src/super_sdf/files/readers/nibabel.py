@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import GridError
 from ...options import RAS
 from ..formats import check_beside
 from . import LABELS, XYZ, Request, Volume, from_affine, triple
+from .axes import in_unit
 
 PAIRS = (".img", ".IMG", ".img.gz")
 UNITS = {1: "metre", 3: "micrometre"}  # of lengths, but for millimetres
@@ -35,8 +35,7 @@ def read_nifti(request: Request) -> Volume:
     scaled by the slope and intercept of the header.
     """
     image, header = _load(request)
-    unit = UNITS.get(int(header["xyzt_units"]) & 7)
-    image["notes"] = (f"lengths are in the unit that it states, {unit}",) * bool(unit)
+    image["notes"] = in_unit(UNITS.get(int(header["xyzt_units"]) & 7, ""))
     if int(header["intent_code"]) == INTENT_LABEL:
         image["hint"] = LABELS
     codes = int(header["sform_code"]), int(header["qform_code"])
@@ -77,15 +76,13 @@ def read_analyze(request: Request) -> Volume:
 
 
 def _load(request: Request) -> tuple[dict[str, Any], Any]:
-    """Return how an image is loaded, its shape, type and index; and its header."""
+    """Return what a ``Volume`` says of an image beside its place, and the header."""
     import nibabel
 
     image: Any = nibabel.load(request.path, mmap=False)
     proxy, shape, dtype = image.dataobj, image.shape, image.get_data_dtype()
-    if len(shape) < 3:
-        raise GridError(f"{request.path} has shape {shape}: give a file of three axes (x, y, z)")
+    index = request.pick(shape, kept=(0, 1, 2))
     if (getattr(proxy, "slope", 1), getattr(proxy, "inter", 0)) != (1, 0):
         dtype = np.asarray(proxy[(slice(0, 1),) * len(shape)]).dtype
-    index = request.pick(shape, kept=(0, 1, 2))
-    whole = {"load": lambda at: np.asarray(proxy[at]), "stored": shape, "dtype": dtype}
-    return {**whole, "index": index}, image.header
+    about = dict(load=lambda at: proxy[at], stored=shape, dtype=dtype, index=index)
+    return about, image.header

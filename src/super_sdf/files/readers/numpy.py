@@ -77,13 +77,11 @@ def read_npz(request: Request) -> Volume:
         with zipped.open(info) as file:
             headers[key] = _header(file, f"{request.path}[{key}]")
     shapes = {key: headers[key][0] for key in keys if key in headers}
-    if "values" in keys and request.member is None:
-        name = "values"
-    elif max(map(len, shapes.values()), default=0) < 3:
+    is_plain = "values" in keys and request.member is None
+    if not is_plain and max(map(len, shapes.values()), default=0) < 3:
         held = ", ".join(keys) or "nothing"
         raise FileError(f"{request.path} has no key 'values' (it holds {held})")
-    else:
-        name = request.choose_array(shapes, "array of three axes")
+    name = "values" if is_plain else request.choose_array(shapes, "array of three axes")
     place: dict[str, Any] = {}
     for key in set(PLACE) & set(keys):
         place[key] = archive[key]
@@ -95,11 +93,7 @@ def read_npz(request: Request) -> Volume:
 
 
 def _blocks_of_open3d(archive: Any) -> Volume:
-    """Return the truncated distances in cubes of voxels, at the keys of a hash map.
-
-    Voxel (x, y, z) of the block with key k is at ``voxel_size * (k * resolution + (x, y, z))``;
-    voxels without weight, and blocks that are missing, are unknown.
-    """
+    """Return the truncated distances in cubes of voxels: without weight, they are unknown."""
     keys, step, resolution, *numbers = (archive[name] for name in OPEN3D)
     values, weights = (archive[f"value_{int(number.item()):03d}"] for number in numbers)
     low, side, step = keys.min(0).astype(np.int64), int(resolution.item()), float(step.item())
@@ -130,10 +124,9 @@ def read_sdf(request: Request) -> Volume:
             x, y, z, spacing = (float(word) for word in words[3:7])
             values = np.array(words[7:], np.float32).reshape(shape[::-1]).T
         except (ValueError, OverflowError):
-            raise FileError(
-                f"{path} is no .sdf grid, or truncated: SDFGen's text begins with three sizes, the "
-                "origin and the spacing, and a value for each sample follows"
-            ) from None
+            said = "three sizes, the origin and the spacing, and a value for each sample follows"
+            said = f"or truncated: SDFGen's text begins with {said}"
+            raise FileError(f"{path} is no .sdf grid, {said}") from None
         return Volume(*of_array(values), (spacing,) * 3, (x, y, z))
     else:
         fields = SDF_HEADER.unpack(beginning[: SDF_HEADER.size].ljust(SDF_HEADER.size, b"\0"))

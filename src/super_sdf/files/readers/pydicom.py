@@ -7,7 +7,7 @@ a place, and takes missing slices for evenly spaced ones.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +25,6 @@ PREAMBLE = 128  # bytes before the mark DICM, mostly 0
 BEYOND = 2  # empty slices on both sides of those that a segmentation stores
 BITS, LABEL_MAP = "1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"
 """The two classes of segmentations: a frame is of one segment, or holds the numbers of all."""
-
 Image = tuple[Path, Any]  # a file and its header
 
 
@@ -40,6 +39,12 @@ class _Slice(NamedTuple):
     spacing: NDArray[np.float64]  # of rows and of columns
     scale: tuple[float, float]
     segment: int
+
+    def place(self, origin: Any, step: float, normal: Any) -> dict[str, Any]:
+        """Return what a ``Volume`` says of the place of slices that begin at an origin."""
+        spacing = triple((*self.spacing[::-1], step))
+        direction = np.column_stack([*self.across, normal])
+        return {"spacing": spacing, "origin": triple(origin), "direction": direction, "space": LPS}
 
 
 def read_dicom(request: Request) -> Volume:
@@ -66,10 +71,7 @@ def read_dicom(request: Request) -> Volume:
 
 
 def _images_in(path: Path) -> tuple[dict[str, list[Image]], tuple[str, ...]]:
-    """Return the images of each series in a folder, or of a file, and notes on what is left out.
-
-    Files of other kinds are left out. FileError names a damaged image.
-    """
+    """Return the images of each series in a folder, or of a file, and notes on what is left out."""
     import pydicom
 
     series: dict[str, list[Image]] = {}
@@ -102,9 +104,9 @@ def _pixels(path: Path, frame: int | None = None) -> NDArray[Any]:
 
     try:
         return np.asarray(pixel_array(path, index=frame))
+    except MemoryError:
+        raise
     except Exception as error:
-        if isinstance(error, MemoryError):
-            raise
         raise FileError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
 
 
@@ -142,27 +144,22 @@ def _of_slices(slices: list[_Slice], notes: tuple[str, ...]) -> Volume:
             plane[:] = values if is_plain else values * each.scale[0] + each.scale[1]
         return planes.T
 
-    direction = np.column_stack([*first.across, shift / step])
-    place = triple((*first.spacing[::-1], step)), triple(corners[0]), direction
-    shape = (*first.shape[::-1], len(slices))
-    return Volume(load, shape, dtype, *place, space=LPS, notes=notes)
+    place = first.place(corners[0], step, shift / step)
+    return Volume(load, (*first.shape[::-1], len(slices)), dtype, **place, notes=notes)
 
 
 def _of_segments(
     path: Path, header: Any, labels: dict[int, str], chosen: list[int], notes: tuple[str, ...]
 ) -> Volume:
-    """Return the numbers of the segments, or 1 in those ``chosen``; frames left out are 0.
-
-    A fractional segment that is chosen comes as its fractions.
-    """
-    frames, shared = list(_slices([(path, header)])), header.SharedFunctionalGroupsSequence
+    """Return the numbers of the segments, or 1 (or the fractions) in those ``chosen``; else 0."""
+    frames = list(_slices([(path, header)]))
     chosen = list(labels) if len(labels) == 1 else chosen
     first = frames[0]
     normal = np.cross(*first.across)
     heights = np.array([each.corner @ normal for each in frames])
     gaps = np.diff(np.unique(heights.round(4)))
-    measures = [*shared, header], "PixelMeasuresSequence"
-    between, thick = (_stated(*measures, n) for n in ("SpacingBetweenSlices", "SliceThickness"))
+    groups = [*_items(header.SharedFunctionalGroupsSequence), header]
+    between, thick = (_stated(groups, n) for n in ("SpacingBetweenSlices", "SliceThickness"))
     step = float(between or (gaps.min() if len(gaps) else thick) or 0)
     if not step > 0:
         raise GridError("it states neither the spacing between slices nor their thickness")
@@ -193,11 +190,10 @@ def _of_segments(
         return planes.T
 
     origin = first.corner + normal * (heights.min() - heights[0] - BEYOND * step)
-    place = triple((*first.spacing[::-1], step)), triple(origin)
     names: Names = {number: (label, None) for number, label in labels.items()}
     return Volume(
-        *(load, shape[::-1], np.dtype(kind), *place, np.column_stack([*first.across, normal])),
-        space=LPS,
+        *(load, shape[::-1], np.dtype(kind)),
+        **first.place(origin, step, normal),
         notes=notes,
         hint=DENSITY if is_fraction else "" if chosen else LABELS,
         names={1: names[chosen[0]]} if chosen else names,
@@ -206,6 +202,7 @@ def _of_segments(
 
 
 def _slices(images: list[Image]) -> Iterator[_Slice]:
+    """Yield the slices of images, one for each frame."""
     for path, header in images:
         if header.get("SamplesPerPixel", 1) != 1 or "ModalityLUTSequence" in header:
             raise GridError(f"{path.name} has colours or a table of values: give grey images")
@@ -215,28 +212,28 @@ def _slices(images: list[Image]) -> Iterator[_Slice]:
                 f"{path.name} has {header.NumberOfFrames} frames without a place each: save it as "
                 "an enhanced image, or as NIfTI"
             )
-        shared = list(header.get("SharedFunctionalGroupsSequence") or ())
+        shape = header.Rows, header.Columns
+        shared = _items(header.get("SharedFunctionalGroupsSequence"))
         for index, frame in enumerate(frames):
-            groups = [frame, *shared, header]
-            corner = _stated(groups, "PlanePositionSequence", "ImagePositionPatient")
-            across = _stated(groups, "PlaneOrientationSequence", "ImageOrientationPatient")
-            steps = _stated(groups, "PixelMeasuresSequence", "PixelSpacing")
-            if not (corner and across and steps):
+            groups = [*_items([frame] if frame is not header else ()), *shared, header]
+            names = "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"
+            place = [_stated(groups, name) for name in names]
+            if not all(place):
                 raise GridError(f"{path.name} states no place: it is no slice of a volume")
-            slope, intercept = (
-                _stated(groups, "PixelValueTransformationSequence", f"Rescale{name}")
-                for name in ("Slope", "Intercept")
-            )
-            segment = _stated(groups, "SegmentIdentificationSequence", "ReferencedSegmentNumber")
-            place = (np.array(numbers, np.float64) for numbers in (corner, across, steps))
-            corner, across, steps = place
-            scale = (1.0 if slope is None else float(slope), float(intercept or 0))
-            shape = (header.Rows, header.Columns)
-            about = shape, corner, across.reshape(2, 3), steps, scale, int(segment or 0)
+            corner, across, steps = (np.array(numbers, np.float64) for numbers in place)
+            slope, intercept = _stated(groups, "RescaleSlope"), _stated(groups, "RescaleIntercept")
+            scale = 1.0 if slope is None else float(slope), float(intercept or 0)
+            segment = int(_stated(groups, "ReferencedSegmentNumber") or 0)
+            about = shape, corner, across.reshape(2, 3), steps, scale, segment
             yield _Slice(path, index, *about)
 
 
-def _stated(groups: list[Any], sequence: str, name: str) -> Any:
-    """Return an element of the first group that has it, in a sequence or plainly; else None."""
-    among = (each for group in groups for each in (*group.get(sequence, ()), group))
-    return next((each[name].value for each in among if name in each), None)
+def _items(groups: Sequence[Any] | None) -> list[Any]:
+    """Return what the sequences of functional groups hold."""
+    each_of = (each for group in groups or () for each in group if each.VR == "SQ")
+    return [item for each in each_of for item in each.value or ()]
+
+
+def _stated(groups: list[Any], name: str) -> Any:
+    """Return an element of the first group that has it, else None."""
+    return next((group[name].value for group in groups if name in group), None)

@@ -55,22 +55,16 @@ def read_tiff(request: Request) -> Volume:
 
 def _pixel_sizes(file: Any) -> tuple[tuple[float, float] | None, str]:
     """Return the sizes of a pixel by the resolution, None if not stated, and their unit."""
-    tags = file.pages[0].tags
+    tags = {tag.name: tag.value for tag in file.pages[0].tags}
     units = {2: "inch", 3: "cm", 4: "mm", 5: "µm"}
-    number = int(tags["ResolutionUnit"].value) if "ResolutionUnit" in tags else 2  # the standard
-    if "XResolution" not in tags or "YResolution" not in tags:
-        return None, units.get(number, "")
-    stated = (tags[name].value for name in ("XResolution", "YResolution"))  # pixels, units
-    x, y = (units / pixels if pixels else 0.0 for pixels, units in stated)
-    return ((x, y) if x > 0 and y > 0 else None), units.get(number, "")
+    unit = units.get(int(tags.get("ResolutionUnit", 2)), "")  # 2 by the standard
+    stated = (tags.get(name, (0, 1)) for name in ("XResolution", "YResolution"))  # pixels, units
+    x, y = (count / pixels if pixels else 0.0 for pixels, count in stated)
+    return ((x, y) if x > 0 and y > 0 else None), unit
 
 
 def _imagej_axes(file: Any, sizes: tuple[float, float] | None, printed: str) -> dict[str, Axis]:
-    """Return the axes of an ImageJ stack by their names; none if it is not calibrated.
-
-    What is not stated holds as in ImageJ: a spacing of z of 1, the unit of the resolution, that of
-    x for all axes, and origins of 0 beside others, which are in pixels.
-    """
+    """Return the axes of an ImageJ stack by their names, with its defaults; none if not stated."""
     metadata: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
     if not sizes or not (file.is_imagej or "spacing" in metadata):
         return {}
@@ -84,17 +78,15 @@ def _imagej_axes(file: Any, sizes: tuple[float, float] | None, printed: str) -> 
     is_bare = not any(unit and not unit.startswith("pixel") for unit in units)
     if is_bare and "spacing" not in metadata and sizes == (1, 1):
         return {}
-    starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]
+    starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]  # in pixels
     places = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
     return {each[0]: Axis(*each) for each in zip("xyz", units, steps, places)}
 
 
 def _ome_axes(ome: ElementTree.Element) -> dict[str, Axis]:
-    stated: dict[str, Axis] = {}
+    """Return those axes by their names whose spacing the metadata of OME states."""
     pixels = ome.find(".//{*}Pixels")
     about = {} if pixels is None else pixels.attrib
-    for axis in "XYZ":
-        size, unit = about.get(f"PhysicalSize{axis}"), about.get(f"PhysicalSize{axis}Unit", "µm")
-        if size and float(size) > 0:
-            stated[axis.lower()] = Axis(axis.lower(), unit, float(size))
-    return stated
+    sizes = {axis: float(about.get(f"PhysicalSize{axis.upper()}") or 0) for axis in "xyz"}
+    units = {axis: about.get(f"PhysicalSize{axis.upper()}Unit", "µm") for axis in "xyz"}
+    return {axis: Axis(axis, units[axis], size) for axis, size in sizes.items() if size > 0}

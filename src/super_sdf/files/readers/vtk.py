@@ -56,11 +56,12 @@ def read_vtk(request: Request) -> Volume:
         if len(text[start.start() if start else 0 :].split()) < promised:
             raise FileError(f"it is truncated: fewer values follow than the {promised:,} promised")
     # what has several numbers a sample, and VTK's own marks, is read only if it is named
-    plain = []
-    for name, (array, _) in arrays.items():
-        is_mark = name.removeprefix("CellData/") in MARKS
-        if name == request.member or (array.GetNumberOfComponents() == 1 and not is_mark):
-            plain.append(name)
+    plain = [
+        name
+        for name, (array, _) in arrays.items()
+        if name == request.member
+        or (array.GetNumberOfComponents() == 1 and name.removeprefix("CellData/") not in MARKS)
+    ]
     name = request.choose(plain or list(arrays), "array of points or cells")
     return _volume_of(image, *arrays[name], f"its array {name!r}", *request.numbers)
 
@@ -96,15 +97,11 @@ def _arrays(image: Any) -> dict[str, tuple[Any, bool]]:
 
 
 def _volume_of(image: Any, array: Any, of_points: bool, what: str, *numbers: int) -> Volume:
-    """Return an array at the points of an image, or at the centres of its cells.
-
-    Point (i, j, k) of the extent, which need not begin at 0, is at
-    ``origin + direction @ (spacing * (i, j, k))``.
-    """
+    """Return an array at the points of an image, or at the centres of its cells."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     extent = np.array(image.GetExtent()) if hasattr(image, "GetExtent") else np.zeros(6, int)
-    direction, first = XYZ, extent[::2]
+    direction, first = XYZ, extent[::2]  # which need not be 0
     if image.IsA("vtkImageData"):
         matrix = image.GetDirectionMatrix()
         direction = np.array([[matrix.GetElement(i, j) for j in range(3)] for i in range(3)])

@@ -12,7 +12,6 @@ import os
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +30,7 @@ CODECS = {
     *("adler32", "crc32", "fletcher32", "jenkins_lookup3"),
     *("astype", "bitround", "delta", "fixedscaleoffset", "packbits", "quantize", "shuffle"),
 }
+TRANSFORMS = "coordinateTransformations"
 
 Document = dict[str, Any]
 
@@ -50,32 +50,30 @@ def read_zarr(request: Request) -> Volume:
         said = f"an array of {array.ndim} axes has the axes {listed}"
         raise GridError(f"{said}: give an image of z, y, x")
     place = placed(request, axes, attributes, array.shape)
-    total = prod(-(-size // chunk) for size, chunk in zip(array.shape, array.chunks))
-    absent = max(total - array.nchunks_initialized, 0)
     none = array.fill_value if version == 2 else None  # as xarray takes it
+    numbers = stored(array, attributes, none, array.nchunks_initialized, array.fill_value)
     sizes = {name: getattr(array, name, None) for name in ("chunks", "shards")}
     about = {"zarr format": version, **{name: list(size) for name, size in sizes.items() if size}}
-    numbers = stored(array, attributes, none, absent, array.fill_value)
     return Volume(*numbers, **place, about=about)
 
 
 def _nodes_of(request: Request) -> dict[str, Document]:
-    """Return the metadata of the arrays and groups of a store, which may not lead out of it.
+    """Return the metadata of the arrays and groups of a store, with attributes as in version 3.
 
-    It is read without zarr, and that of version 2 has its attributes as that of version 3 has.
+    It is read without zarr, and no link may lead out of the store.
     """
     path, nodes = request.path, dict[str, Document]()
     if is_zip := not path.is_dir():
         archive = request.files.enter_context(zipfile.ZipFile(path))
         keys = archive.namelist()
     else:
-        listed = (Path(at, n) for at, inner, names in os.walk(path) for n in (*inner, *names))
+        listed = [Path(at, n) for at, inner, names in os.walk(path) for n in (*inner, *names)]
         keys = [each.relative_to(path).as_posix() for each in listed]
-        for key in keys:
-            if (path / key).is_symlink():
+        for key, each in zip(keys, listed):
+            if each.is_symlink():
                 check_beside(path, key)
-            elif not (path / key).is_dir() and not (path / key).is_file():
-                check_regular_file(path / key)
+            elif not each.is_dir() and not each.is_file():
+                check_regular_file(each)
     for key in keys:
         node, _, name = key.rpartition("/")
         if name in METADATA:
@@ -116,6 +114,7 @@ def _open(nodes: dict[str, Document], path: str, request: Request) -> Any:
 
 
 def _codecs_of(about: Document) -> Iterator[str]:
+    """Yield the names of the codecs in metadata, those within a codec, too."""
     for key in ("compressor", "filters", "codecs", "index_codecs"):
         listed: Any = about.get(key) or ()
         for codec in listed if isinstance(listed, (list, tuple)) else (listed,):
@@ -145,7 +144,7 @@ def _choose(nodes: dict[str, Document], request: Request) -> str:
 
 def _named_axes(nodes: dict[str, Document], name: str, array: Any, request: Request) -> list[Axis]:
     """Return the axes of an array by the names of its dimensions, and by arrays of these names."""
-    said = getattr(getattr(array, "metadata", None), "dimension_names", None)
+    said = getattr(array.metadata, "dimension_names", None)
     names = [str(each or "") for each in said or array.attrs.get("_ARRAY_DIMENSIONS") or ()]
     names = names if len(names) == array.ndim else [""] * array.ndim
     group, axes = name.rpartition("/")[0], []
@@ -158,10 +157,7 @@ def _named_axes(nodes: dict[str, Document], name: str, array: Any, request: Requ
 
 
 def _image_axes(nodes: dict[str, Document], name: str) -> list[Axis] | None:
-    """Return the axes of an array that is a level of an image of OME, None if it is of none.
-
-    The transformations of a level come first, then those of the whole image.
-    """
+    """Return the axes of an array that is a level of an image of OME, None if it is of none."""
     parts = name.split("/") if name else []
     levels = (
         (image, level)
@@ -170,26 +166,24 @@ def _image_axes(nodes: dict[str, Document], name: str) -> list[Axis] | None:
         for level in image["datasets"]
         if str(level["path"]).strip("/") == "/".join(parts[depth:])
     )
-    image, level = next(levels, (None, None))
-    if image is None or level is None:
+    if not (found := next(levels, None)):
         return None
-    named = [
-        axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", "zyx")
-    ]
-    key = "coordinateTransformations"
-    steps = [*level.get(key, ()), *image.get(key, ())]
-    scale, shift = np.ones(len(named)), np.zeros(len(named))
+    image, level = found
+    axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", "zyx")]
+    steps = [*level.get(TRANSFORMS, ()), *image.get(TRANSFORMS, ())]  # in this order
+    scale, shift = np.ones(len(axes)), np.zeros(len(axes))
     for step in steps:
         kind = str(step.get("type"))
         numbers = np.asarray(step.get(kind, ()), np.float64)
-        if kind not in ("identity", "scale", "translation"):
-            raise GridError(f"one of its {key} has the type {kind!r}: give scale or translation")
         if kind == "scale":
             scale, shift = scale * numbers, shift * numbers
         elif kind == "translation":
             shift = shift + numbers
-    places = zip(scale.tolist(), shift.tolist()) if steps else [(None, None)] * len(named)
+        elif kind != "identity":
+            said = f"one of its {TRANSFORMS} has the type {kind!r}"
+            raise GridError(f"{said}: give scale or translation")
+    places = zip(scale.tolist(), shift.tolist()) if steps else [(None, None)] * len(axes)
     return [
         Axis(str(axis.get("name", "")).lower(), str(axis.get("unit") or ""), *place)
-        for axis, place in zip(named, places)
+        for axis, place in zip(axes, places)
     ]
