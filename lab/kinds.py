@@ -180,7 +180,7 @@ def spline_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
 def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
     """Mesh the values with super-sdf, as a user of the command would.
 
-    If the default call is refused, and the kind is scaled, ``--field scaled`` is tried. ``facts``
+    If the default call is refused, and the kind is scaled, ``--field smooth`` is tried. ``facts``
     has what the values were taken as and whether the user had to say so, or why they were refused.
     Without a spacing the mesh is in units of the values.
     """

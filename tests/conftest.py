@@ -40,6 +40,12 @@ def ball(n: int = 20, radius: float = 6.0, shape: tuple[int, int, int] | None = 
     return SdfGrid(values.astype(np.float32), (1.0, 1.0, 1.0))
 
 
+def cut_ball() -> SdfGrid:
+    """A ball that leaves its grid on three sides, with voxels inside that have no block."""
+    ijk = np.indices((14, 15, 16)).astype(np.float64)
+    return SdfGrid.trusted(np.linalg.norm(ijk - 2.3, axis=0) * 0.3 - 1.8, 0.3, (1.0, 2.0, 3.0))
+
+
 def walled(values: np.ndarray) -> np.ndarray:
     """Make the outer two layers of a field as far outside as anything, so no surface leaves."""
     out = np.full_like(values, np.abs(values).max() + 1)

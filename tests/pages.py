@@ -5,14 +5,13 @@ import re
 from pathlib import Path
 
 import numpy as np
+from solids import box_distance
 
 
 def wedge(n=24):
     """Distances to a box with sides of three lengths, off the middle, in spacings."""
-    ijk = np.indices((n, n, n)) - np.array([11.3, 12.1, 11.7])[:, None, None, None]
-    away = np.abs(ijk) - np.array([8.2, 5.3, 3.1])[:, None, None, None]
-    outside = np.linalg.norm(np.maximum(away, 0), axis=0)
-    return (outside + np.minimum(away.max(0), 0)).astype(np.float32)
+    ijk = np.moveaxis(np.indices((n, n, n)), 0, -1)
+    return box_distance(ijk - [11.3, 12.1, 11.7], [8.2, 5.3, 3.1]).astype(np.float32)
 
 
 def blocks(page):

@@ -153,14 +153,15 @@ def slices_of(affine: np.ndarray, **about: Any) -> list[pydicom.Dataset]:
     }
     images = []
     for k in range(SIZES[2]):
-        images.append(holding(pydicom.Dataset(), **common, PixelData=stored[:, :, k].T.tobytes()))
+        images.append(holding(**common, PixelData=stored[:, :, k].T.tobytes()))
         place = affine[:3, 3] + affine[:3, 2] * k
         images[-1].ImagePositionPatient = np.round(place, 8).tolist()
     return images
 
 
-def holding(dataset: pydicom.Dataset, **values: Any) -> pydicom.Dataset:
+def holding(dataset: pydicom.Dataset | None = None, **values: Any) -> pydicom.Dataset:
     """Return a dataset with these values; a dataset among them is a sequence of one."""
+    dataset = pydicom.Dataset() if dataset is None else dataset
     for name, value in values.items():
         setattr(dataset, name, [value] if isinstance(value, pydicom.Dataset) else value)
     return dataset
@@ -239,23 +240,20 @@ def text_sdf(affine: np.ndarray = CUBES) -> str:
 def save(name: str, affine: np.ndarray = AFFINE) -> None:
     """Write the part in the format of the name."""
     suffix = Path(name.removesuffix(".gz")).suffix
-    if name in PLACED:
-        PLACED[name](name, affine)
-    elif suffix == ".tif":
-        tifffile.imwrite(name, sampled(affine).T, photometric="minisblack")
-    elif suffix == ".h5":
+    if suffix == ".h5" and name not in PLACED:
         with h5py.File(name, "w") as file:
             file["field"] = sampled(affine).T
+    elif suffix == ".tif":
+        tifffile.imwrite(name, sampled(affine).T, photometric="minisblack")
     elif suffix == ".vdb":
         Path(name).write_bytes((DATA / "two-balls.vdb").read_bytes())
     elif suffix == ".sdf":
         Path(name).write_text(text_sdf())
-    elif suffix in (".mrc", ".map"):
-        save_mrc(name, affine)
-    elif suffix == ".vtk":
-        save_vtk(name, affine)
     elif suffix == ".nc":
-        old = {"format": "NETCDF3_CLASSIC"} if "3" in name else {}
-        array_of().to_netcdf(name, engine="netcdf4", **old)
-    else:
+        version = "NETCDF3_CLASSIC" if "3" in name else "NETCDF4"
+        array_of().to_netcdf(name, engine="netcdf4", format=version)
+    elif suffix == ".mat":
         save_mat(name, d=sampled(affine))
+    else:
+        others = {".mrc": save_mrc, ".map": save_mrc, ".vtk": save_vtk}
+        (PLACED.get(name) or others[suffix])(name, affine)

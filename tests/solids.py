@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lab.surfaces import isosurface
 from super_sdf import Mesh, write_mesh
@@ -12,6 +13,12 @@ from super_sdf import Mesh, write_mesh
 CUBE_CORNERS = "013 032 467 475 045 051 237 276 026 064 157 173"
 CUBE_FACES = np.array([[int(corner) for corner in face] for face in CUBE_CORNERS.split()], np.int32)
 TORUS = 0.3, 0.12  # radii of the circle and of the tube
+
+
+def box_distance(points: np.ndarray, half: ArrayLike) -> np.ndarray:
+    """Return the distances of points (..., 3) from a box round the origin with these half sides."""
+    beyond = np.abs(points) - half
+    return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
 
 
 def square(z: float = 0.0) -> Mesh:

@@ -47,20 +47,16 @@ def batch(command):
     return go
 
 
-def contents(folder="out"):
-    """Return the bytes of the files in a folder that are not hidden."""
-    return {
-        name: Path(folder, name).read_bytes() for name in files(folder) if name != "report.jsonl"
-    }
+def contents():
+    """Return the bytes of the outputs."""
+    return {name: Path("out", name).read_bytes() for name in files() if name != "report.jsonl"}
 
 
-def is_made(row, folder="out"):
+def is_made(row):
     """Return whether the files of a row are there with the content that it says."""
     known = {row["out"]: row["output"]} if "sha256" in row["output"] else row["output"]
-    return all(
-        hashlib.sha256(Path(folder, name).read_bytes()).hexdigest() == each["sha256"]
-        for name, each in known.items()
-    )
+    found = {name: hashlib.sha256(Path("out", name).read_bytes()).hexdigest() for name in known}
+    return all(found[name] == each["sha256"] for name, each in known.items())
 
 
 # Files, folders, patterns, lists
@@ -227,31 +223,24 @@ LISTS = {
     + MESH_SUFFIXES[0],
     '{"in": "a.npy", "out": "a/../../b.ply"}': "list.jsonl, line 1: 'out' is 'a/../../b.ply': give",
 }
-
-
-@pytest.mark.parametrize("text", LISTS, ids=range(len(LISTS)))
-def test_a_list_without_meaning_is_refused_before_the_work(command, text):
-    Path("list.jsonl").write_text(text)
-    code, _, err = command("batch", "list.jsonl", "--out", "out")
-    assert code == 2 and err.startswith(f"Error: {LISTS[text]}") and err.count("\n") == 1
-    assert not Path("out").exists()
-
-
 KINDS = ", ".join(GRID_SUFFIXES)
 NO_GRIDS = {
-    "none.npy": "does not exist: give grids, folders, patterns or a list",
-    "in/*.raw": f"holds no grid ({KINDS})",
-    "empty": f"holds no grid ({KINDS})",
-    "odd.raw": f"is neither a grid ({KINDS}) nor a list (.txt, .jsonl)",
+    "none.npy": "none.npy does not exist: give grids, folders, patterns or a list\n",
+    "in/*.raw": f"in/*.raw holds no grid ({KINDS})\n",
+    "empty": f"empty holds no grid ({KINDS})\n",
+    "odd.raw": f"odd.raw is neither a grid ({KINDS}) nor a list (.txt, .jsonl)\n",
 }
 
 
-@pytest.mark.parametrize("argument", NO_GRIDS)
-def test_arguments_that_name_no_grid_are_refused(command, argument):
+@pytest.mark.parametrize("words", [*LISTS, *NO_GRIDS], ids=range(len(LISTS) + len(NO_GRIDS)))
+def test_lists_and_arguments_without_meaning_are_refused_before_the_work(command, words):
+    Path("list.jsonl").write_text(words)
     Path("empty").mkdir()
     Path("odd.raw").write_text("")
-    said = command("batch", "in", argument, "--out", "out")
-    assert said == (2, "", f"Error: {argument} {NO_GRIDS[argument]}\n")
+    given = words if words in NO_GRIDS else "list.jsonl"
+    code, out, err = command("batch", "in/a.npy", given, "--out", "out")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith(f"Error: {(LISTS | NO_GRIDS)[words]}") and not Path("out").exists()
 
 
 def test_odd_files_names_and_folders_fail_alone(batch, monkeypatch):

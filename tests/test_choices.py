@@ -17,6 +17,7 @@ import trimesh
 import xarray
 import zarr
 from conftest import refusal
+from placed import holding
 from pydicom.uid import ExplicitVRLittleEndian
 
 from super_sdf import read_grid
@@ -41,34 +42,35 @@ def read(path: str) -> np.ndarray:
 SHAPE = (5, 7)  # rows, columns: a frame is no whole number of bytes
 
 
-def holding(**values: object) -> pydicom.Dataset:
-    """Return a dataset with these values; a dataset among them is a sequence of one."""
-    dataset = pydicom.Dataset()
-    for name, value in values.items():
-        setattr(dataset, name, [value] if isinstance(value, pydicom.Dataset) else value)
-    return dataset
-
-
 def save_segments(
     path: str, frames: list[tuple[int, float, np.ndarray]], labels: list[str], **about: object
 ) -> None:
     """Write frames, each a segment's number, its height and its mask, along x = -y, y = x."""
     of_frames = [
         holding(
-            SegmentIdentificationSequence=holding(ReferencedSegmentNumber=number),
+            pydicom.Dataset(),
+            SegmentIdentificationSequence=holding(
+                pydicom.Dataset(), ReferencedSegmentNumber=number
+            ),
             PlanePositionSequence=holding(ImagePositionPatient=[1, 2, height]),
         )
         for number, height, _ in frames
     ]
     shared = holding(
-        PlaneOrientationSequence=holding(ImageOrientationPatient=[0, 1, 0, -1, 0, 0]),
-        PixelMeasuresSequence=holding(PixelSpacing=[0.5, 0.25], SpacingBetweenSlices=2),
+        pydicom.Dataset(),
+        PlaneOrientationSequence=holding(
+            pydicom.Dataset(), ImageOrientationPatient=[0, 1, 0, -1, 0, 0]
+        ),
+        PixelMeasuresSequence=holding(
+            pydicom.Dataset(), PixelSpacing=[0.5, 0.25], SpacingBetweenSlices=2
+        ),
     )
     masks = np.array([mask for *_, mask in frames])
     is_packed = masks.dtype == bool
     bits = 1 if is_packed else 8
     pixels = np.packbits(masks, bitorder="little") if is_packed else masks
     image = holding(
+        pydicom.Dataset(),
         SOPClassUID="1.2.840.10008.5.1.4.1.1.66.4",
         SOPInstanceUID="1.2.3.4",
         SeriesInstanceUID="1.2.3",

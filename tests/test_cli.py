@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import sys
 import zipfile
 from pathlib import Path
 
@@ -21,11 +22,9 @@ from super_sdf.options import MESH_FORMATS, OPTIONS, Options
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def here(folder):
     """A folder of its own with a good grid in it."""
-    monkeypatch.chdir(tmp_path)
     np.save("in.npy", ball().values)
-    return tmp_path
 
 
 def test_the_main_job(here, command):
@@ -51,9 +50,14 @@ def test_json_has_options_counts_times_and_findings(here, command):
 
 
 def test_options_reach_the_result(here, command):
-    np.save("out-in.npy", -ball().values)
-    assert command("upsample", "out-in.npy", "a.ply", "--inside", "positive", "--offset", 1)[0] == 0
-    assert trimesh.load("a.ply").extents == pytest.approx([14] * 3, rel=0.01)
+    np.save("out-in.npy", -2 * ball().values)
+    options = ("--inside", "positive", "--offset", 2, "--spacing", 2, "--origin", "1,2,3")
+    code, out, _ = command("upsample", "out-in.npy", "a.ply", *options, "--json")
+    report, mesh = json.loads(out), trimesh.load("a.ply")
+    assert code == 0 and mesh.extents == pytest.approx([28] * 3, rel=0.01)
+    assert mesh.bounds.mean(0) == pytest.approx(np.array([1, 2, 3]) + 2 * 9.63, abs=0.2)
+    assert (report["vertices"], report["triangles"]) == (len(mesh.vertices), len(mesh.faces))
+    np.testing.assert_allclose(report["bounds"], mesh.bounds)
     code, _, err = command("upsample", "in.npy", "a.ply", "--force", "--threads", 1, "-v")
     assert code == 0 and "device: cpu" in err and "isosurface: " in err
 
@@ -61,15 +65,12 @@ def test_options_reach_the_result(here, command):
 def test_a_surface_that_leaves_the_grid_is_reported_and_capped(here, command):
     np.save("cut.npy", ball().values[:12])
     _, _, err = command("upsample", "cut.npy", "open.ply", "--open")
-    assert (
-        "Warning: the surface runs out of the grid and is open there (close it with --cap)" in err
-    )
+    said = "Warning: the surface runs out of the grid and is open there (close it with --cap)"
+    assert said in err
     assert " triangles, open, from (" in err and not trimesh.load("open.ply").is_watertight
     _, _, err = command("upsample", "cut.npy", "closed.ply")
-    assert (
-        "Warning" not in err
-        and "Note: the solid runs out of the grid: its surface is closed" in err
-    )
+    note = "Note: the solid runs out of the grid: its surface is closed"
+    assert "Warning" not in err and note in err
     assert trimesh.load("closed.ply").is_watertight
 
 
@@ -111,7 +112,7 @@ def bad_files() -> None:
     Path("short.npy").write_bytes(good[: len(good) // 2])
     Path("text.npz").write_text("hello")
     Path("empty.npy").write_bytes(b"")
-    np.save("objects.npy", np.array([{}], object), allow_pickle=True)
+    np.save("objects.npy", np.array([[[{}]]], object), allow_pickle=True)
     np.savez("other.npz", field=np.zeros(3), more=np.zeros(3))
     with zipfile.ZipFile("short.npz", "w") as archive:
         archive.writestr("values.npy", good[: len(good) // 2])
@@ -212,3 +213,9 @@ def test_wrong_values_are_named_in_lists_by_their_names(here, command):
     Path("list.jsonl").write_text('{"in": "in.npy", "simplify": -1}')
     _, _, err = command("batch", "list.jsonl", "--out", "out", "--simplify", "0.5")
     assert "simplify is -1: give a number" in err and "--simplify" not in err
+
+
+def test_the_progress_bar_says_that_it_reads_and_runs_to_100_percent(here, command, monkeypatch):
+    monkeypatch.setattr(type(sys.stderr), "isatty", lambda self: True, raising=False)
+    code, _, err = command("upsample", "in.npy", "out.ply", "--spacing", "1")
+    assert code == 0 and err.index("reading") < err.index("upsampling") < err.index("100%")

@@ -21,8 +21,7 @@ QUICK += ["--spacing", "1", "--origin", "0"]
 
 
 @pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def here(folder):
     np.save("in.npy", ball().values)
 
 

@@ -220,14 +220,14 @@ def test_an_image_of_several_frames():
     slices = slices_of(AFFINE)
     image, frames, shared = slices[0], [], pydicom.Dataset()
     for each in slices[::-1]:
-        place = holding(pydicom.Dataset(), ImagePositionPatient=each.ImagePositionPatient)
-        frames.append(holding(pydicom.Dataset(), PlanePositionSequence=place))
+        place = holding(ImagePositionPatient=each.ImagePositionPatient)
+        frames.append(holding(PlanePositionSequence=place))
     for group, names in (
         ("PlaneOrientationSequence", ["ImageOrientationPatient"]),
         ("PixelMeasuresSequence", ["PixelSpacing"]),
         ("PixelValueTransformationSequence", ["RescaleSlope", "RescaleIntercept"]),
     ):
-        holding(shared, **{group: holding(pydicom.Dataset(), **{n: image[n].value for n in names})})
+        holding(shared, **{group: holding(**{n: image[n].value for n in names})})
         for name in names:
             delattr(image, name)
     pixels = b"".join(each.PixelData for each in slices[::-1])

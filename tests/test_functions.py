@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from conftest import refusal, trilinear
+from solids import box_distance
 
 from super_sdf import DistanceFunction, reconstruct
 from super_sdf.check import check_mesh
@@ -19,9 +20,7 @@ def torus(points):
 
 
 def block(points):
-    beyond = np.abs(points @ TURNED) - SIDES
-    outside = np.linalg.norm(np.maximum(beyond, 0), axis=1)
-    return outside + np.minimum(beyond.max(1), 0)
+    return box_distance(points @ TURNED, SIDES)
 
 
 def off(function, mesh):
@@ -73,10 +72,8 @@ def test_any_function_that_changes_sign_there_will_do(sign):
 
 def cubes(points, gap):
     """Two cubes apart, shifted along their walls."""
-    one, other = ((np.abs(points - [x, y, z]) - 0.4) for x, y, z in
-                  ((-0.4 - gap / 2, 0, 0), (0.4 + gap / 2, 0.1, 0.2)))  # fmt: skip
-    far = [np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(1), 0) for q in (one, other)]
-    return np.minimum(*far)
+    middles = (-0.4 - gap / 2, 0, 0), (0.4 + gap / 2, 0.1, 0.2)
+    return np.minimum(*(box_distance(points - middle, 0.4) for middle in middles))
 
 
 THIN = {

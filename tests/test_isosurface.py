@@ -15,7 +15,7 @@ from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField, SampleSpheres
 from super_sdf.refine.nodes import block_ijk, share_parts
 from super_sdf.surface.cell_cases import make_tables
-from super_sdf.surface.extract import extract, reach_in_voxels
+from super_sdf.surface.extract import extract
 from super_sdf.surface.marching import FACES, tables
 from super_sdf.surface.mesh import CLEARANCE
 
@@ -33,61 +33,6 @@ def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGri
     )
     spheres = SampleSpheres(shape, voxels, blocks[len(blocks) // 2])
     return FineField(shape, factor, voxels, blocks, parts, spheres=spheres), grid
-
-
-def part_of(field: FineField, low: np.ndarray, high: np.ndarray) -> FineField:
-    """Return the part of a field in a box of voxels."""
-
-    def within(ijk):
-        return np.flatnonzero(((ijk >= low) & (ijk < high)).all(1))
-
-    def moved(ijk):
-        return (ijk - low).astype(np.int32)
-
-    shape, rows = tuple((high - low).tolist()), within(field.voxel_ijk)
-    voxels, spheres = moved(field.voxel_ijk[rows]), field.spheres
-    some = within(spheres.voxel_ijk)
-    return FineField(
-        shape,
-        field.factor,
-        voxels,
-        field.blocks[:, rows],
-        share_parts(neighbour_table(voxels, shape)),
-        grid=SdfGrid.trusted(field.grid.values[tuple(map(slice, low, high))], 1.0, low),
-        spheres=SampleSpheres(shape, moved(spheres.voxel_ijk[some]), spheres.distance[some]),
-        leaves=field.leaves,
-    )
-
-
-@pytest.mark.parametrize("mesher", ["marching", "sharp"])
-@pytest.mark.parametrize("cap", [True, False])
-def test_a_part_of_a_field_has_the_vertices_and_triangles_of_the_whole(mesher, cap):
-    """In its own voxels, if it has as many more beside as the mesher reaches; keys name them."""
-    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-    shape = np.array([40, 12, 13])
-    beyond = np.abs(turn @ (np.indices(shape).reshape(3, -1) - [[9], [5], [5]])) - [[30], [4], [3]]
-    values = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
-    grid = SdfGrid.trusted(values.reshape(shape).astype(np.float32), 1.0)
-    field = upsample(grid, trilinear, 8)
-    mesh, keys = extract(field, grid, mesher=mesher, cap=cap)
-    assert len(np.unique(keys)) == len(keys) and (mesher == "marching") == (keys % 16 < 3).all()
-    place = dict(zip(keys.tolist(), mesh.vertices))
-    triangles = {tuple(np.roll(t, -t.argmin())) for t in keys[mesh.faces]}
-    reach, seen = reach_in_voxels(mesher, 8), set()
-    for start, stop in ((0, 15), (15, 24), (24, 40)):
-        low, high = np.array([max(start - reach, 0), 0, 0]), shape.copy()
-        high[0] = min(stop + reach, shape[0])
-        part = part_of(field, low, high)
-        first, whole = tuple(low.tolist()), tuple(shape.tolist())
-        made, names = extract(part, part.grid, mesher=mesher, cap=cap, first=first, shape=whole)
-        node = names[made.faces].min(1) // 16 // np.prod(8 * (shape[1:] + 2) + 1) // 8 - 1
-        own = (node >= start - (start == 0)) & (node < stop + (stop == 40))
-        some = {tuple(np.roll(t, -t.argmin())) for t in names[made.faces[own]]}
-        assert some <= triangles and not seen & some
-        seen |= some
-        for row in np.unique(made.faces[own]):
-            np.testing.assert_allclose(made.vertices[row], place[names[row]], atol=1e-5)
-    assert seen == triangles
 
 
 def test_threads_change_nothing(monkeypatch):

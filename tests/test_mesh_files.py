@@ -97,10 +97,7 @@ PLACES = {
     "beyond single": (1e39, 0.0),
     "below single": (1e-44, 0.0),
 }
-REFUSED = {
-    ".stl": set(PLACES) - {"near", "microns"},
-    ".glb": {"beyond single", "below single"},
-}
+REFUSED = {".stl": set(PLACES) - {"near", "microns"}, ".glb": {"beyond single", "below single"}}
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".stl", ".glb", ".3mf"])

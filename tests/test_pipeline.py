@@ -10,7 +10,6 @@ from scipy.spatial import cKDTree
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
 from super_sdf.errors import GridError
 from super_sdf.refine import band
-from super_sdf.refine.band import find_band
 from super_sdf.refine.nodes import block_ijk
 from super_sdf.surface.mesh import CLEARANCE
 
@@ -136,12 +135,6 @@ def test_threads_give_the_same_mesh(network):
         np.testing.assert_array_equal(one, other)
 
 
-def test_both_voxels_of_a_jump_over_the_band_are_in_it():
-    values = np.full((6, 4, 4), 9.0, np.float32)
-    values[3:] = -9.0
-    assert set(find_band(values)[:, 0]) == {2, 3}
-
-
 def test_two_samples_an_axis_are_enough(network):
     values = np.array([-0.5, 0.5])[:, None, None] + np.zeros((2, 2, 2))
     mesh = reconstruct(SdfGrid(values, (1.0,) * 3), network, cap=False)
@@ -157,3 +150,32 @@ def test_a_field_without_a_surface_is_refused(low, high):
             SdfGrid(values, (1.0,) * 3),
             lambda patches, table, voxels, offsets: np.ones((len(voxels), 125), np.float32),
         )
+
+
+# Progress
+
+
+def reported(work, *arguments):
+    """Return the progress that some work reports, in thousandths."""
+    reports = []
+    work(*arguments, progress=lambda done, total: reports.append((done, total)))
+    assert {total for _, total in reports} == {1000}
+    return [done for done, _ in reports]
+
+
+def test_steps_are_reported_in_thousandths_of_their_usual_time():
+    assert reported(reconstruct, ball(), trilinear) == [30, 480, 630, 1000]
+    assert reported(upsample, ball(), trilinear) == [48, 762, 1000]
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
+def test_an_exception_in_the_callback_ends_the_run_and_the_next_is_right(network, error):
+    plain = reconstruct(ball(), network, 2)
+
+    def stop(done, total):
+        if done > 20:  # after the band
+            raise error
+
+    with pytest.raises(error):
+        reconstruct(ball(), network, 2, progress=stop)
+    np.testing.assert_array_equal(reconstruct(ball(), network, 2).vertices, plain.vertices)

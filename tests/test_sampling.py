@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
-from solids import TORUS, cube, inverted, joined, saved, sphere, torus
+from solids import TORUS, box_distance, cube, inverted, joined, saved, sphere, torus
 
 from super_sdf import Mesh, SuperSdfError, load_network, reconstruct
 from super_sdf.truth import sampling
@@ -18,18 +20,13 @@ from super_sdf.truth.sampling import (
 from super_sdf.truth.solid import Solid, load_solid
 
 
-def cube_distance(points: np.ndarray) -> np.ndarray:
-    beyond = np.abs(points) - 0.5
-    return np.linalg.norm(np.maximum(beyond, 0), axis=1) + np.minimum(beyond.max(1), 0)
-
-
 def torus_distance(points: np.ndarray) -> np.ndarray:
     ring = np.linalg.norm(points[:, :2], axis=1) - TORUS[0]
     return np.hypot(ring, points[:, 2]) - TORUS[1]
 
 
 SOLIDS = {
-    "cube": (cube(), cube_distance, 1e-12),
+    "cube": (cube(), partial(box_distance, half=0.5), 1e-12),
     # Chords lie under the surface: by an eighth of edge^2 over radius, or twice that.
     "sphere": (sphere(size=64), lambda points: np.linalg.norm(points, axis=1) - 0.4, 2.5e-4),
     "torus": (torus(128, 64), torus_distance, 4.5e-4),
@@ -65,7 +62,7 @@ def test_overlapping_pieces_are_one_solid_and_a_cavity_is_no_overlap():
     both = Solid(joined(cube(), apart))
     assert both.count_overlapping() > 0
     points = np.random.default_rng(2).uniform(-1, 1.2, (1000, 3))
-    expected = (cube_distance(points) < 0) | (cube_distance(points - [0.4, 0, 0]) < 0)
+    expected = (box_distance(points, 0.5) < 0) | (box_distance(points - [0.4, 0, 0], 0.5) < 0)
     assert (both.is_inside(points) == expected).all()
     hollow = Solid(joined(cube(), inverted(Mesh(cube().vertices * 0.5, cube().faces))))
     assert hollow.is_closed and hollow.count_overlapping() == 0

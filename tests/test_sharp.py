@@ -7,6 +7,7 @@ import pytest
 from conftest import ball, count_fans, trilinear
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from solids import box_distance
 from test_isosurface import dense_field
 
 from lab.methods import sharp_isosurface
@@ -18,16 +19,14 @@ TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 BOX = np.array([6.2, 5.1, 4.3])
 
 
-def box_distance(half, samples, middle, turn=TURN):
-    """Return the distance to a box, at samples of spacing 1."""
-    ijk = np.indices((samples,) * 3).reshape(3, -1) - middle
-    beyond = np.abs(turn.T @ ijk) - np.array(half)[:, None]
-    distance = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
-    return distance.reshape((samples,) * 3)
+def box_grid(half, samples, middle, turn=TURN):
+    """Return the distance to a turned box, at samples of spacing 1."""
+    ijk = np.moveaxis(np.indices((samples,) * 3), 0, -1)
+    return box_distance((ijk - middle) @ turn, half)
 
 
 def turned_box(half=BOX, samples=22):
-    return SdfGrid.trusted(box_distance(half, samples, samples / 2 + 0.13), 1.0)
+    return SdfGrid.trusted(box_grid(half, samples, samples / 2 + 0.13), 1.0)
 
 
 def intersections(mesh):
@@ -97,12 +96,6 @@ def test_the_command_takes_a_mesher_and_says_which(folder, command):
     assert command("upsample", "in.npy", "x.ply", "--mesher", "dual", *words)[0] == 2
 
 
-def test_the_rule_of_the_package_has_a_weight_for_each_evidence():
-    rule = json.loads(features.RULE.read_text())
-    assert len(features.load_rule().weights) == len(rule["weights"]) == 10
-    assert features.load_rule().share(np.zeros((1, 10))) == np.clip(rule["bias"], 0, 1)
-
-
 @pytest.fixture
 def features_everywhere():
     """Let every patch be a feature: fans and turned sides, ambiguous faces among them."""
@@ -154,7 +147,7 @@ def test_a_blade_and_a_gap_do_not_intersect():
 @pytest.mark.parametrize("turn, half", [(TURN, [3.1, 2.5, 2.1]), (np.eye(3), [3.0, 2.5, 2.0])])
 def test_the_true_distance_is_meshed_on_its_edges(turn, half):
     """Of a dense field; also along the lattice, where triangles share planes, vertices nodes."""
-    lattice = box_distance(4 * np.array(half), 49, 49 / 2 + 0.13 * (turn is TURN), turn) / 4
+    lattice = box_grid(4 * np.array(half), 49, 49 / 2 + 0.13 * (turn is TURN), turn) / 4
     mesh = sharp_isosurface(lattice.astype(np.float32), 0.25, 0.0)
     assert mesh.is_closed() and mesh.volume() == pytest.approx(8 * np.prod(half), rel=1e-3)
     local = (mesh.vertices - (49 / 2 + 0.13 * (turn is TURN)) / 4) @ turn

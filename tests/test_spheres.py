@@ -3,64 +3,51 @@
 import numpy as np
 import pytest
 from conftest import ball, trilinear
+from solids import box_distance
 
-from super_sdf import SdfGrid, load_network, pipeline, reconstruct
-from super_sdf.refine.band import neighbour_table, survey
-from super_sdf.refine.bounds import keep_within_bounds
-from super_sdf.refine.nodes import VoxelIndex, average_shared, block_ijk, share_parts
-from super_sdf.refine.spheres import fit_to_spheres, spheres_of_band
+from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
+from super_sdf.refine.band import survey
 
 MIDDLE = 10 - 0.37  # of the ball
 
 
-class Fields:
-    """What the steps get of a grid of the ball, and the distances at the nodes, in half voxels."""
+def away(points):
+    """Return the distances of points (..., 3) from the ball."""
+    return np.linalg.norm(points - MIDDLE, axis=-1) - 6
 
-    def __init__(self, grid, factor=4):
-        self.band, self.factor = survey(grid), factor
-        self.ijk = self.band.voxel_ijk[self.band.decoded]
-        self.parts = share_parts(neighbour_table(self.ijk, grid.shape))
-        self.index = VoxelIndex(self.ijk, grid.shape)
-        self.spheres = spheres_of_band(self.band)
-        node = self.ijk + block_ijk(factor)[:, None] / factor - 0.5
-        away = 2 * (np.linalg.norm(node - MIDDLE, axis=2) - 6)
-        self.exact = np.pad(away.astype(np.float32), ((0, 0), (0, 1)))
 
-    def wrong(self, by):
-        """Return the distances with an error, the same at nodes that blocks share, none at samples.
+def network_for(grid, error):
+    """Return a network that knows the ball, with an error: one number, or some by voxel."""
+    places, error = survey(grid).voxel_ijk, np.atleast_2d(error)
 
-        The last column is 0.
-        """
-        blocks = self.exact + np.float32(by)
-        blocks[len(blocks) // 2], blocks[:, -1] = self.exact[len(blocks) // 2], 0
-        average_shared(blocks, self.parts, self.factor)
-        return blocks
+    def values(patches, table, voxels, offsets):
+        found = 2 * away(places[voxels, None] + offsets / 2)  # in half voxels
+        return (found + error[voxels % len(error)]).astype(np.float32)
 
-    def bounded(self, blocks):
-        moved = blocks.copy()
-        keep_within_bounds(moved, self.parts, self.factor, self.ijk, self.band.trusted)
-        return moved
+    return values
+
+
+def without(monkeypatch, *steps):
+    """Leave out steps of the method."""
+    for step in steps:
+        monkeypatch.setattr(pipeline, step, lambda *_: None)
 
 
 @pytest.mark.parametrize("bias", [-0.2, 0.1])
-def test_a_constant_error_is_corrected_and_exact_samples_are_kept(bias):
-    fields = Fields(ball())
-    moved = fields.exact + np.float32(bias)
-    moved[:, -1] = 0
-    fit_to_spheres(moved, fields.parts, 4, fields.spheres, fields.index)
-    off = np.abs(moved - fields.exact)[np.abs(fields.exact) < 0.3]
+def test_a_constant_error_of_the_network_is_corrected(bias):
+    field = upsample(ball(), network_for(ball(), bias))
+    truth = away(field.positions())
+    off = 2 * np.abs(field.distances() - truth)[np.abs(truth) < 0.15]
     assert off.max() < 0.4 * abs(bias) and off.mean() < 0.2 * abs(bias)
-    samples = 2 * ball().values[tuple(fields.ijk.T)]
-    np.testing.assert_allclose(moved[62, :-1], samples, atol=1e-6)
 
 
-def test_noisy_samples_move_nothing():
+def test_noisy_samples_move_nothing(monkeypatch):
     grid = ball()
     noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
-    fields = Fields(SdfGrid.trusted(grid.values + noise, grid.spacing))
-    blocks = fields.exact.copy()
-    fit_to_spheres(blocks, fields.parts, 4, fields.spheres, fields.index)
-    np.testing.assert_array_equal(fields.bounded(blocks), fields.exact)
+    grid = SdfGrid.trusted(grid.values + noise, grid.spacing)
+    moved = upsample(grid, trilinear).values
+    without(monkeypatch, "fit_to_spheres", "keep_within_bounds")
+    np.testing.assert_array_equal(upsample(grid, trilinear).values, moved)
 
 
 def test_samples_that_contradict_others_and_truncated_ones_are_not_exact():
@@ -75,27 +62,23 @@ def test_samples_that_contradict_others_and_truncated_ones_are_not_exact():
 
 @pytest.mark.parametrize(
     "step, other, least",
-    [("fit_to_spheres", "", 0.35), ("keep_within_bounds", "fit_to_spheres", 0.7)],
+    [("fit_to_spheres", (), 0.35), ("keep_within_bounds", ("fit_to_spheres",), 0.7)],
 )
 def test_a_step_improves_an_interpolated_ball(monkeypatch, step, other, least):
     """The bounds without the fit, after which little is left."""
 
     def error():
-        mesh = reconstruct(ball(), trilinear)
-        return np.abs(np.linalg.norm(mesh.vertices - MIDDLE, axis=1) - 6).mean()
+        return np.abs(away(reconstruct(ball(), trilinear).vertices)).mean()
 
-    if other:
-        monkeypatch.setattr(pipeline, other, lambda *_: None)
+    without(monkeypatch, *other)
     improved = error()
-    monkeypatch.setattr(pipeline, step, lambda *_: None)
+    without(monkeypatch, step)
     assert improved < least * error()
 
 
 def test_a_wall_between_the_samples_is_found():
     """It is a third of a voxel thick and contains no sample: all values are positive."""
-    ijk = np.indices((16, 16, 16)) - 7.5
-    beyond = np.abs(ijk) - np.array([4.6, 0.17, 4.6])[:, None, None, None]
-    outer = np.linalg.norm(np.maximum(beyond, 0), axis=0) + np.minimum(beyond.max(0), 0)
+    outer = box_distance(np.moveaxis(np.indices((16, 16, 16)), 0, -1) - 7.5, [4.6, 0.17, 4.6])
     assert outer.min() > 0
     mesh = reconstruct(SdfGrid.trusted(outer, (1.0,) * 3, (-7.5,) * 3), load_network())
     assert mesh.is_closed()
@@ -104,17 +87,17 @@ def test_a_wall_between_the_samples_is_found():
 
 
 @pytest.mark.parametrize(("factor", "limit"), [(4, 100), (4, 1.7), (8, 3.0)])
-def test_bounds_move_no_value_away_from_the_truth_and_many_nearer(factor, limit):
-    """Wherever others are cut off; those that are the truth stay, and copies of nodes agree."""
-    fields = Fields(SdfGrid.trusted(np.clip(ball().values, -limit, limit), 1.0), factor)
-    np.testing.assert_allclose(fields.bounded(fields.exact), fields.exact, atol=2e-5)
-    blocks = fields.wrong(np.random.default_rng(0).normal(0, 0.2, fields.exact.shape))
-    moved = fields.bounded(blocks)
-    before, after = np.abs(blocks - fields.exact), np.abs(moved - fields.exact)
-    assert (after <= before + 2e-5).mean() > 0.999  # but for means of shared nodes
+def test_bounds_move_no_value_away_from_the_truth_and_many_nearer(monkeypatch, factor, limit):
+    """Wherever samples are cut off; values that are the truth stay."""
+    without(monkeypatch, "fit_to_spheres")
+    grid = SdfGrid.trusted(np.clip(ball().values, -limit, limit), 1.0)
+    noisy = network_for(grid, np.random.default_rng(0).normal(0, 0.2, (9999, (factor + 1) ** 3)))
+    exact, moved = (upsample(grid, network, factor) for network in (network_for(grid, 0), noisy))
+    truth = away(exact.positions())
+    np.testing.assert_allclose(exact.distances(), truth, atol=1e-5)
+    without(monkeypatch, "keep_within_bounds")
+    before, after = (
+        np.abs(field.distances() - truth) for field in (upsample(grid, noisy, factor), moved)
+    )
+    assert (after <= before + 1e-5).mean() > 0.999  # but for means of shared nodes
     assert after.mean() < (0.7 if limit == 100 else 1) * before.mean()
-    again = moved.copy()
-    average_shared(again, fields.parts, factor)
-    np.testing.assert_array_equal(again, moved)
-    middle = len(moved) // 2
-    np.testing.assert_array_equal(moved[middle], fields.exact[middle])

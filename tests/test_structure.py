@@ -39,10 +39,10 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     TOP: 1584,  # 1,250
     "grid": 2980,  # 1,800
     "network": 540,  # 500: CUDA's missing library is named
-    "refine": 1529,  # 1,300
+    "refine": 1528,  # 1,300
     "surface": 2182,
     "tiles": 300,
-    "files": 3539,  # 2,700: readers of twelve libraries have 2,150
+    "files": 3533,  # 2,700: readers of twelve libraries have 2,150
     "functions": 600,
     "labels": 1132,  # 900
     "simplify check truth": 1524,  # 1,100: with the walls between labels

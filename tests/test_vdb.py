@@ -118,29 +118,29 @@ def one_leaf(leaf: bytes, active: bytes, *, flags: int, count: int | None = None
     return head + struct.pack("<qqq", place, 0, 0) + grid + tree + active + leaf
 
 
-@pytest.mark.parametrize(
-    ("state", "stated", "selected", "inactive"),
-    [
-        (0, (), False, (3.0, 3.0)),
-        (1, (), False, (-3.0, -3.0)),
-        (2, (-2.0,), False, (-2.0, -2.0)),
-        (3, (), True, (-3.0, 3.0)),
-        (4, (-2.0,), True, (-2.0, 3.0)),
-        (5, (-2.0, 1.5), True, (-2.0, 1.5)),
-    ],
-)
-def test_inactive_values_as_a_leaf_states_them(tmp_path, state, stated, selected, inactive):
+# By the state of a leaf: the values that it states, and those below and above voxel 300.
+INACTIVE = [
+    ((), (3.0, 3.0)),
+    ((), (-3.0, -3.0)),
+    ((-2.0,), (-2.0, -2.0)),
+    ((), (-3.0, 3.0)),
+    ((-2.0,), (-2.0, 3.0)),
+    ((-2.0, 1.5), (-2.0, 1.5)),
+]
+
+
+@pytest.mark.parametrize("state", range(6))
+def test_inactive_values_as_a_leaf_states_them(tmp_path, state):
     """Voxels 0 to 99 are active, 1 to 100 in value; of the others those from 300 on are masked."""
     numbers, flags = np.arange(1, 101, dtype="<f4"), ACTIVE_MASK | ZIP
+    stated, inactive = INACTIVE[state]
     leaf = bytes([state]) + np.array(stated, "<f4").tobytes()
-    leaf += mask(*range(300, 512), size=512) if selected else b""
+    leaf += mask(*range(300, 512), size=512) if state > 2 else b""
     leaf += packed(numbers.tobytes(), flags)
-    (tmp_path / "a.vdb").write_bytes(
-        one_leaf(leaf, mask(*range(100), size=512), flags=flags, count=100)
-    )
+    data = one_leaf(leaf, mask(*range(100), size=512), flags=flags, count=100)
+    (tmp_path / "a.vdb").write_bytes(data)
     values, origin, _ = voxels(tmp_path / "a.vdb")
-    expected = np.full(512, inactive[0])
-    expected[300:] = inactive[1]
+    expected = np.repeat([0.0, *inactive], (100, 200, 212))
     expected[:100] = numbers
     whole = np.full((12, 12, 12), 3.0)  # two voxels of background on each side
     whole[2:-2, 2:-2, 2:-2] = expected.reshape(8, 8, 8)
@@ -191,11 +191,7 @@ def test_info_lists_the_grids_of_a_file(command):
         assert code == 0 and f"shape: {shape}" in lines
         assert lines[-4:] == [*listed, note]
     code, out, _ = command("info", str(path), "--json")
-    assert json.loads(out)["grids"][1] == {
-        "name": "surface",
-        "type": "float",
-        "class": "level set",
-        "active_voxels": 619,
-    }
+    about = {"name": "surface", "type": "float", "class": "level set", "active_voxels": 619}
+    assert json.loads(out)["grids"][1] == about
     said = refusal(FileError, read_grid, path)
     assert said.endswith(f"holds several arrays, density, surface: give {path}:density, say")

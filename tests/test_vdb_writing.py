@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ball, refusal, trilinear
-from test_fields import TURNED, cut_ball, tip
+from conftest import ball, cut_ball, refusal, trilinear
+from test_fields import TURNED, tip
 from test_vdb import text
 
 from super_sdf import SdfGrid, fine_grid, make_grid, upsample, write_field

@@ -126,7 +126,7 @@ class DistanceFunction:
             return make()
         except GridError:  # the spacing is right: what contradicts it is no distance
             with suppress(GridError):
-                return make(field="scaled")
+                return make(field="smooth")
             raise
 
 

@@ -23,7 +23,6 @@ from ..grid.samples import let_go, over_three, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
 from ..threads import over_threads
 from .bounds import FARTHEST, TrustedSamples
-from .nodes import VoxelIndex
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
 # Patch values are clipped to this (3 h): samples that are farther from the surface do not matter to
@@ -101,7 +100,13 @@ class _Found(NamedTuple):
     decoded: BoolArray
     number: NDArray[np.int64]  # (n,), of samples beyond the band that may be exact, in C order
     value: FloatArray  # (n,), of these
-    figures: NDArray[np.float64]  # (1, 5), as in ``BandSummary``
+    leaves: BoolArray  # (1,), whether a sample on the border of the grid is inside
+
+    def figures(self) -> tuple[int, int, float, float, bool]:
+        """Return the first five figures of ``BandSummary``."""
+        noisy, sample = self.sampled & ~self.lipschitz, self.patches[:, CENTRE]
+        ends = float(sample.min(initial=np.inf)), float(sample.max(initial=-np.inf))
+        return int(self.sampled.sum()), int(noisy.sum()), *ends, bool(self.leaves.any())
 
 
 def survey(
@@ -131,7 +136,7 @@ def survey(
             raise BandTooLargeError
     every = _Found(*map(np.concatenate, zip(*parts)))
     del parts, found
-    whole = whole or _summary(every.figures, np.zeros((0, 0, 0), np.int64))
+    whole = whole or BandSummary(*every.figures(), np.zeros((0, 0, 0), np.int64))
     exact, sample = _exact(every, whole), every.patches[:, CENTRE]
     exact &= (sample > low) & (sample < high)
     trusted = TrustedSamples(grid.shape, every.number[:0], every.value[:0])
@@ -150,15 +155,9 @@ def summarise(grid: SdfGrid, offset: float = 0.0, threads: int = 1) -> BandSumma
     cells, figures = np.zeros([-(-n // side) for n in grid.shape], np.int64), []
     for found in _found(grid, offset, threads):
         np.add.at(cells, tuple((found.voxel_ijk // side).T), 1)
-        figures.append(found.figures)
-    return _summary(np.concatenate(figures), cells, side)
-
-
-def _summary(figures: NDArray[np.float64], cells: NDArray[np.int64], side: int = 1) -> BandSummary:
-    """Return the summary of planes that have these figures, (n, 5)."""
-    told, noisy, low, high, leaves = figures.T
-    ends = float(low.min()), float(high.max())
-    return BandSummary(int(told.sum()), int(noisy.sum()), *ends, bool(leaves.any()), cells, side)
+        figures.append(found.figures())
+    told, noisy, low, high, leaves = zip(*figures)
+    return BandSummary(sum(told), sum(noisy), min(low), max(high), any(leaves), cells, side)
 
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
@@ -189,10 +188,8 @@ def _found(
         rescaled = rescale(grid, offset, low, min(last + 1, count))
         let_go(grid.samples)
         own = slice(first - low, last - low)
-        inner, active = rescaled[own], (is_near if is_spline else is_active)(rescaled)[own]
-        if unseen is not None:
-            hidden = np.asarray(unseen[first:last])
-            inner, active = np.where(hidden, np.float32(FAR), inner), active & ~hidden
+        known = True if unseen is None else ~np.asarray(unseen[first:last])
+        active = (is_near if is_spline else is_active)(rescaled)[own] & known
         ijk = np.argwhere(active).astype(np.int32)
         patches = gather_patches(rescaled, ijk + np.array([own.start, 0, 0], np.int32))
         ijk[:, 0] += first
@@ -202,25 +199,23 @@ def _found(
         # Samples of a resampled grid are judged by samples alone: interpolated values do not tell
         # whether these are noisy. Interpolated values that contradict no others count as exact,
         # since thin parts need them (docs/guides/formats.md).
-        centre = patches[:, CENTRE]
         lipschitz, sampled = is_lipschitz(patches), on_samples(grid, ijk)
         if grid.on_sample is not None:
             lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
         # Only a patch that can be distances proves, by a sample far from the surface, that the
         # voxel holds none.
-        decoded: BoolArray = (np.abs(centre) <= DECODE_LIMIT) | ~lipschitz | is_spline
+        decoded: BoolArray = (np.abs(patches[:, CENTRE]) <= DECODE_LIMIT) | ~lipschitz | is_spline
         if grid.field.sides_only:
             decoded = np.asarray((patches > 0).any(1) & (patches <= 0).any(1))
 
-        faces = [rescaled[own, [0, -1]], rescaled[own, :, [0, -1]]]
-        faces += [rescaled[0]] * (first == 0) + [rescaled[-1]] * (last == count)
-        told, noisy = sampled.sum(), (sampled & ~lipschitz).sum()
-        ends = centre.min(initial=np.inf), centre.max(initial=-np.inf)
-        figures = np.array([[told, noisy, *ends, any((face <= 0).any() for face in faces)]], float)
+        inner = rescaled[own]
+        faces = [inner[:, [0, -1]], inner[:, :, [0, -1]]]
+        faces += [inner[0]] * (first == 0) + [inner[-1]] * (last == count)
+        leaves = np.array([any((face <= 0).any() for face in faces)])
         lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
-        beyond = (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
+        beyond = known & (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
         number, value = np.flatnonzero(beyond) + first * inner[0].size, inner[beyond]
-        return _Found(ijk, patches, lipschitz, sampled, decoded, number, value, figures)
+        return _Found(ijk, patches, lipschitz, sampled, decoded, number, value, leaves)
 
     step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), planes_at_once(grid.samples))
     blocks = [(first, min(first + step, count)) for first in range(0, count, step)]
@@ -319,9 +314,19 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArra
     It has their rows at the 27 places of ``NEIGHBOURHOOD`` round each, -1 where there is no voxel.
     As an index -1 is the last row, so append a row of zeros to the array that is gathered from.
     """
-    table, index = np.empty((len(voxel_ijk), 27), np.int32), VoxelIndex(voxel_ijk, shape)
-    for place, step in enumerate(NEIGHBOURHOOD):
-        table[:, place] = index.find(voxel_ijk + step)
+    strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1])
+    keys = voxel_ijk.astype(np.int64) @ strides  # ascending; a step beyond the grid has no key
+    rows = np.arange(len(keys), dtype=np.int32)
+    table = np.full((len(keys), 27), -1, np.int32)
+    table[:, CENTRE] = rows
+    at = np.empty(0, np.int64)
+    for place, step in enumerate((NEIGHBOURHOOD[:CENTRE] @ strides).tolist()):
+        if place % 3 == 0:  # the next two are beside it along z
+            at = np.searchsorted(keys, keys + step)
+        found = keys[at] == keys + step
+        table[found, place] = at[found]
+        table[at[found], 26 - place] = rows[found]  # a neighbour's neighbour
+        at += found
     return table
 
 

@@ -75,16 +75,9 @@ class FineField:
     leaves : bool
         Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
         that crosses the border all the same is closed there.
-    border_inside : (n, 3) int32, optional
-        The voxels on the grid's border that are inside and have no block: what a cap needs of the
-        samples. None if they are to be found in ``grid``.
     octants : (D,) uint8, optional
         A bit for each octant of each voxel: whether all eight samples round it are known. Where
         one is not, the surface ends. None if all are known.
-    found : two ints
-        The ``band_voxels`` and ``noisy_voxels`` of ``count``.
-    pinned : (D,) int32, optional
-        How many of the ``pinned_nodes`` of ``count`` each voxel owns.
     """
 
     shape: tuple[int, int, int]
@@ -96,10 +89,11 @@ class FineField:
     offset: float = 0.0
     spheres: SampleSpheres | None = None
     leaves: bool = True
+    # (n, 3), voxels on the border that are inside and have no block; None: found in the grid
     border_inside: IntArray | None = None
     octants: NDArray[np.uint8] | None = None
-    found: tuple[int, int] = (0, 0)
-    pinned: IntArray | None = None
+    found: tuple[int, int] = (0, 0)  # ``band_voxels`` and ``noisy_voxels`` of ``count``
+    pinned: IntArray | None = None  # (D,), how many ``pinned_nodes`` each voxel owns
 
     def __repr__(self) -> str:
         shape, nodes = " x ".join(map(str, self.shape)), self.parts.count_nodes(self.factor)

@@ -140,7 +140,7 @@ def roughness(values: FloatArray) -> FloatArray:
 def _evaluate(coefficients: FloatArray, ijk: IntArray, weights: NDArray[np.float32]) -> FloatArray:
     """Return what weights make at the nodes of the blocks of voxels (n, 3), (Q, n)."""
     out = np.empty((len(weights) ** 3, len(ijk)), np.float32)
-    step = np.array([coefficients.shape[1] * coefficients.shape[2], coefficients.shape[2], 1])
+    step = np.array([coefficients[0].size, coefficients.shape[2], 1])
     around = (np.indices((SIDE,) * 3).reshape(3, -1).T - 2) @ step
     centre = ijk.astype(np.int64) @ step
     for rows in chunks_of(len(ijk), SIDE**3):

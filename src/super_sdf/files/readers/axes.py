@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...arrays import Triple
 from ...errors import FileError, GridError, seen
 from ...grid.samples import UNNAMED, even_steps
 from . import Index, Request, axes_direction, kept_of, triple
@@ -74,22 +75,20 @@ def placed(
 ) -> dict[str, Any]:
     """Return what a ``Volume`` says of the place of an array: which axes are kept, and where.
 
-    Attributes replace what ``axes`` says: ``element_size_um``, as the HDF5 plugin of ImageJ writes
-    it, has the order of the array's axes; ``spacing`` and ``origin`` are x, y, z. The columns of
-    ``direction``, nine numbers row by row, are the world directions of the axes x, y and z.
-    ``order`` is that of axes that have no names. With ``beside``, attributes elsewhere in the file,
-    notes say what was not taken from the file.
+    Attributes replace what ``axes`` says: ``element_size_um``, of ImageJ's HDF5 plugin, has the
+    order of the array's axes; ``spacing``, ``origin`` and the columns of ``direction`` are x, y, z.
+    ``order`` is that of axes without names. With ``beside``, attributes elsewhere in the file,
+    notes say what was not read.
     """
-    order = order or request.axes
     names = ["" if axis.name in UNNAMED else axis.name.strip().lower() for axis in axes]
     aliases = [axis.alias.strip().lower() or name for axis, name in zip(axes, names)]
     names = names if _space_in(names) or not _space_in(aliases) else aliases
     index = request.pick(shape, _space_in(names), names)
-    kept = kept_of(index)
+    kept, order = kept_of(index), order or request.axes
     named, notes = [names[axis] for axis in kept], list[str]()
     if any(named) and not _space_in(names):
-        listed = ", ".join(name or "?" for name in named)
-        notes = [f"its axes are named {listed}: taken as {', '.join(order)}"]
+        called = ", ".join(name or "?" for name in named)
+        notes = [f"its axes are named {called}: taken as {', '.join(order)}"]
     elif any(named) and order == "zyx":
         order = "".join(named)
     elif beside is not None and not any(named) and not request.axes_given:
@@ -97,31 +96,25 @@ def placed(
     world = [axes[kept[order.index(name)]] for name in SPACE]
     notes += [f"its {each.name} grows downwards: turned" for each in world if each.is_down]
     is_one, told = one_unit([axis.unit for axis in world])
-    missing = [name for name, axis in zip(SPACE, world) if not axis.step]
-    if 0 < len(missing) < 3:
-        lacking = " and ".join(missing)
+    lacking = " and ".join(name for name, axis in zip(SPACE, world) if not axis.step)
+    if any(axis.step for axis in world) and lacking:
         told += (f"it states no spacing along {lacking}: none is taken from it (give --spacing)",)
-    steps = starts = None
-    if is_one and not missing:
-        steps = [abs(axis.step or 0) for axis in world]
-        if None not in [axis.start for axis in world]:
-            starts = triple(axis.start for axis in world)
-    steps = _stated(attributes, "spacing", steps)
-    spacing = None if steps is None else triple(steps[SPACE.index(name)] for name in order)
+    is_known = is_one and not lacking
+    steps = _stated(attributes, "spacing", [abs(axis.step or 0) for axis in world], is_known)
+    starts = [axis.start for axis in world]
+    origin = _stated(attributes, "origin", starts, is_known and None not in starts)
+    along = [steps[SPACE.index(name)] for name in order] if steps else None
+    spacing = _stated(attributes, "element_size_um", along, bool(along))
     direction = axes_direction(order) * [-1 if (axes[n].step or 0) < 0 else 1 for n in kept]
     if "direction" in attributes:
         said = np.asarray(attributes["direction"])
         if said.size != 9 or said.dtype.kind not in "fiu":
             raise FileError(f"its attribute direction is {said.tolist()!r}: give nine numbers")
         direction = said.reshape(3, 3) @ direction
-    spacing = _stated(attributes, "element_size_um", spacing)
     if beside is not None and spacing is None:
         told += _unread({**beside, **attributes})
-    return {
-        "spacing": spacing,
-        "origin": _stated(attributes, "origin", starts),
-        **{"direction": direction, "index": index, "axes": order, "notes": (*notes, *told)},
-    }
+    place = {"spacing": spacing, "origin": origin, "direction": direction, "index": index}
+    return {**place, "axes": order, "notes": (*notes, *told)}
 
 
 def _unread(attributes: dict[str, Any]) -> tuple[str, ...]:
@@ -143,10 +136,10 @@ def _space_in(names: Sequence[str]) -> list[int] | None:
     return found if sorted(names[n] for n in found) == list(SPACE) else None
 
 
-def _stated(attributes: dict[str, Any], name: str, default: Any) -> Any:
-    """Return three numbers that an attribute states."""
+def _stated(attributes: dict[str, Any], name: str, default: Any, is_known: bool) -> Triple | None:
+    """Return three numbers that an attribute states, or the default, if that is known."""
     if name not in attributes:
-        return default
+        return triple(default) if is_known else None
     try:
         return triple(np.broadcast_to(np.asarray(attributes[name], np.float64).ravel(), 3))
     except (TypeError, ValueError):

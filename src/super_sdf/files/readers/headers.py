@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import zlib
 from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,6 @@ IN_SPACE = ("domain", "space", "???", "none")  # kinds of axes; others are lists
 SPACES = {"right-anterior-superior": RAS, "ras": RAS, "left-posterior-superior": LPS, "lps": LPS}
 # Fields in one spelling of those that the format allows
 SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
-NO_UNIT = ("?", "mm", "UNKNOWN")  # of MetaImage
 
 
 def read_nrrd(request: Request) -> Volume:
@@ -143,12 +143,9 @@ def read_metaimage(request: Request) -> Volume:
     lines = stated.before.decode(errors="replace").splitlines()
     pairs = (re.split("[=:]", line, maxsplit=1) for line in lines)
     fields = {pair[0].strip(): pair[-1].strip() for pair in pairs}
-
-    def is_true(name: str) -> bool:
-        return fields.get(name, "F")[:1] in ("T", "t", "1")  # as ITK reads it
-
-    names = stated.names() if stated.entry.lower() != "local" else []
-    files = [check_beside(path, name) for name in names]
+    true = {name for name, value in fields.items() if value[:1] in ("T", "t", "1")}  # as in ITK
+    is_local = stated.entry.lower() == "local"
+    files = [check_beside(path, name) for name in stated.names() if not is_local]
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
@@ -164,30 +161,34 @@ def read_metaimage(request: Request) -> Volume:
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
     data, start = (files[0], 0) if files else (path, stated.start)
     promised, follow = prod(size) * dtype.itemsize, data.stat().st_size - start
-    is_packed = is_true("CompressedData") and len(files) <= 1
+    is_packed = "CompressedData" in true and len(files) <= 1
     if not is_packed and len(files) <= 1 and promised > follow:
         raise FileError(f"{data} is truncated: {promised:,} bytes are promised, {follow:,} follow")
 
     def load(index: Index) -> Any:
         if not is_packed:
             return SimpleITK.GetArrayFromImage(reader.Execute()).T[index]
-        is_big = is_true("BinaryDataByteOrderMSB") or is_true("ElementByteOrderMSB")
-        unpacker = zlib.decompressobj()
-        numbers = unpacker.decompress(data.read_bytes()[start:], promised + 1)
-        if len(numbers) != promised or not unpacker.eof:
-            said = f"{data} is damaged: {promised:,} bytes are promised, and its compressed data is"
-            raise FileError(f"{said} torn or has others ({len(numbers):,})")
+        is_big = {"BinaryDataByteOrderMSB", "ElementByteOrderMSB"} & true
+        numbers = _unpacked(data, start, promised)
         values = np.frombuffer(numbers, dtype.newbyteorder(">" if is_big else "<"))
         return values.reshape(size[::-1]).T[index]
 
     index = request.pick(size)
     kept = kept_of(index)
-    steps = np.array(reader.GetSpacing())[kept]
+    steps, origin = (np.array(said)[kept] for said in (reader.GetSpacing(), reader.GetOrigin()))
     direction = np.array(reader.GetDirection()).reshape(len(size), -1)[np.ix_(kept, kept)]
-    origin = triple(np.array(reader.GetOrigin())[kept])
-    place = triple(np.abs(steps)), origin, direction * np.sign(steps)
-    unit = fields.get("DistanceUnits", "?")
-    notes = in_unit("" if unit in NO_UNIT else unit)
+    place = triple(np.abs(steps)), triple(origin), direction * np.sign(steps)
+    notes = in_unit(re.sub("^(mm|UNKNOWN|[?])$", "", fields.get("DistanceUnits", "")))
     if not {"ElementSpacing", "ElementSize"} & set(fields):
         notes += ("it states no ElementSpacing: taken as 1, as ITK does",)
     return Volume(load, size, dtype, *place, index, notes=notes, space=LPS)
+
+
+def _unpacked(data: Path, start: int, promised: int) -> bytes:
+    """Return what a zlib stream in a file holds."""
+    unpacker = zlib.decompressobj()
+    numbers = unpacker.decompress(data.read_bytes()[start:], promised + 1)
+    if len(numbers) != promised or not unpacker.eof:
+        said = f"{data} is damaged: {promised:,} bytes are promised, and its compressed data is"
+        raise FileError(f"{said} torn or has others ({len(numbers):,})")
+    return numbers

@@ -66,8 +66,9 @@ def read_dicom(request: Request) -> Volume:
         return _of_slices(list(_slices(series[uid])), notes)
     if len(series[uid]) > 1:
         raise GridError(f"{uid} is several segmentations: give one of its files")
-    chosen = [number for number, label in segments[uid].items() if label == name]
-    return _of_segments(*series[uid][0], segments[uid], chosen, notes)
+    found = segments[uid]
+    chosen = [number for number, label in found.items() if label == name or len(found) == 1]
+    return _of_segments(*series[uid][0], found, chosen, notes)
 
 
 def _images_in(path: Path) -> tuple[dict[str, list[Image]], tuple[str, ...]]:
@@ -153,13 +154,12 @@ def _of_segments(
 ) -> Volume:
     """Return the numbers of the segments, or 1 (or the fractions) in those ``chosen``; else 0."""
     frames = list(_slices([(path, header)]))
-    chosen = list(labels) if len(labels) == 1 else chosen
     first = frames[0]
     normal = np.cross(*first.across)
     heights = np.array([each.corner @ normal for each in frames])
-    gaps = np.diff(np.unique(heights.round(4)))
     groups = [*_items(header.SharedFunctionalGroupsSequence), header]
     between, thick = (_stated(groups, n) for n in ("SpacingBetweenSlices", "SliceThickness"))
+    gaps = np.diff(np.unique(heights.round(4)))
     step = float(between or (gaps.min() if len(gaps) else thick) or 0)
     if not step > 0:
         raise GridError("it states neither the spacing between slices nor their thickness")
