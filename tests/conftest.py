@@ -12,10 +12,11 @@ import pytest
 from batches import FAST, PLAIN
 from hypothesis import HealthCheck, settings
 
-from super_sdf import SdfGrid
+from super_sdf import Mesh, SdfGrid
 from super_sdf.arrays import NEIGHBOURHOOD
 from super_sdf.network import onnx
 from super_sdf.network.onnx import ort
+from super_sdf.truth.solid import Solid
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -132,3 +133,10 @@ def cpu_build(monkeypatch):
     """Make onnxruntime one that was built without CUDA, whichever is installed."""
     monkeypatch.setattr(ort, "get_available_providers", lambda: ["CPUExecutionProvider"])
     monkeypatch.setattr(onnx, "VERSION", f"onnxruntime {ort.__version__}")
+
+
+def farthest(mesh: Mesh, other: Mesh) -> float:
+    """Return the largest distance of ten points on every triangle of a mesh to another one."""
+    shares = np.array([[i, j, 3 - i - j] for i in range(4) for j in range(4 - i)]) / 3
+    points = np.einsum("pc,mcd->mpd", shares, mesh.vertices[mesh.faces].astype(np.float64))
+    return float(Solid(other).distance(points.reshape(-1, 3)).max())

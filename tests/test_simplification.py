@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from conftest import ball, count_fans, trilinear, walled
+from conftest import ball, count_fans, farthest, trilinear, walled
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from solids import cube, joined, sphere, square, torus
@@ -42,13 +42,6 @@ def refined(mesh: Mesh, times: int) -> Mesh:
         fine = fine.subdivide()
     fine.merge_vertices()
     return Mesh(np.array(fine.vertices), np.array(fine.faces, np.int32))
-
-
-def farthest(mesh: Mesh, other: Mesh) -> float:
-    """Return the largest distance of ten points on every triangle of a mesh to another one."""
-    shares = np.array([[i, j, 3 - i - j] for i in range(4) for j in range(4 - i)]) / 3
-    points = np.einsum("pc,mcd->mpd", shares, mesh.vertices[mesh.faces].astype(np.float64))
-    return float(Solid(other).distance(points.reshape(-1, 3)).max())
 
 
 def genus(mesh: Mesh) -> int:

@@ -21,13 +21,7 @@ from ..pipeline import refine_band
 from ..refine.band import survey
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
 from ..surface.marching import strides
-from ..threads import (
-    Progress,
-    StepCounter,
-    check_bound,
-    part_of,
-    useful_threads,
-)
+from ..threads import Progress, StepCounter, check_bound, part_of, useful_threads
 from .walls import Labelled, Labels
 
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
@@ -148,11 +142,7 @@ def could_hold(mask: BoolArray, ijk: IntArray) -> BoolArray:
 
 
 def share_border(
-    holder: Labels,
-    voxel_ijk: IntArray,
-    shape: NDArray[np.intp],
-    index: VoxelIndex,
-    factor: int,
+    holder: Labels, voxel_ijk: IntArray, shape: NDArray[np.intp], index: VoxelIndex, factor: int
 ) -> None:
     """Give nodes of voxels beyond the border, on it, the holders that voxels inside gave them."""
     outer = np.flatnonzero(((voxel_ijk < 0) | (voxel_ijk >= shape)).any(1))

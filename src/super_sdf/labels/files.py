@@ -93,13 +93,7 @@ def convert_labels(
     wanted, place = in_order(options.labels), {name: getattr(options, name) for name in PLACE}
     image = find_image(source, wanted, place, options.axes, options.max_memory, options.space)
     grid, called = image.grid, names_of(image.labels, known)
-    ends = {n: called[n].name if n in known else str(n) for n in called}
-    ends = {n: re.sub(r"[^\w.-]+", "_", end).strip("._") or "label" for n, end in ends.items()}
-    ends = {n: end.encode()[:LONGEST].decode(errors="ignore") for n, end in ends.items()}
-    path, ends = Path(target), told_apart(ends, "-")
-    paths = [path.with_name(f"{path.stem}-{end}{path.suffix}") for end in ends.values()]
-    if has_parts(path):
-        paths = [path] * len(called)
+    paths = paths_of(Path(target), called, known)
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
@@ -131,6 +125,17 @@ def convert_labels(
         notes.append(f"no sample has a label that was asked for: {listed}")
     said = (*grid.notes, *notes)
     return LabelConversion(grid, rows, missing, said, watch.seconds, tuple(warnings))
+
+
+def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
+    """Return the file of each label: the target, if that holds several meshes, or its own."""
+    if has_parts(target):
+        return [target] * len(called)
+    ends = {n: called[n].name if n in known else str(n) for n in called}
+    ends = {n: re.sub(r"[^\w.-]+", "_", end).strip("._") or "label" for n, end in ends.items()}
+    ends = {n: end.encode()[:LONGEST].decode(errors="ignore") for n, end in ends.items()}
+    named = told_apart(ends, "-").values()
+    return [target.with_name(f"{target.stem}-{end}{target.suffix}") for end in named]
 
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:

@@ -26,7 +26,7 @@ from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.contract import Decoder, adapt
 from ..network.network import load_network, network_for
-from ..simplify.collapsing import collapse_edges, within
+from ..simplify.collapsing import Unsimplified, collapse_edges, within
 from ..simplify.measuring import Original
 from ..simplify.walls import Walls, faults, meshes_of
 from ..surface.mesh import Mesh, vertex_type
@@ -228,11 +228,10 @@ def label_meshes(
     else:
         walls = spared(walls, SLIGHT * voxel, voxel / factor)
     if error := chosen.error(voxel):
-        originals = [Original(mesh) for mesh in meshes_of(walls, count)]
-        if found := within(walls, originals, error, lambda: None):
-            walls = found
-        else:
+        found = within(Unsimplified(walls, [*map(Original, meshes_of(walls, count))]), error)
+        if not found:
             warnings.append("the meshes were not simplified: no way was found within the error")
+        walls = found or walls
     return meshes_of(walls, count), notes, warnings
 
 

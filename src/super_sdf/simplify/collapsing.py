@@ -16,10 +16,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import BoolArray, face_normals
 from ..surface.mesh import Mesh, row_keys
@@ -49,26 +48,28 @@ Pass = Sequence[dict[str, float]]
 """What ``collapse_edges`` is told, step by step."""
 
 
-def collapsed(
-    walls: Walls,
-    passes: Sequence[Pass],
-    originals: Sequence[Original],
-    error: float,
-    count_round: Callable[[], None],
-) -> Walls | None:
+class Unsimplified(NamedTuple):
+    """What is simplified, what each of its labels is measured against, and what counts rounds."""
+
+    walls: Walls
+    originals: list[Original]
+    count_round: Callable[[], None] = lambda: None
+
+
+def collapsed(of: Unsimplified, passes: Sequence[Pass], error: float) -> Walls | None:
     """Return what the last pass makes once nothing is wrong with it, None if that fails.
 
     Right are walls of which each label is within the error of its original, with no place that is
-    less of a manifold than in ``walls``, without triangles that intersect, with all components and
+    less of a manifold than it was, without triangles that intersect, with all components and
     their holes.
     """
-    is_original = originals[0].mesh.faces is walls.faces
-    stages, solids = [walls], [originals[0].solid if is_original else Solid(walls)]
+    is_original = of.originals[0].mesh.faces is of.walls.faces
+    stages, solids = [of.walls], [of.originals[0].solid if is_original else Solid(of.walls)]
     kept: list[BoolArray] = []  # triangles of each stage but the last
     places, since = np.zeros((0, 3)), np.zeros(0, np.intp)  # to keep, and from which pass on
-    first, before = 0, irregular_places(walls)  # pass that is to be made anew
+    first, before = 0, irregular_places(of.walls)  # pass that is to be made anew
     for _ in range(MOST_REPEATS):
-        count_round()
+        of.count_round()
         del stages[first + 1 :], solids[first + 1 :], kept[first:]
         for number, steps in enumerate(passes[first:], first):
             result, held = stages[number], np.zeros(len(stages[number].vertices), bool)
@@ -83,7 +84,7 @@ def collapsed(
                 return None
             stages.append(result)
             solids.append(Solid(result))
-        wrong, lost, is_same = examine(result, walls, before, solids[-1], originals, error)
+        wrong, lost, is_same = examine(of, result, solids[-1], before, error)
         if not len(wrong) and is_same:
             return result
         if not len(wrong) and not len(lost):
@@ -103,24 +104,19 @@ def collapsed(
 
 
 def examine(
-    result: Walls,
-    walls: Walls,
-    before: NDArray[np.float64],
-    solid: Solid,
-    originals: Sequence[Original],
-    error: float,
+    of: Unsimplified, result: Walls, solid: Solid, before: Points, error: float
 ) -> tuple[Points, Points, bool]:
     """Return where a result is wrong; if nowhere, also lost components, and if the topology stays.
 
-    ``before`` are the irregular places of the ``walls`` that it was made of, ``solid`` is its own.
+    ``before`` are the irregular places of what it was made of, (n, 6), ``solid`` is its own.
     """
-    labels = [solid]
-    if len(originals) > 1:
-        labels = [Solid(mesh) for mesh in meshes_of(result, len(originals))]
-    none, pairs = np.zeros((0, 3)), list(zip(originals, labels))
+    labels, count = [solid], len(of.originals)
+    if count > 1:
+        labels = [Solid(mesh) for mesh in meshes_of(result, count)]
+    none, pairs = np.zeros((0, 3)), list(zip(of.originals, labels))
     if not all(len(label.mesh.faces) for label in labels):
         return none, none, False
-    wrong = [faults_made(result, walls, before, solid)]
+    wrong = [faults_made(result, of.walls, before, solid)]
     if error < np.inf:
         wrong += [original.compare(label, error)[0] for original, label in pairs]
     if len(far := np.concatenate(wrong)):
@@ -129,7 +125,7 @@ def examine(
     return far, np.concatenate([none, *(lost_places(*pair) for pair in others)]), not others
 
 
-def faults_made(result: Walls, walls: Walls, before: NDArray[np.float64], solid: Solid) -> Points:
+def faults_made(result: Walls, walls: Walls, before: Points, solid: Solid) -> Points:
     """Return where walls are less of a manifold than those they were made of, or meet themselves.
 
     ``before`` are the irregular places of the latter, ``solid`` is that of the former.
@@ -172,36 +168,33 @@ def lost_places(original: Original, mesh: Mesh) -> Points:
     return original.mesh.vertices[missing].astype(np.float64)
 
 
-def within(
-    walls: Walls, originals: Sequence[Original], error: float, count_round: Callable[[], None]
-) -> Walls | None:
+def within(of: Unsimplified, error: float) -> Walls | None:
     """Return walls within a distance of the originals; None if no triangle can be spared."""
     for halving in range(HALVINGS):
         unit = error / 2**halving
         passes = [[{"distance": unit * share} for share in steps] for steps in PLANE_DISTANCES]
         for some in (passes, passes[:1]):
-            result = collapsed(walls, some, originals, error, count_round)
-            if result and len(result.faces) < len(walls.faces):
+            result = collapsed(of, some, error)
+            if result and len(result.faces) < len(of.walls.faces):
                 return result
     return None
 
 
-def down_to(
-    walls: Walls, original: Original, triangles: int, count_round: Callable[[], None]
-) -> Walls:
+def down_to(of: Unsimplified, triangles: int) -> Walls:
     """Return walls of at most ``triangles`` triangles, or the fewest that are found.
 
     The error is sought that leaves hardly fewer. Each error that is tried is a whole
     simplification, so that the mesh is as good as that of the error.
     """
+    walls = of.walls
     if len(walls.faces) <= triangles:
         return walls
     farthest = FARTHEST * float(np.linalg.norm(np.ptp(walls.vertices, axis=0)))
-    error = min(FIRST_ERROR * original.side * len(walls.faces) / triangles, farthest)
+    error = min(FIRST_ERROR * of.originals[0].side * len(walls.faces) / triangles, farthest)
     low, more, high, fewer = 0.0, len(walls.faces), np.inf, 0  # errors and what they leave
     reached, least = None, walls
     for _ in range(MOST_ERRORS):
-        result = within(walls, [original], error, count_round) or walls
+        result = within(of, error) or walls
         left = len(result.faces)
         if left <= triangles:
             reached, high, fewer = result, error, left
@@ -222,7 +215,7 @@ def down_to(
     if reached:
         return reached
     steps = [{"triangles": float(triangles)}] * 5  # whatever the distance
-    exact = collapsed(least, [steps], [original], np.inf, count_round)
+    exact = collapsed(of._replace(walls=least), [steps], np.inf)
     return exact if exact and len(exact.faces) <= triangles else least
 
 

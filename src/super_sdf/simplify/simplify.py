@@ -92,7 +92,7 @@ def simplify_mesh(
     way_out = "use a smaller factor, do not simplify, or "
     check_bound(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", most, way_out)
     from ..truth.solid import Solid
-    from .collapsing import down_to, within  # need the extra
+    from .collapsing import Unsimplified, down_to, within  # need the extra
     from .measuring import Deviation, Original
     from .walls import Walls
 
@@ -106,13 +106,13 @@ def simplify_mesh(
             progress(1 - left)
         left *= LEFT
 
-    walls, warnings = Walls.of(mesh), tuple[str, ...]()
+    of, warnings = Unsimplified(Walls.of(mesh), [original], count_round), tuple[str, ...]()
     if triangles is None:
-        found = within(walls, [original], error or 0.0, count_round)
+        found = within(of, error or 0.0)
         if not found:
             warnings = (NONE_SPARED,)
     else:
-        error, found = float("inf"), down_to(walls, original, triangles, count_round)
+        error, found = float("inf"), down_to(of, triangles)
         if len(found.faces) > triangles:
             warnings = (UNREACHED.format(triangles, len(found.faces)),)
     result = Mesh(found.vertices, found.faces) if found else mesh
