@@ -136,7 +136,7 @@ ASKED = {"function": torus, "bounds": BOX, "spacing": H}
     ({"function": torus}, OptionError, "a function needs bounds and spacing, or a grid of its "),
     ({**ASKED, "bounds": (1, -1)}, OptionError, "bounds are (1, -1): the box is empty, give "),
     ({**ASKED, "function": lambda p: p}, OptionTypeError,
-     "the function returns an array of shape (162, 3) for 162 points: return one number for each"),
+     "the function returns an array of shape (8, 3) for 8 points: return one number for each"),
     ({**ASKED, "function": lambda p: np.full(len(p), np.nan)}, GridError,
      "the function has no finite value at any sample: give other bounds"),
     ({**ASKED, "function": lambda p: np.tanh(8 * torus(p)), "offset": 0.01}, OptionError,

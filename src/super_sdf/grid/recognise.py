@@ -66,7 +66,7 @@ CONTRADICTIONS = 0.003  # exact and cut off 0; noise of .05 voxel from .009; oth
 STRAIGHT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
 EXACT = 0.02  # spacings, and share of a slope: the error of differences of exact distances
 SAME_UNIT = 0.01  # from 1: exact to .002; saturating and smooth unions from .019
-ANOTHER_UNIT = 0.05  # from 1: up to this, values are divided by their slope, with a note
+ANOTHER_UNIT = 0.03  # from 1: up to this, values are divided by their slope, with a note
 MOST_DIGIT = 0.12  # spacings: the last digit of rounded distances
 MATTERS = 3.0  # spacings: values farther from 0 may be anything
 NARROW = 4.5  # spacings up to which values that are cut off have too few slopes to judge
@@ -294,16 +294,20 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
     shares = {look.low: look.at_ends[0], look.high: look.at_ends[1], **look.common}
     frequent = [value for value, share in shares.items() if share >= CUT]
     pairs = look.all_pairs * look.scale
-    change, is_frequent = np.abs(pairs[0] - pairs[1]), np.isin(pairs, frequent)
-    usual = change[~is_frequent.any(0)]
+    change, is_frequent = np.abs(pairs[0] - pairs[1]), np.isin(pairs, frequent).all(0)
     found = []
-    for value in frequent if len(usual) else ():
-        steps = change[(pairs == value).any(0) & ~is_frequent.all(0)]
-        jumps = float((steps > JUMP * np.quantile(usual, 0.99)).mean()) if len(steps) else 0.0
+    for value in frequent:
+        at = (pairs == value).any(0)
+        steps = change[at & ~is_frequent]
+        if not len(steps) or at.all():
+            continue
+        jumps = float((steps > JUMP * np.quantile(change[~at], 0.99)).mean())
         if jumps > 0.5:
             found.append(value)
         elif jumps > MIXED and value in facts["cut"]:
             facts["perhaps_unknown"] = value
+    # far inside and far outside a value may stand for "unknown" with either sign
+    found += [x for x in (look.low, look.high) if -x in found and x not in found]
     if found:
         facts["unknown_values"] = found
         facts["cut"] = [x for x in facts["cut"] if x not in found]
