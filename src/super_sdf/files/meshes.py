@@ -148,7 +148,7 @@ def write_meshes(
         for path, parts in files.items():
             suffix, meshes, origin = path.suffix.lower(), list(parts.values()), world.origin
             for mesh in meshes:
-                _check_arrays(mesh)
+                check_mesh(mesh)
             boxes = [(m.vertices.min(0), m.vertices.max(0)) for m in meshes if len(m.vertices)]
             if suffix == ".glb" and boxes and meshes[0].vertices.dtype != np.float32:
                 x, y, z = np.min(boxes, axis=(0, 1)) / 2 + np.max(boxes, axis=(0, 1)) / 2
@@ -162,18 +162,6 @@ def write_meshes(
             before_rename(complete)
         for path in files:
             check_free(path, force=force)  # before the first of them appears
-
-
-def _check_arrays(mesh: Mesh) -> None:
-    """Raise MeshError if arrays are no mesh."""
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    for name, array, kinds in (("vertices", vertices, "f"), ("faces", faces, "iu")):
-        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
-            said = f"the {name} of the mesh are {array.dtype} of shape {array.shape}"
-            raise MeshError(f"{said}: give rows of three {'floats' if kinds == 'f' else 'indices'}")
-    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
-        worst = int(faces.min() if faces.min() < 0 else faces.max())
-        raise MeshError(f"a face of the mesh names vertex {worst} of {len(vertices):,}: repair it")
 
 
 def _check_holds(path: Path, mesh: Mesh, origin: Triple) -> None:

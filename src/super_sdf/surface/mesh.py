@@ -157,13 +157,17 @@ class Mesh:
 
 
 def check_mesh(mesh: Any) -> None:
-    """Raise OptionTypeError if ``mesh`` is not a ``Mesh``, MeshError if a face has no vertex."""
+    """Raise OptionTypeError if ``mesh`` is no ``Mesh``, MeshError if its arrays are no mesh."""
     if not isinstance(mesh, Mesh):
         raise OptionTypeError(f"mesh is {seen(mesh)}: give one from reconstruct(grid)")
-    faces, count = mesh.faces, len(mesh.vertices)
-    if len(faces) and not 0 <= faces.min() <= faces.max() < count:
-        wrong = next(n for n in (faces.max(), faces.min()) if not 0 <= n < count)
-        raise MeshError(f"a face names vertex {wrong}, of {count}: give 0 to {count - 1}")
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    for name, array, kinds in (("vertices", vertices, "f"), ("faces", faces, "iu")):
+        if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in kinds:
+            said = f"the {name} of the mesh are {array.dtype} of shape {array.shape}"
+            raise MeshError(f"{said}: give rows of three {'floats' if kinds == 'f' else 'indices'}")
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
+        worst = int(faces.min() if faces.min() < 0 else faces.max())
+        raise MeshError(f"a face of the mesh names vertex {worst} of {len(vertices):,}: repair it")
 
 
 def row_keys(rows: NDArray[np.float64]) -> NDArray[np.uint64]:
