@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, Triple, cross
 from ..arrays import unit as of_length_1
-from ..errors import FileError, MeshError, OptionError
+from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
 from ..surface.mesh import Mesh, check_mesh
 from .output import check_free, replacing
