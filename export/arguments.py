@@ -23,7 +23,7 @@ class Parser(argparse.ArgumentParser):
         try:
             yield
         except (SuperSdfError, OSError) as error:
-            self.exit(1, f"Error: {error}\n")
+            self.exit(1, f"Error: {getattr(error, 'flagged', error)}\n")
 
 
 def share(text: str) -> float:

@@ -24,7 +24,7 @@ from export.dataset import draw_mesh, mesh_order
 from export.shapes.solid import random_solid
 from super_sdf import Mesh, load_network, upsample
 from super_sdf.errors import SuperSdfError
-from super_sdf.surface import cap, extract, marching
+from super_sdf.surface import cap, marching
 from super_sdf.surface.sharp import features, patches, planes
 from super_sdf.truth import sampling, solid
 
@@ -62,7 +62,7 @@ def rows_of(mesh: Mesh, size: int, network: Any) -> tuple[np.ndarray, np.ndarray
     for way in SHARES:
         placed = features.place(found, own, candidates, np.full(len(candidates.patch), way))
         patch, corners = patches.triangles_of(found, placed, np.ones(len(found.row), bool))
-        points = extract.to_world(placed.points[corners].reshape(-1, 3).T, FACTOR, grid)
+        points = grid.to_world(placed.points[corners].reshape(-1, 3) / FACTOR - 0.5)
         errors = errors_of(truth, patch, points.reshape(-1, 3, 3), len(found.row))
         losses.append((errors[candidates.patch] / (DISTANCE / size, TURN)).sum(1))
     return candidates.evidence, np.stack(losses, 1)

@@ -29,10 +29,10 @@ def main() -> int:
     try:
         return import_module(f"lab.{command}").main() or 0
     except OptionError as error:
-        print(f"Error: {error}", file=sys.stderr)
+        print(f"Error: {getattr(error, 'flagged', error)}", file=sys.stderr)
         return 2
     except (SuperSdfError, OSError) as error:
-        print(f"Error: {error}", file=sys.stderr)
+        print(f"Error: {getattr(error, 'flagged', error)}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         print("Error: interrupted; what was measured is kept", file=sys.stderr)

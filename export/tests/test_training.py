@@ -148,7 +148,7 @@ def test_a_network_starts_from_one_with_fewer_blocks_and_has_its_values(tmp_path
         with torch.no_grad():
             values = [predict(each, batch, encode(each, batch)) for each in (net, run.average)]
         torch.testing.assert_close(*values)
-    with pytest.raises(train.OptionError, match=r"^--start has a network of another size: "):
+    with pytest.raises(train.OptionError, match=r"^start has a network of another size: "):
         run.start_from(SuperSdfNet(replace(SMALL, hidden=64)).state_dict())
 
 

@@ -81,6 +81,6 @@ def test_meshes_are_at_the_place_and_size_of_the_shape(name, case, fast):
 
 
 def test_what_the_values_were_taken_as(case, fast):
-    pairs = ("mask", "mask"), ("cut off at 1", "distance"), ("noise of 0.25", "noisy")
+    pairs = ("mask", "mask"), ("cut off at 2", "distance"), ("noise of 0.25", "noisy")
     for name, kind in pairs:
         assert mesh_of(f"ours on {name}", case, fast).facts["taken_as"] == kind

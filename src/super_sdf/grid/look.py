@@ -31,6 +31,7 @@ LEVELS = 63  # that are tried
 AS_GOOD = 0.9  # of the largest mean step of neighbours over a level
 GROWS = 2.0  # times the share of all samples, that of the border above a level of unsigned values
 SHARE, LEAST = 0.05, 20  # of the most steps over any level, and steps, that count
+MOST_OUTSIDE = 0.65  # of the border, above a level: maps of noise to .55, distances from .76
 MOST_NAMED = 8  # labels that a message lists
 TRIED = 4096  # samples whose different values are counted first
 
@@ -361,7 +362,7 @@ def which_level(look: Look, *, signed: bool = False, shift: float = 0.0, unit: f
     if at < len(values) and values[at] == level:
         beside = values[at - 1] if at else values[at + 1]
         level = float(beside + values[at]) / 2
-    outside = border_share(look, lambda x: x / unit > level - shift) > 0.9
+    outside = border_share(look, lambda x: x / unit > level - shift) > MOST_OUTSIDE
     option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
     other = " (or --field smooth, if it is at 0)" if signed else ""
     return f"they look like densities: give the level of their surface, such as {option}{other}"
