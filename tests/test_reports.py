@@ -102,3 +102,19 @@ def test_a_large_label_is_named_in_full():  # seung-lab/chunkflow 138
     values = np.where(MASK, np.uint64(720575940379279312), np.uint64(0))
     values[0, 0, 0] = 720575940379279007
     assert "label=720575940379279312," in refusal(GridError, make_grid, values)
+
+
+def test_a_slope_that_is_a_little_off_is_divided_out():
+    grid = make_grid(1.02 * ball(12), spacing=1)
+    assert grid.field.kind == "distance"
+    assert grid.notes[0].startswith("the values change by 1.02 of a spacing")
+    assert reconstruct(grid).volume() == pytest.approx(volume_of(12), rel=1e-3)
+
+
+@pytest.mark.parametrize("size", [1e200, 1e-200])
+def test_a_function_of_any_size_has_the_same_surface(size):
+    def values(points):
+        return size * (np.sqrt((points**2).sum(1)) - 0.6)
+
+    mesh = reconstruct(function=values, bounds=(-1, 1), spacing=0.1)
+    assert mesh.volume() == pytest.approx(volume_of(0.6), rel=0.01)

@@ -118,7 +118,7 @@ class DistanceFunction:
         known = samples[np.isfinite(samples)]
         if not len(known):
             raise GridError("the function has no finite value at any sample: give other bounds")
-        least, most = float(known.min()), float(known.max())
+        least, most = known.min() * scale, known.max() * scale
         if not least < 0 < most:
             raise GridError(
                 f"the function goes from {least:.6g} to {most:.6g} at {len(known):,} samples, and "

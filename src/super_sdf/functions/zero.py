@@ -89,7 +89,7 @@ def unit_of(function: DistanceFunction, grid: SdfGrid) -> float:
     found = function(grid.to_world(near))
     some = np.isfinite(found) & (known != 0)
     ratio = float(np.median(found[some] / known[some])) if some.any() else 1.0
-    other = float(np.mean(found[some] / known[some] * ratio < 0)) if some.any() else 0.0
+    other = float(np.mean(found[some] / known[some] * np.sign(ratio) < 0)) if some.any() else 0.0
     if other > MOST_OTHER or ratio == 0:
         raise OptionError(
             f"function has another side than the grid at {other:.0%} of the samples near the "

@@ -50,7 +50,7 @@ class Slab(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """All that is asked of the samples. The kept ones are float64, NaN if unknown or beyond."""
+    """What is known of a grid's samples; in float64 arrays, NaN is unknown or beyond the grid."""
 
     shape: tuple[int, ...]
     low: float  # of the finite samples

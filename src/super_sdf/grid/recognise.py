@@ -203,7 +203,7 @@ def _are_whole(values: Floats) -> bool:
 
 
 def _share_amid(look: Look, distinct: NDArray[Any], counts: NDArray[np.int64], least: int) -> float:
-    """Return the share of samples off the background that equal so many of their neighbours."""
+    """Return the share of samples off the background that equal ``least`` neighbours or more."""
     background, equal, total = distinct[counts.argmax()], 0, 0
     for slab in look.slabs:
         values, neighbours = equal_neighbours(slab)

@@ -103,7 +103,7 @@ def label_fields(
 
 
 def check_room(samples: int, voxels: int, labels: int, nodes: int, bound: int | None) -> None:
-    """Raise OutOfMemoryError if labels with so many voxels at their walls need too much memory."""
+    """Raise OutOfMemoryError if labels in a number of samples need more memory than the bound."""
     need = SAMPLE_BYTES * samples + voxels * (VOXEL_BYTES + NODE_BYTES * nodes)
     what = f"meshing {labels} labels in {samples:,} samples, {voxels:,} of them at walls,"
     check_bound(need, what, bound, "choose fewer (--labels), a smaller factor, cut the image, or ")
