@@ -22,7 +22,7 @@ Extremes: TypeAlias = tuple[float, float]
 """The smallest and the largest sample."""
 
 WHOLE = 1 << 18  # samples of a grid that is a part as it is
-SLABS, CLOSER = (6, 16), 1 << 20  # how many planes, least and most; samples of all of them, about
+SLABS, CLOSER = (4, 8), 1 << 20  # how many planes, least and most; samples of all of them, about
 BOXES, LINES, PAIRS = 3000, 8000, 5300  # that are kept
 FREQUENT = 0.01  # share of the samples, amid equal ones, that have one value
 MOST_LABELS, FEW = 1000, 3  # different values that are listed; that are looked for first
