@@ -27,7 +27,8 @@ from ..grid.samples import SamplePlanes, in_blocks
 from ..grid.sdf_grid import SdfGrid
 from ..options import OPTIONS, check_path
 from ..refine.band import neighbour_table
-from ..refine.field import FineField, FineLattice, SampleSpheres, fine_grid, lattice_shape
+from ..refine.bounds import SampleSpheres
+from ..refine.field import FineField, FineLattice, fine_grid, lattice_shape
 from ..refine.nodes import share_parts
 from ..surface.cap import check_all_seen, find_border_inside
 from ..threads import check_fits
@@ -55,7 +56,8 @@ def write_sparse(field: FineField, path: Path) -> None:
     exact = np.dtype("<f4" if is_power else "<f8")
     samples, distances = none, np.empty(0)
     if field.spheres is not None:
-        samples = field.spheres.voxel_ijk
+        places = np.unravel_index(field.spheres.number, field.shape)
+        samples = np.stack(places, 1).astype(np.int32)
         distances = field.in_world_units(field.spheres.distance)
     arrays: dict[str, Any] = {
         "version": VERSION,
@@ -295,7 +297,7 @@ def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
     distances = in_half_voxels(arrays["sample_distances"])
     return replace(
         plain,
-        spheres=SampleSpheres(shape, arrays["sample_voxels"], distances),
+        spheres=SampleSpheres(shape, arrays["sample_voxels"] @ (ny * nz, nz, 1), distances),
         grid=grid,
         offset=float(arrays["offset"]),
         leaves=bool(arrays["leaves"]),
