@@ -423,8 +423,7 @@ def find_spheres(wedges: Wedges, voxel: IntArray, spheres: SampleSpheres) -> Nea
     wedge, place = np.nonzero(kept)
     number = number[of_wedge[wedge], place]
     centre = np.stack(np.unravel_index(spheres.number[number], spheres.shape)) + 0.5
-    tangent = wedges.tangent.take(wedge, 1)
-    convex = wedges.convex[wedge]
+    tangent, convex = wedges.tangent.take(wedge, 1), wedges.convex[wedge]
     may_touch = (np.sign(spheres.distance[number]) == convex) & tangent.any(0)
     outward = -convex * wedges.sides.take(wedge, 2)
     columns = centre, radius[number].astype(np.float64), tangent, outward, wedges.cosine[wedge]
