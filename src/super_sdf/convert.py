@@ -173,13 +173,8 @@ def _warnings(grid: SdfGrid, made: Result, offset: float) -> list[str]:
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if grid.field.network and not grid.field.sides_only:  # else nothing can be noisy
-        if counts["noisy_voxels"]:
-            share = 100 * counts["noisy_voxels"] / counts["band_voxels"]
-            differ = f"in {share:.3g} % of the band the values differ by more than distances can"
-            warnings.append(f"{differ}: they are taken as noisy there, and corrected")
-        if pinned := counts["pinned_nodes"]:
-            contradict = f"{pinned} fine values contradict the coarse ones around them"
-            way = "were given their sign: the input is no distance field there"
-            warnings.append(f"{contradict} and {way}")
+    if counts["noisy_voxels"] and grid.field.network and not grid.field.sides_only:
+        share = 100 * counts["noisy_voxels"] / counts["band_voxels"]
+        differ = f"in {share:.3g} % of the band the values differ by more than distances can"
+        warnings.append(f"{differ}: they are taken as noisy there, and corrected")
     return warnings

@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,16 +30,15 @@ from .refine import nodes
 from .refine.band import (
     Band,
     BandSummary,
-    BandTooLargeError,
     neighbour_table,
     no_surface,
-    summarise,
     survey,
+    survey_within,
 )
-from .refine.bounds import keep_within_bounds
-from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
+from .refine.bounds import SampleSpheres, keep_within_bounds
+from .refine.field import COUNTS, FineField, border_is_crossed
 from .refine.prediction import interpolate, predict
-from .refine.spheres import fit_to_spheres, spheres_of_band
+from .refine.spheres import fit_to_spheres
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
@@ -76,14 +74,15 @@ def refine_band(
     del table
     nodes.average_shared(blocks, parts, factor, threads)  # Eq. 7
     index = nodes.VoxelIndex(own_ijk, grid.shape)
-    fit_to_spheres(blocks, parts, factor, spheres_of_band(band, threads), index, threads)
+    fit_to_spheres(blocks, parts, factor, band, index, threads)
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
     decoded = blocks[:, :-1]
     if grid.field.sides_only:
         nodes.hold_sides(decoded, factor, patches[voxels, CENTRE])
-    pinned = nodes.pin_to_skipped(decoded, parts, factor, own_ijk, patches[voxels], grid.shape)
+    nodes.pin_to_skipped(decoded, parts, factor, own_ijk, patches[voxels], grid.shape)
     steps.finish("nodes")
-    unseen = grid.field.unseen
+    unseen, exact = grid.field.unseen, band.exact
+    number = np.ravel_multi_index(tuple(band.voxel_ijk[exact].T), grid.shape)
     return FineField(
         grid.shape,
         factor,
@@ -92,11 +91,10 @@ def refine_band(
         parts,
         grid,
         band.offset,
-        SampleSpheres(grid.shape, band.voxel_ijk[band.exact], patches[band.exact, CENTRE]),
+        SampleSpheres(grid.shape, number, patches[exact, CENTRE]),
         band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
         found=(len(patches), band.count_noisy()),
-        pinned=pinned,
     )
 
 
@@ -315,28 +313,32 @@ def mesh_grid(
     mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
-    room, parts = Room.of(chosen.max_memory, factor, decoder.memory_bytes), list[Part]()
-    if map_tiles is None and least_tiles == 1:
-        with suppress(BandTooLargeError):
-            parts = [make_tile(task, decoder, steps, save_field, room.voxels())]
-    counts = dict[str, int]()
-    if not parts and save_field:
+    room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
+    most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
+    bands, whole = survey_within(lattice, chosen.offset, most, threads=threads)
+    steps.finish("band")
+    if bands:
+        parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
+    elif save_field:
         raise OutOfMemoryError(
             f"the refined field does not fit in the {in_words(room.bound)} that may be used: use a "
             "smaller factor, allow more (--max-memory), or leave --save-field out"
         )
-    if not parts:
-        whole = summarise(lattice, chosen.offset, threads)
-        counts = {"band_voxels": int(whole.cells.sum()), "noisy_voxels": whole.noisy}
-        tasks = _tiles_of(replace(task, whole=whole), decoder, room, least_tiles)
-        steps.finish("band")
-        for part in (map_tiles or map)(partial(make_tile, network=decoder), iter(tasks)):
+    else:
+        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
+        tiles, parts = plan(shape, whole, margin, room, least_tiles), list[Part]()
+        tasks = (
+            replace(task, tile=tile, grid=crop(lattice, tile.low, tile.high), whole=whole)
+            for tile in tiles
+        )
+        for part in (map_tiles or map)(partial(make_tile, network=decoder), tasks):
             parts.append(part)
-            steps.show(steps.done + (1 - steps.done) * len(parts) / len(tasks))
+            steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
     count = len(parts)
     leaves, is_cut = any(part.leaves for part in parts), any(part.is_cut for part in parts)
-    counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS} | counts
+    counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
+    counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, chosen.offset)
@@ -346,29 +348,16 @@ def mesh_grid(
     return Result(mesh, lattice, edges, counts, leaves, steps.seconds, count)
 
 
-def _tiles_of(task: Task, network: Adapter, room: Room, least: int) -> list[Task]:
-    """Return the tasks of the tiles of a grid, the task of which has the summary of its band."""
-    assert task.whole
-    margin = margin_of(task.grid, network.receptive_field, task.mesher, task.factor)
-    tiles = plan(task.shape, task.whole, margin, room, least)
-    return [replace(task, tile=tile, grid=crop(task.grid, tile.low, tile.high)) for tile in tiles]
-
-
 def make_tile(
     task: Task,
     network: Adapter,
+    band: Band | None = None,
     steps: StepCounter | None = None,
     save_field: Callable[[FineField], None] | None = None,
-    most: float = np.inf,
 ) -> Part:
-    """Return the part of the mesh that belongs to a tile, which may be the whole grid.
-
-    BandTooLargeError if there are more than ``most`` voxels near the surface.
-    """
+    """Return the part of the mesh that belongs to a tile, which may be the whole grid."""
     tile, chosen, factor, threads = task.tile, task.options, task.factor, task.threads
-    band = survey(task.grid, chosen.offset, threads=threads, whole=task.whole, most=most)
-    if steps:
-        steps.finish("band")
+    band = band or survey(task.grid, chosen.offset, threads=threads, whole=task.whole)
     if not band.decoded.any():
         return Part.without_surface(tile)
     field = refine_band(band, network, factor, threads, steps)
