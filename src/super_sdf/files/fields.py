@@ -54,11 +54,7 @@ def write_sparse(field: FineField, path: Path) -> None:
     # float32 is exact where world units only change exponents
     is_power = math.frexp(grid.voxel_size)[0] == 0.5 and 1e-20 < grid.voxel_size < 1e20
     exact = np.dtype("<f4" if is_power else "<f8")
-    samples, distances = none, np.empty(0)
-    if field.spheres is not None:
-        places = np.unravel_index(field.spheres.number, field.shape)
-        samples = np.stack(places, 1).astype(np.int32)
-        distances = field.in_world_units(field.spheres.distance)
+    samples = field.spheres or SampleSpheres(field.shape, np.empty(0, int), np.empty(0, np.float32))
     arrays: dict[str, Any] = {
         "version": VERSION,
         "shape": field.shape,
@@ -70,8 +66,8 @@ def write_sparse(field: FineField, path: Path) -> None:
         "leaves": field.leaves,
         "values": field.block_distances().astype(exact).reshape(-1, side, side, side),
         "voxels": field.voxel_ijk,
-        "sample_voxels": samples,
-        "sample_distances": distances.astype(exact),
+        "sample_voxels": np.stack(np.unravel_index(samples.number, field.shape), 1).astype("i4"),
+        "sample_distances": field.in_world_units(samples.distance).astype(exact),
         "border_inside": find_border_inside(field) if field.leaves else none,
     }
     with path.open("wb") as file:
