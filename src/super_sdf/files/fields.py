@@ -27,7 +27,8 @@ from ..grid.samples import SamplePlanes, in_blocks
 from ..grid.sdf_grid import SdfGrid
 from ..options import OPTIONS, check_path
 from ..refine.band import neighbour_table
-from ..refine.field import FineField, FineLattice, SampleSpheres, fine_grid, lattice_shape
+from ..refine.bounds import SampleSpheres
+from ..refine.field import FineField, FineLattice, fine_grid, lattice_shape
 from ..refine.nodes import share_parts
 from ..surface.cap import check_all_seen, find_border_inside
 from ..threads import check_fits
@@ -53,10 +54,7 @@ def write_sparse(field: FineField, path: Path) -> None:
     # float32 is exact where world units only change exponents
     is_power = math.frexp(grid.voxel_size)[0] == 0.5 and 1e-20 < grid.voxel_size < 1e20
     exact = np.dtype("<f4" if is_power else "<f8")
-    samples, distances = none, np.empty(0)
-    if field.spheres is not None:
-        samples = field.spheres.voxel_ijk
-        distances = field.in_world_units(field.spheres.distance)
+    samples = field.spheres or SampleSpheres(field.shape, np.empty(0, int), np.empty(0, np.float32))
     arrays: dict[str, Any] = {
         "version": VERSION,
         "shape": field.shape,
@@ -68,8 +66,8 @@ def write_sparse(field: FineField, path: Path) -> None:
         "leaves": field.leaves,
         "values": field.block_distances().astype(exact).reshape(-1, side, side, side),
         "voxels": field.voxel_ijk,
-        "sample_voxels": samples,
-        "sample_distances": distances.astype(exact),
+        "sample_voxels": np.stack(np.unravel_index(samples.number, field.shape), 1).astype("i4"),
+        "sample_distances": field.in_world_units(samples.distance).astype(exact),
         "border_inside": find_border_inside(field) if field.leaves else none,
     }
     with path.open("wb") as file:
@@ -295,7 +293,7 @@ def _field_of(arrays: dict[str, NDArray[Any]], path: Path) -> FineField:
     distances = in_half_voxels(arrays["sample_distances"])
     return replace(
         plain,
-        spheres=SampleSpheres(shape, arrays["sample_voxels"], distances),
+        spheres=SampleSpheres(shape, arrays["sample_voxels"] @ (ny * nz, nz, 1), distances),
         grid=grid,
         offset=float(arrays["offset"]),
         leaves=bool(arrays["leaves"]),

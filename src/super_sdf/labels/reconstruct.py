@@ -27,7 +27,6 @@ from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.contract import Decoder, adapt
 from ..network.network import load_network, network_for
 from ..simplify.collapsing import Unsimplified, collapse_edges, within
-from ..simplify.measuring import Original
 from ..simplify.walls import Walls, faults, meshes_of
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import Progress
@@ -155,10 +154,10 @@ def find_image(
 
 def in_order(labels: Any) -> list[int] | None:
     """Return labels in ascending order, each once; None for all."""
-    given = options.check_labels(labels)
+    given = options.OPTIONS["labels"].check(labels)
     if isinstance(given, str):
         return None
-    chosen = sorted({options.check_label(label, "--labels") for label in given})
+    chosen = sorted({options.LABEL.check(label, "--labels") for label in given})
     if not 0 < len(chosen) <= MOST_LABELS:
         raise OptionError(f"--labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
     return chosen
@@ -228,11 +227,11 @@ def label_meshes(
     else:
         walls = spared(walls, SLIGHT * voxel, voxel / factor)
     if error := chosen.error(voxel):
-        found = within(Unsimplified(walls, [*map(Original, meshes_of(walls, count))]), error)
+        found = within(Unsimplified(walls), error)
         if not found:
             warnings.append("the meshes were not simplified: no way was found within the error")
         walls = found or walls
-    return meshes_of(walls, count), notes, warnings
+    return meshes_of(walls), notes, warnings
 
 
 def spared(walls: Walls, distance: float, spacing: float) -> Walls:
