@@ -22,7 +22,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, Triple, cross
+from ..arrays import BoolArray, Triple, cross
 from ..arrays import unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
@@ -190,28 +190,6 @@ def write_ply(file: IO[bytes], parts: Parts, world: World) -> None:
     kind = "double" if mesh.vertices.dtype == np.float64 else "float"
     properties = [f"{kind} {axis}" for axis in "xyz"]
     _write_ply(file, mesh.vertices, mesh.faces, properties, world.note, PLY_HEADER_BYTES)
-
-
-def write_coloured_ply(
-    mesh: Mesh,
-    residuals: FloatArray,
-    colours: NDArray[np.uint8],
-    path: Path,
-    *,
-    force: bool = False,
-) -> None:
-    """Write binary PLY whose vertices also have ``residuals`` (n,) and ``colours`` (n, 3).
-
-    Positions are double; ``force`` replaces a file that exists.
-    """
-    kind = [("position", "<f8", 3), ("residual", "<f4"), ("colour", "u1", 3)]
-    rows = np.empty(len(residuals), kind)
-    rows["position"], rows["residual"], rows["colour"] = mesh.vertices, residuals, colours
-    properties = [*(f"double {axis}" for axis in "xyz"), "float residual"]
-    properties += [f"uchar {colour}" for colour in ("red", "green", "blue")]
-    note = "residual: distance of samples to the mesh minus their value, in voxels"
-    with replacing(path, force=force) as part, part.open("wb") as file:
-        _write_ply(file, rows, mesh.faces, properties, note)
 
 
 def _write_ply(
