@@ -118,7 +118,7 @@ def test_what_is_no_grid_is_refused_with_the_way_out(command):
         "part.stl": f"is a mesh, not a grid: sample it first with {first}",
         "part.step": f"is a CAD model: export it as part.stl, then {first}",
         "a.nii": "is a folder: give a file",
-        "a.zarr": "is no Zarr store: it holds none of zarr.json, .zarray, .zgroup",
+        "a.zarr": "holds no 3D array",
         "no.zarr": "does not exist",
     }.items():
         code, _, err = command("upsample", name, "o.ply")

@@ -145,7 +145,7 @@ def test_links_and_pipes_in_a_store():
     )
     chunk.unlink()
     os.mkfifo(chunk)
-    assert said_of("a.zarr") == "a.zarr/c/0/0/0 is a named pipe: give a file"
+    assert said_of("a.zarr") == "a.zarr/c/0/0/0 is no regular file: give a file"
 
 
 @pytest.mark.parametrize("kind", ["hdf5", "2", "3", "zip"])

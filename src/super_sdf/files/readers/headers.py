@@ -37,13 +37,11 @@ def read_nrrd(request: Request) -> Volume:
     """Read a ``.nrrd`` file, or a ``.nhdr`` file and the data files that it names."""
     import nrrd
 
-    path, stated = request.path, split_header(request.path)
-    with path.open("rb") as file:
-        raw = nrrd.read_header(stated.before.splitlines(True) if stated.lists else file)
-    named = [raw.pop(name) for name in ("data file", "datafile") if name in raw]
-    if len(named) != (stated.start > 0 and not stated.lists):  # pynrrd would open another one
-        raise FileError("its header is damaged: it does not name one data file")
-    files = [check_beside(path, name) for name in stated.names()]
+    path, (text, named, _) = request.path, split_header(request.path)
+    raw = nrrd.read_header(text.splitlines(True))
+    if {"data file", "datafile"} & set(raw):  # pynrrd would open another one
+        raise FileError("its header is damaged: it names its data twice")
+    files = [check_beside(path, name) for name in named]
     header = {SPELT.get(name, name): value for name, value in raw.items()}
     sizes = tuple(int(size) for size in header["sizes"])
     if header["dimension"] != len(sizes) or min(sizes) < 1:
@@ -137,15 +135,15 @@ def read_metaimage(request: Request) -> Volume:
     """Read a ``.mha`` file, or a ``.mhd`` file and the data files that it names."""
     import SimpleITK
 
-    path, stated = request.path, split_header(request.path)
-    if not stated.start:
+    path, (text, named, start) = request.path, split_header(request.path)
+    if not start:
         raise FileError("its header is damaged: it has no ElementDataFile")
-    lines = stated.before.decode(errors="replace").splitlines()
+    lines = text.decode(errors="replace").splitlines()
     pairs = (re.split("[=:]", line, maxsplit=1) for line in lines)
     fields = {pair[0].strip(): pair[-1].strip() for pair in pairs}
     true = {name for name, value in fields.items() if value[:1] in ("T", "t", "1")}  # as in ITK
-    is_local = stated.entry.lower() == "local"
-    files = [check_beside(path, name) for name in stated.names() if not is_local]
+    is_local = [name.lower() for name in named] == ["local"]
+    files = [check_beside(path, name) for name in named if not is_local]
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
@@ -159,7 +157,7 @@ def read_metaimage(request: Request) -> Volume:
         raise GridError(f"{path} has {components} numbers a sample: give a file of three axes")
     one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
-    data, start = (files[0], 0) if files else (path, stated.start)
+    data, start = (files[0], 0) if files else (path, start)
     promised, follow = prod(size) * dtype.itemsize, data.stat().st_size - start
     is_packed = "CompressedData" in true and len(files) <= 1
     if not is_packed and len(files) <= 1 and promised > follow:

@@ -8,6 +8,7 @@ metadata names when it opens an array: they are checked before.
 
 from __future__ import annotations
 
+import json
 import os
 import zipfile
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError, GridError, seen
-from ..formats import check_beside, check_regular_file, parse_json
+from ..formats import check_beside, check_regular_file
 from . import Request, Volume
 from .axes import Axis, measured, placed, stored
 
@@ -78,7 +79,7 @@ def _nodes_of(request: Request) -> dict[str, Document]:
         node, _, name = key.rpartition("/")
         if name in METADATA:
             data = archive.read(key) if is_zip else (path / key).read_bytes()
-            content = parse_json(data, f"{path}/{key}")
+            content = json.loads(data)
             if not isinstance(content, dict):
                 raise FileError(f"{path} is damaged: {key} is no JSON object")
             content = {"attributes": content} if name == ".zattrs" else content
