@@ -22,7 +22,8 @@ from super_sdf.network.contract import Decoder, adapt
 from super_sdf.options import AUTO, MARCHING, SHARP
 from super_sdf.pipeline import extract_mesh, reconstruct, refine_band
 from super_sdf.refine.band import neighbour_table, survey
-from super_sdf.refine.field import FineField, SampleSpheres
+from super_sdf.refine.bounds import SampleSpheres
+from super_sdf.refine.field import FineField
 from super_sdf.refine.nodes import block_ijk, share_parts
 from super_sdf.simplify.simplify import simplify_mesh
 from super_sdf.surface.mesh import Mesh
@@ -116,7 +117,8 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     side = spacing * factor
     blocks = whole[crossed].reshape(len(voxel_ijk), -1).T * np.float32(2 / side)
     blocks = np.ascontiguousarray(blocks)
-    spheres = SampleSpheres(shape, voxel_ijk, blocks[len(blocks) // 2])
+    number = np.ravel_multi_index(tuple(voxel_ijk.T), shape)
+    spheres = SampleSpheres(shape, number, blocks[len(blocks) // 2])
     parts = share_parts(neighbour_table(voxel_ijk, shape))
     fine = FineField(shape, factor, voxel_ijk, blocks, parts, spheres=spheres)
     grid = SdfGrid.trusted(whole[..., 0, 0, 0], side, low + side / 2)

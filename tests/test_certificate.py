@@ -282,7 +282,7 @@ def test_the_coloured_mesh_is_a_mesh_with_residuals(here, command):
         ("ball.ply ball.npz --max-mean nan", 2, "--max-mean is nan: give "),
         ("ball.ply ball.npz --max-residual -1", 2, "--max-residual is -1: give a number from 0 on"),
         ("ball.ply ball.npz --tolerance inf", 2, "--tolerance is inf: give a number from 0 on"),
-        ("ball.ply ball.npz --offset nan", 2, "--offset is nan: give a finite number, in world"),
+        ("ball.ply ball.npz --offset nan", 2, "--offset is 'nan': give a finite number, in world"),
         ("ball.ply ball.npz --offset 9", 1, "no surface at 9: the values go from "),
     ],
 )

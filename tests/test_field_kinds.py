@@ -144,12 +144,6 @@ def test_the_user_may_overrule_the_evidence(field):
     assert reconstruct(grid, trilinear).is_closed()
 
 
-@pytest.mark.parametrize(("old", "new"), [("exact", "distance"), ("scaled", "smooth")])
-def test_another_word_for_a_kind_is_answered_by_its_name(old, new):
-    said = refusal(OptionError, make_grid, torus(), field=old)
-    assert said == f"field is '{old}': give {new}"
-
-
 def test_all_forms_of_a_mask_give_the_same_mesh():
     forms = [MASK, MASK.astype(np.uint8), np.where(MASK, -1.0, 1.0), MASK * 7.0]
     forms += TRANSFORMS.values()

@@ -126,7 +126,7 @@ WRONG = {
     "factor is 3: give an even number from 2 to 16": {"factor": 3},
     "spacing is 0, 0, 0: it must be greater than 0": {"spacing": np.zeros(3)},
     "origin is array([nan, nan, nan]): it must be finite": {"origin": np.full(3, np.nan)},
-    "its voxels are not in order": {"sample_voxels": np.ones((2, 3), np.int32)},
+    "its voxels are not in order": {"samples": np.ones(2, int)},
     "cannot reshape array": {"factor": 4},
     "": {"factor": None},
     " ": {"offset": np.zeros(3)},

@@ -12,7 +12,8 @@ from skimage.measure import marching_cubes
 from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, reconstruct, upsample
 from super_sdf import threads as limits
 from super_sdf.refine.band import neighbour_table
-from super_sdf.refine.field import FineField, SampleSpheres
+from super_sdf.refine.bounds import SampleSpheres
+from super_sdf.refine.field import FineField
 from super_sdf.refine.nodes import block_ijk, share_parts
 from super_sdf.surface.cell_cases import make_tables
 from super_sdf.surface.extract import extract
@@ -31,7 +32,7 @@ def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGri
     grid = SdfGrid.trusted(
         np.zeros(shape, np.float32), (float(factor),) * 3, (half * factor + 0.5,) * 3
     )
-    spheres = SampleSpheres(shape, voxels, blocks[len(blocks) // 2])
+    spheres = SampleSpheres(shape, np.arange(len(voxels)), blocks[len(blocks) // 2])
     return FineField(shape, factor, voxels, blocks, parts, spheres=spheres), grid
 
 

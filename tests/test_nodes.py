@@ -1,15 +1,11 @@
-"""The fine lattice: numbering of nodes, averaging (Eq. 7), pinned signs."""
+"""The fine lattice: numbering of nodes, averaging (Eq. 7)."""
 
 import numpy as np
 import pytest
 
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField
-from super_sdf.refine.nodes import (
-    average_shared,
-    block_ijk,
-    share_parts,
-)
+from super_sdf.refine.nodes import average_shared, block_ijk, share_parts
 
 
 def some_voxels(seed, density=0.4, shape=(6, 5, 7)):

@@ -200,7 +200,7 @@ WRONG = {
     "error is 0: give a number greater than 0": {"error": 0},
     "error is nan: give a number greater than 0": {"error": float("nan")},
     "triangles is 3: give a whole number, 4 or more, as a closed mesh has": {"triangles": 3},
-    "error is '1': give a number greater than 0": {"error": "1"},
+    "error is [1]: give a number greater than 0": {"error": [1]},
     "triangles is 4.5: give a whole number, 4 or more, as a closed mesh has": {"triangles": 4.5},
 }
 

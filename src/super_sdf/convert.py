@@ -186,8 +186,4 @@ def find_warnings(
         percent = f"{share:.2g}" if share < 9.95 else f"{share:.0f}"
         differ = f"in {percent} % of the band the values differ by more than distances can"
         warnings.append(f"{differ}: they are taken as noisy there, and corrected")
-    if pinned := counts["pinned_nodes"]:
-        contradict = f"{pinned} fine values contradict the coarse ones around them"
-        way = "were given their sign: the input is no distance field there"
-        warnings.append(f"{contradict} and {way}")
     return warnings

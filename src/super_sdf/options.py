@@ -8,14 +8,16 @@ rows, so a new option is a row here and the line that uses it.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass, field, fields
 from math import inf, isfinite
-from numbers import Integral, Real
+from numbers import Real
+from operator import index
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypedDict, get_args
+
+import numpy as np
 
 from .errors import OptionError, OptionTypeError, flag, seen
 
@@ -43,7 +45,6 @@ FLOAT32: Final = "float32"
 INT8: Final = "int8"
 DEFAULT_QUALITY: Final = "base"
 FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
-OTHER_FIELDS = {"exact": DISTANCE, "truncated": DISTANCE, "scaled": SMOOTH}  # and their names
 MESHERS: tuple[MesherName, ...] = get_args(MesherName)
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
@@ -57,118 +58,112 @@ EXCLUSIVE = (GOALS, ("label", "level"), ("model", "quality"))
 
 
 class Kind(NamedTuple):
-    """What the values of an option are."""
+    """What the values of an option are. Text is taken as on the command line."""
 
     give: str  # what to give instead of a wrong value
-    check: Callable[[Any, str], Any]  # returns the value; OptionError, by a name, if it is wrong
-    parse: Callable[[str], Any] = str  # makes a value of text; ValueError if it can be none
+    make: Callable[[Any], Any]  # returns the value as the program takes it; TypeError, ValueError
     choices: tuple[str, ...] = ()  # all values, if there are only some
 
+    def check(self, value: Any, name: str) -> Any:
+        """Return a value as the program takes it; OptionError, by a name, if it is wrong."""
+        try:
+            return self.make(value)
+        except (TypeError, ValueError, OverflowError) as error:
+            shown = f"{value}" if isinstance(value, Real) else seen(value)
+            kind = OptionTypeError if isinstance(error, TypeError) else OptionError
+            raise kind(f"{name} is {shown}: give {self.give}") from None
 
-def wrong(value: Any, name: str, give: str, is_type: bool = False) -> OptionError:
-    """Return the error for a value, which may be of a wrong type."""
-    shown = f"{value:g}" if isinstance(value, float) else seen(value)
-    return (OptionTypeError if is_type else OptionError)(f"{name} is {shown}: give {give}")
 
+def number(give: str, above: float = -inf, most: float = inf, step: int = 0) -> Kind:
+    """Return the kind of numbers in a range, or of whole ones that are multiples of a step."""
 
-def number(give: str, above: float = -inf, most: float = inf, step: int | None = None) -> Kind:
-    """Return the kind of numbers in a range, or of multiples of a step."""
-    of: Any = Integral if step else Real
-    make: Any = int if step else float
+    def make(value: Any) -> Any:
+        if isinstance(value, bool):
+            raise TypeError
+        found = (int(value) if isinstance(value, str) else index(value)) if step else float(value)
+        if not isfinite(found) or not above < found <= most or (step and found % step):
+            raise ValueError
+        return found
 
-    def check(value: Any, name: str) -> Any:
-        if not isinstance(value, of) or isinstance(value, bool):
-            raise wrong(value, name, give, is_type=True)
-        with suppress(OverflowError):  # a whole number beyond 1.8e308
-            found = make(value)
-            if isfinite(found) and above < found <= most and not (step and found % step):
-                return found
-        raise wrong(int(value) if step else value, name, give)
-
-    return Kind(give, check, make)
+    return Kind(give, make)
 
 
 def numbers(counts: tuple[int, ...], give: str) -> Kind:
-    """Return the kind of several numbers, of which there may be one, separated by commas."""
+    """Return the kind of several numbers, of which there may be one; in text with commas."""
 
-    def check(value: Any, name: str) -> tuple[float, ...]:
-        several = isinstance(value, Iterable) and not isinstance(value, str)
-        found = tuple(value) if several else (value,)
+    def make(value: Any) -> tuple[float, ...]:
+        parts = value.split(",") if isinstance(value, str) else value
+        found = tuple(map(ANY.make, parts if isinstance(parts, Iterable) else [parts]))
         if len(found) not in counts:
-            raise wrong(value, name, give)
-        return tuple(number("a finite number").check(each, name) for each in found)
-
-    def parse(text: str) -> tuple[float, ...]:
-        if len(found := tuple(map(float, text.split(",")))) not in counts:
-            raise ValueError(text)
+            raise ValueError
         return found
 
-    return Kind(give, check, parse)
+    return Kind(give, make)
 
 
-def one_of(names: Iterable[str], others: Mapping[str, str] | None = None) -> Kind:
-    """Return the kind of some names; messages name those for ``others``."""
+def one_of(names: Iterable[str]) -> Kind:
+    """Return the kind of some names."""
     choices = tuple(names)
-    give = f"one of {', '.join(choices)}"
 
-    def check(value: Any, name: str) -> str:
-        if isinstance(value, str) and value in choices:
-            return value
-        is_text = isinstance(value, str)
-        instead = (others or {}).get(value, give) if is_text else give
-        raise wrong(value, name, instead, is_type=not is_text)
+    def make(value: Any) -> str:
+        if not isinstance(value, str):
+            raise TypeError
+        return choices[choices.index(value)]
 
-    return Kind(give, check, choices=choices)
+    return Kind(f"one of {', '.join(choices)}", make, choices)
 
 
-def _flag(value: Any, name: str) -> bool:
-    if not isinstance(value, bool) and type(value).__name__ not in ("bool_", "bool"):  # NumPy's
-        raise wrong(value, name, "True or False, in JSON true or false", is_type=True)
+def _flag(value: Any) -> bool:
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError
     return bool(value)
 
 
-def check_label(label: Any, name: str = "--label") -> int:
-    """Return a label; OptionError if no integer of 64 bits, signed or not, can be it."""
-    is_whole = isinstance(label, Real) and not isinstance(label, bool) and isfinite(label)
-    if not (is_whole and int(label) == label and -(2**63) <= int(label) < 2**64):
-        raise wrong(label, name, "a whole number, -2^63 to 2^64 - 1")
-    return int(label)
+def _label(value: Any) -> int:
+    """Return a whole number of 64 bits, signed or not."""
+    found = int(value)
+    is_whole = isinstance(value, str) or (found == value and not isinstance(value, bool))
+    if not is_whole or not -(2**63) <= found < 2**64:
+        raise ValueError
+    return found
 
 
-def check_labels(labels: Any, name: str = "--labels") -> str | tuple[int | str, ...]:
-    """Return "all" or some labels, numbers or names; OptionError if it is neither."""
-    if isinstance(labels, str) and labels == ALL:
-        return ALL
-    if isinstance(labels, (str, bytes)) or not hasattr(labels, "__iter__"):
-        raise wrong(labels, name, "all, or some labels such as 1,2,3")
-    return tuple(each if isinstance(each, str) else check_label(each, name) for each in labels)
+def _labels(value: Any) -> str | tuple[int | str, ...]:
+    """Return "all", or some labels, numbers or names; in text with commas."""
+    if not isinstance(value, str):
+        return tuple(each if isinstance(each, str) else _label(each) for each in value)
+    parts = [part.strip() for part in value.split(",")]
+    is_number = re.compile("[-+]?[0-9]+").fullmatch
+    return ALL if value == ALL else tuple(int(n) if is_number(n) else n for n in parts)
 
 
-def _parse_label(text: str) -> int | str:
-    """Parse a whole number, never as a float; other text may be a name."""
-    return int(text) if re.fullmatch("[-+]?[0-9]{1,20}", text) else text
+def _bytes(value: Any) -> int:
+    """Return a number of bytes, in text such as "1500M" or "4G"; the units are powers of ten."""
+    if isinstance(value, str):
+        power = "KMG".find(value[-1:].upper()) + 1
+        value = int(float(value[:-1] if power else value) * 1000**power)
+    return int(COUNT.make(value))
 
 
-def _parse_labels(text: str) -> str | tuple[int | str, ...]:
-    return text if text == ALL else tuple(_parse_label(part.strip()) for part in text.split(","))
+def _path(value: Any) -> Path:
+    if not isinstance(value, (str, PathLike)):
+        raise TypeError
+    return Path(value)
 
 
-def parse_size(text: str) -> int:
-    """Parse a number of bytes, such as "1500M" or "4G"; the units are powers of ten."""
-    amount, unit = (text, "") if text[-1:].isdigit() else (text[:-1], text[-1:].upper())
-    with suppress(KeyError, OverflowError):
-        return int(float(amount) * {"": 1, "K": 10**3, "M": 10**6, "G": 10**9}[unit])
-    raise ValueError(text)
+def _called(value: Any) -> Any:
+    if not callable(value):
+        raise TypeError
+    return value
 
 
-# fmt: off
-ABOVE_0, POINT = number("a number greater than 0", above=0), numbers((1, 3), "one number, or three")
-FACTOR = number("an even number from 2 to 16 (an odd one has no node on the samples)",
-    above=0, most=16, step=2)
-VOXELS = number("a number greater than 0, in voxels (--tolerance takes world units)", above=0)
-MEMORY = number("a number of bytes greater than 0, such as 1500M or 4G", above=0, step=1)
-FLAG = Kind("", _flag)
-# fmt: on
+ANY, ABOVE_0 = number("a finite number"), number("a number greater than 0", above=0)
+COUNT, POINT = number("", above=0, step=1), numbers((1, 3), "one number, or three")
+FLAG = Kind("True or False, in JSON true or false", _flag)
+LABEL = Kind("a whole number, -2^63 to 2^64 - 1", _label)
+NETWORK = Kind("one from load_network()", _called)
+PROGRESS = Kind("a function of (done, total), in thousandths", _called)
+PATH = Kind("the path of a file", _path)
 
 
 class Option(NamedTuple):
@@ -183,17 +178,10 @@ class Option(NamedTuple):
     metavar: str | None = None
     off: str = ""  # a flag's opposite on the command line
 
-    def check(self, value: Any, name: str = "") -> Any:
-        """Return a value as the program takes it; OptionError, by another name, if it is wrong."""
+    def check(self, value: Any) -> Any:
+        """Return a value as the program takes it; OptionError if it is wrong."""
         is_left_out = value is None and self.default is None
-        return None if is_left_out else self.kind.check(value, name or flag(self.name))
-
-    def parse(self, text: str) -> Any:
-        """Return the value, not checked, that a text on the command line stands for."""
-        try:
-            return self.kind.parse(text)
-        except ValueError:
-            raise wrong(text, flag(self.name), self.kind.give) from None
+        return None if is_left_out else self.kind.check(value, flag(self.name))
 
 
 def _option(default: Any, group: str, shows: str, kind: Kind, text: str, **more: Any) -> Any:
@@ -225,7 +213,8 @@ class Options:
     """
 
     # fmt: off
-    factor: int | None = _option(None, MESH, "list labels", FACTOR,
+    factor: int | None = _option(None, MESH, "list labels", number(
+        "an even number from 2 to 16 (an odd one has no node on the samples)", 0, 16, step=2),
         "How many times finer than the grid per axis: an even number from 2 to 16. Default: 2 for "
         "masks and labels, else 4.", metavar="K")
     _: KW_ONLY
@@ -245,23 +234,23 @@ class Options:
         "Anatomical space of the mesh, for files that state theirs. Default: that of the file.")
     inside: Inside = _option(AUTO, VALUES, "read list", one_of(get_args(Inside)),
         "Sign of the values inside the solid; auto takes the border of the grid as outside.")
-    field: FieldKind = _option(AUTO, VALUES, "read list", one_of(FIELDS, OTHER_FIELDS),
+    field: FieldKind = _option(AUTO, VALUES, "read list", one_of(FIELDS),
         "What the values are: distances, distances with noise, a mask or its transform, or a "
         "smooth field, which has the surface of its own cubic spline; auto goes by the samples.")
-    label: int | None = _option(None, VALUES, "read list", Kind("", check_label, _parse_label),
+    label: int | None = _option(None, VALUES, "read list", LABEL,
         "Mesh the samples with the value N of a label image, or its name by --names.",
         metavar="N")
     labels: str | tuple[int | str, ...] | None = _option(None, VALUES, "list labels",
-        Kind("", check_labels, _parse_labels),
+        Kind("all, or some labels such as 1,2,3", _labels),
         "Mesh all labels of a label image but 0, or those listed, with shared walls: as parts of "
         "a .glb or .3mf, else each in its own file, NAME-N.ply.", metavar="all|N,N")
-    level: float | None = _option(None, VALUES, "read list", number("a finite number"),
+    level: float | None = _option(None, VALUES, "read list", ANY,
         "Mesh the surface at the value L of densities; above L is inside, unless --inside is "
         "negative.", metavar="L")
     scale: float | None = _option(None, VALUES, "read list", ABOVE_0,
         "World units per unit of the values, if they have another unit than the spacing.",
         metavar="S")
-    unknown: float | None = _option(None, VALUES, "read list", number("a finite number"),
+    unknown: float | None = _option(None, VALUES, "read list", ANY,
         "Samples with the value V are unknown, as those that are NaN.", metavar="V")
     offset: float = _option(0.0, MESH, "list",
         number("a finite number, in world units"),
@@ -273,7 +262,8 @@ class Options:
     mesher: MesherName = _option(AUTO, MESH, "list", one_of(MESHERS),
         "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
         "them; auto is sharp for distances, marching for masks and noise.")
-    simplify: float | None = _option(None, MESH, "list labels", VOXELS,
+    simplify: float | None = _option(None, MESH, "list labels",
+        number("a number greater than 0, in voxels (--tolerance takes world units)", above=0),
         "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
         "Needs the extra simplify.", metavar="ERROR")
     tolerance: float | None = _option(None, MESH, "list labels",
@@ -292,7 +282,7 @@ class Options:
         "Network: fast is quicker than base, the default; best averages base over 4 turns of the "
         "grid, and takes 4 times as long.")
     model: str | None = _option(None, WORK, "labels",
-        Kind("", lambda value, name: str(check_path(value, name))),
+        Kind(PATH.give, lambda value: str(_path(value))),
         "Use the network in this ONNX file instead of --quality.", metavar="FILE")
     precision: Precision = _option(AUTO, WORK, "labels", one_of(PRECISIONS),
         "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "
@@ -302,7 +292,8 @@ class Options:
     threads: int = _option(0, WORK, "labels",
         number("1 or more, or 0 for one per core", above=-1, step=1),
         "CPU threads; 0 means one per core.", metavar="N")
-    max_memory: int | None = _option(None, WORK, "labels", MEMORY._replace(parse=parse_size),
+    max_memory: int | None = _option(None, WORK, "labels",
+        Kind("a number of bytes greater than 0, such as 1500M or 4G", _bytes),
         "Memory limit of the process, such as 4G. Default: 60 % of the free memory. Larger grids "
         "are refined in boxes, whose meshes are joined.", metavar="SIZE")
     # fmt: on
@@ -311,7 +302,11 @@ class Options:
         """Check the values; OptionError names the first that is wrong, or contradicts another."""
         for name, row in OPTIONS.items():
             object.__setattr__(self, name, row.check(getattr(self, name)))
-        check_alone(vars(self))
+        for names in EXCLUSIVE:
+            values = {name: getattr(self, name) for name in names}
+            some = [f"{flag(n)} {seen(value)}" for n, value in values.items() if value is not None]
+            if len(some) > 1:
+                raise OptionError(f"{some[0]} and {some[1]}: give only one of them")
         if self.label is not None and self.field not in (AUTO, MASK):
             said = f"--label {self.label} and --field {self.field}"
             raise OptionError(f"{said}: the samples of a label are a mask")
@@ -359,28 +354,16 @@ READ, BATCH_LISTS, LABELS = (
 )
 
 
-def check_alone(given: Mapping[str, Any]) -> None:
-    """Raise OptionError if two options are given that exclude each other; others are None."""
-    for names in EXCLUSIVE:
-        some = [f"{flag(n)} {seen(given[n])}" for n in names if given.get(n) is not None]
-        if len(some) > 1:
-            raise OptionError(f"{some[0]} and {some[1]}: give only one of them")
-
-
 def check_path(path: Any, name: str) -> Path:
     """Return an argument as a path; OptionTypeError if it is neither a string nor a path."""
-    if not isinstance(path, (str, PathLike)):
-        raise wrong(path, name, "the path of a file", is_type=True)
-    return Path(path)
+    return Path(PATH.check(path, name))
 
 
 def check_called(network: Any, progress: Any) -> None:
     """Raise OptionTypeError if a network, or a progress that is not None, cannot be called."""
-    if not callable(network):
-        raise wrong(network, "network", "one from load_network()", is_type=True)
-    if progress is not None and not callable(progress):
-        give = "a function of (done, total), in thousandths"
-        raise wrong(progress, "progress", give, is_type=True)
+    NETWORK.check(network, "network")
+    if progress is not None:
+        PROGRESS.check(progress, "progress")
 
 
 def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:

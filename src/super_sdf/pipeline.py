@@ -30,16 +30,15 @@ from .refine import nodes
 from .refine.band import (
     Band,
     BandSummary,
-    BandTooLargeError,
     neighbour_table,
     no_surface,
-    summarise,
     survey,
+    survey_within,
 )
-from .refine.bounds import keep_within_bounds
-from .refine.field import COUNTS, FineField, SampleSpheres, border_is_crossed
+from .refine.bounds import SampleSpheres, keep_within_bounds
+from .refine.field import COUNTS, FineField, border_is_crossed
 from .refine.prediction import interpolate, predict
-from .refine.spheres import fit_to_spheres, spheres_of_band
+from .refine.spheres import fit_to_spheres
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
@@ -75,14 +74,15 @@ def refine_band(
     del table
     nodes.average_shared(blocks, parts, factor, threads)  # Eq. 7
     index = nodes.VoxelIndex(own_ijk, grid.shape)
-    fit_to_spheres(blocks, parts, factor, spheres_of_band(band, threads), index, threads)
+    fit_to_spheres(blocks, parts, factor, band, index, threads)
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
     decoded = blocks[:, :-1]
     if grid.field.sides_only:
         nodes.hold_sides(decoded, factor, patches[voxels, CENTRE])
-    pinned = nodes.pin_to_skipped(decoded, parts, factor, own_ijk, patches[voxels], grid.shape)
+    nodes.pin_to_skipped(decoded, parts, factor, own_ijk, patches[voxels], grid.shape)
     steps.finish("nodes")
-    unseen = grid.field.unseen
+    unseen, exact = grid.field.unseen, band.exact
+    number = np.ravel_multi_index(tuple(band.voxel_ijk[exact].T), grid.shape)
     return FineField(
         grid.shape,
         factor,
@@ -91,11 +91,10 @@ def refine_band(
         parts,
         grid,
         band.offset,
-        SampleSpheres(grid.shape, band.voxel_ijk[band.exact], patches[band.exact, CENTRE]),
+        SampleSpheres(grid.shape, number, patches[exact, CENTRE]),
         band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
         found=(len(patches), band.count_noisy()),
-        pinned=pinned,
     )
 
 
@@ -343,13 +342,10 @@ def mesh_grid(
     mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
-    room, whole = Room.of(chosen.max_memory, factor, decoder.memory_bytes), None
+    room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
     most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
-    try:
-        bands = [survey(lattice, offset, threads=threads, most=most)]
-    except BandTooLargeError:
-        whole = summarise(lattice, offset, threads)
-    if not whole:
+    bands, whole = survey_within(lattice, offset, most, threads=threads)
+    if bands:
         steps.finish("band")
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:
@@ -373,8 +369,7 @@ def mesh_grid(
     count = len(parts)
     leaves, is_cut = any(part.leaves for part in parts), any(part.is_cut for part in parts)
     counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
-    if whole:
-        counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
+    counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, offset)

@@ -10,11 +10,13 @@ import ctypes
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from math import ceil, inf
+from math import ceil
 from pathlib import Path
-from threading import Thread
 from typing import TypeVar
+
+import psutil
 
 from .errors import OptionError, OutOfMemoryError
 
@@ -25,7 +27,7 @@ CHUNK = 1 << 19  # temporaries (array elements) per chunk, so that they stay in 
 MIN_PER_THREAD = 1 << 21  # array elements; with fewer, a thread costs more than it saves
 MAX_INDEX = 2**31 - 1  # of vertices and nodes, as in mesh files; beyond, one would mean another
 
-SYSTEM, GROUPS, OWN = Path("/proc/meminfo"), Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
+GROUPS, OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 SHARE = 0.6  # of the memory that is free, the share that is taken unless a bound is given
 
 
@@ -46,7 +48,8 @@ def cores_of_system() -> int:
 
 def count_cores() -> int:
     """Return the number of cores this process may use; in a container its quota, rounded up."""
-    return max(ceil(min([cores_of_system(), *map(_cores_of, _groups("cpu"))])), 1)
+    quotas = _of_groups(lambda quota, period: int(quota) / int(period), "cpu.max")
+    return max(ceil(min([cores_of_system(), *quotas])), 1)
 
 
 def useful_threads(requested: int) -> int:
@@ -78,8 +81,6 @@ def over_threads(
     if min(threads, len(pieces)) < 2:
         yield from map(work, pieces)
         return
-    from concurrent.futures import ThreadPoolExecutor  # imported here, as small grids need none
-
     with ThreadPoolExecutor(threads) as pool:
         yield from pool.map(work, pieces)
 
@@ -100,67 +101,44 @@ def map_chunks(
 
 def call_beside(work: Callable[[], object], stop: Callable[[], object]) -> None:
     """Do some work in another thread, and ``stop`` it at an interrupt; errors are passed on."""
-    failures: list[Exception] = []
-
-    def run() -> None:
+    with ThreadPoolExecutor(1) as pool:  # waits at the end
         try:
-            work()
-        except Exception as error:
-            failures.append(error)
-
-    thread = Thread(target=run)
-    thread.start()
-    try:
-        thread.join()
-    except BaseException:
-        stop()
-        thread.join()
-        raise
-    if failures:
-        raise failures[0]
+            pool.submit(work).result()
+        except BaseException:
+            stop()
+            raise
 
 
-def free_memory() -> int | None:
-    """Return the bytes of memory that are free, None if the system does not tell.
+def free_memory() -> int:
+    """Return the bytes of memory that are free; in a container at most what is left of its limit.
 
-    In a container with a memory limit, at most what is left of the limit.
+    Inactive cached files of a container can be dropped.
     """
-    with suppress(OSError, KeyError):
-        free = _sizes_in(SYSTEM)["MemAvailable"]
-        return int(min([free, *map(_left_in, _groups("memory"))]))
-    with suppress(ImportError):  # not Linux
-        import psutil
 
-        return int(psutil.virtual_memory().available)
-    return None
+    def left(most: str, taken: str, *stat: str) -> int:
+        cached = int(stat[stat.index("inactive_file") + 1])
+        return max(int(most) - max(int(taken) - cached, 0), 0)
 
-
-def held_memory() -> int | None:
-    """Return the bytes of memory that this process holds; None if nothing tells."""
-    with suppress(OSError, KeyError):
-        return _sizes_in(Path("/proc/self/status"))["VmRSS"]
-    with suppress(ImportError):  # not Linux
-        import psutil
-
-        return int(psutil.Process().memory_info().rss)
-    return None
+    files = "memory.max", "memory.current", "memory.stat"
+    return min([int(psutil.virtual_memory().available), *_of_groups(left, *files)])
 
 
-def memory_bound(max_memory: int | None = None) -> int | None:
-    """Return how many bytes this process may hold in all, None if that is not known.
+def held_memory() -> int:
+    """Return the bytes of memory that this process holds."""
+    return int(psutil.Process().memory_info().rss)
+
+
+def memory_bound(max_memory: int | None = None) -> int:
+    """Return how many bytes this process may hold in all.
 
     ``max_memory`` if given; else what the process holds, and ``SHARE`` of what is free.
     """
-    free = free_memory()
-    if max_memory is not None or free is None:
-        return max_memory
-    return (held_memory() or 0) + int(SHARE * free)
+    return max_memory or held_memory() + int(SHARE * free_memory())
 
 
 def check_fits(need: int, what: str, way_out: str) -> None:
     """Raise OutOfMemoryError if ``what``, which needs ``need`` bytes, does not fit into memory."""
-    free = free_memory()
-    if free is not None and need > free:
+    if need > (free := free_memory()):
         raise OutOfMemoryError(
             f"{what} needs {in_words(need)} of memory, {in_words(free)} are free; {way_out}"
         )
@@ -168,8 +146,8 @@ def check_fits(need: int, what: str, way_out: str) -> None:
 
 def check_bound(need: int, what: str, max_memory: int | None, way_out: str = "") -> None:
     """Raise OutOfMemoryError if ``need`` bytes beside what is held pass the process's bound."""
-    bound, need = memory_bound(max_memory), need + (held_memory() or 0)
-    if bound is not None and need > bound:
+    bound, need = memory_bound(max_memory), need + held_memory()
+    if need > bound:
         raise OutOfMemoryError(
             f"{what} needs {in_words(need)} of memory, {in_words(bound)} may be taken in all; "
             f"{way_out}allow more (--max-memory)"
@@ -187,47 +165,17 @@ def give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _sizes_in(path: Path) -> dict[str, int]:
-    """Return the sizes in a file of /proc, in bytes, by name."""
-    fields = (line.split(":", 1) for line in path.read_text().splitlines())
-    return {name: int(text.split()[0]) * 1024 for name, text in fields if text.endswith(" kB")}
+def _of_groups(take: Callable[..., Result], *names: str) -> Iterator[Result]:
+    """Yield what is taken of the words in files of the control groups that this process is in.
 
-
-def _groups(controller: str) -> Iterator[Path]:
-    """Yield the folders of the control groups that this process is in, innermost first.
-
-    Groups, such as those of containers, are nested; the tightest limit counts. In a container the
-    path of the group may not exist: what is mounted there is the group itself.
+    Groups (version 2), such as those of containers, are nested; the tightest limit counts. In a
+    container the path of the group may not exist: what is mounted there is the group itself.
     """
-    with suppress(OSError):  # not Linux
-        for line in OWN.read_text().splitlines():
-            _, names, path = line.split(":", 2)
-            if not names or controller in names.split(","):  # version 2, or 1
-                root = GROUPS / controller if names else GROUPS
-                inner = root / path.strip("/")
-                yield from (each for each in (inner, *inner.parents) if each.is_relative_to(root))
-
-
-def _left_in(group: Path) -> float:
-    """Return how many bytes a control group may still take; inactive cached files are dropped."""
-    for limit, used, cache in (
-        ("memory.max", "memory.current", "inactive_file"),
-        ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
-    ):
-        with suppress(OSError, ValueError):  # of the other version, or the limit is "max"
-            most, taken = (int((group / name).read_text()) for name in (limit, used))
-            words = (group / "memory.stat").read_text().split()
-            return max(most - max(taken - int(words[words.index(cache) + 1]), 0), 0)
-    return inf
-
-
-def _cores_of(group: Path) -> float:
-    """Return the cores' worth of time that a control group may use, infinity without a limit."""
-    for names in (["cpu.max"], ["cpu.cfs_quota_us", "cpu.cfs_period_us"]):
-        with suppress(OSError, ValueError):  # as above
-            quota, period = " ".join((group / name).read_text() for name in names).split()
-            return int(quota) / int(period) if int(quota) > 0 else inf
-    return inf
+    with suppress(OSError, IndexError):  # not Linux, or version 1
+        inner = GROUPS / OWN.read_text().split("0::/")[1].split("\n")[0]
+        for group in (inner, *inner.parents):
+            with suppress(OSError, ValueError):  # no such file, or the limit is "max"
+                yield take(*" ".join((group / name).read_text() for name in names).split())
 
 
 Progress = Callable[[int, int], None]

@@ -112,11 +112,7 @@ def table_option(name: str, text: str = "") -> Decorator:
         return option(f"{word}/--{row.off}" if row.off else word, is_flag=True, **more)
     choices = f"[{'|'.join(row.kind.choices)}]" if row.kind.choices else None
     more |= {"show_default": row.default is not None, "metavar": row.metavar or choices}
-
-    def parse(context: click.Context, param: click.Parameter, value: Any) -> Any:
-        return row.parse(value) if isinstance(value, str) else value
-
-    return option(word, type=click.UNPROCESSED, callback=parse, **more)
+    return option(word, type=click.UNPROCESSED, **more)
 
 
 # fmt: off
@@ -145,7 +141,7 @@ SHARED = {
 
 def chosen_options(given: dict[str, Any]) -> Options:
     """Return the options of a conversion, from all options of a command that may go with them."""
-    if given.get("names") and isinstance(given["label"], str):
+    if given.get("names") and given["label"] is not None:
         from ..labels.files import read_names
 
         numbers = {entry.name: number for number, entry in read_names(given["names"]).items()}
@@ -168,7 +164,7 @@ def chosen_options(given: dict[str, Any]) -> Options:
 
 def check_names(given: dict[str, Any], labels: Any) -> None:
     """Raise OptionError if there are names, and no labels are meshed, nor one by its name."""
-    if given["names"] and not labels and not isinstance(given["label"], str):
+    if given["names"] and not labels and given["label"] is None:
         raise OptionError(f"--names {given['names']} is for --labels: give that, too")
 
 

@@ -22,7 +22,8 @@ from ..grid.interpret import Field
 from ..grid.sdf_grid import SdfGrid
 from ..options import OPTIONS, check_path
 from ..refine.band import neighbour_table
-from ..refine.field import FineField, FineLattice, SampleSpheres, fine_grid
+from ..refine.bounds import SampleSpheres
+from ..refine.field import FineField, FineLattice, fine_grid
 from ..refine.nodes import share_parts
 from ..surface.cap import check_all_seen, find_border_inside
 from ..threads import check_fits
@@ -36,7 +37,7 @@ VERSION = 2
 def write_sparse(field: FineField, path: Path) -> None:
     """Write a field to an ``.npz`` file."""
     grid, side, none = field.placed, field.factor + 1, np.empty((0, 3), np.int32)
-    spheres = field.spheres or SampleSpheres(field.shape, none, np.empty(0, np.float32))
+    spheres = field.spheres or SampleSpheres(field.shape, np.empty(0, int), np.empty(0, np.float32))
     arrays: dict[str, Any] = {
         "version": VERSION,
         "shape": field.shape,
@@ -49,7 +50,7 @@ def write_sparse(field: FineField, path: Path) -> None:
         "leaves": field.leaves,
         "voxels": field.voxel_ijk,
         "values": field.blocks.T.reshape(-1, side, side, side),
-        "sample_voxels": spheres.voxel_ijk,
+        "samples": spheres.number,
         "sample_values": spheres.distance,
         "border_inside": find_border_inside(field) if field.leaves else none,
     }
@@ -199,12 +200,11 @@ def _field_of(arrays: dict[str, Any]) -> FineField:
         extremes=(-math.inf, math.inf),
         field=Field(own_lattice=True),  # it is on the lattice of the field already
     )
-    voxels, samples, border = (
-        arrays[key].astype(np.int32) for key in ("voxels", "sample_voxels", "border_inside")
-    )
-    for each in (voxels, samples, border):
-        if (np.diff(np.ravel_multi_index(tuple(each.T), shape)) <= 0).any():
-            raise ValueError("its voxels are not in order")
+    voxels, border = (arrays[key].astype(np.int32) for key in ("voxels", "border_inside"))
+    samples, distances = arrays["samples"].astype(np.int64), arrays["sample_values"]
+    flat = (np.ravel_multi_index(tuple(each.T), shape) for each in (voxels, border))
+    if any((np.diff(numbers) <= 0).any() for numbers in (*flat, samples)):
+        raise ValueError("its voxels are not in order")
     values = arrays["values"].reshape(len(voxels), (factor + 1) ** 3)
     field = FineField(
         shape,
@@ -214,7 +214,7 @@ def _field_of(arrays: dict[str, Any]) -> FineField:
         share_parts(neighbour_table(voxels, shape)),
         grid,
         float(arrays["offset"]),
-        SampleSpheres(shape, samples, arrays["sample_values"].reshape(len(samples))),
+        SampleSpheres(shape, samples, distances.reshape(len(samples))),
         bool(arrays["leaves"]),
         border,
     )

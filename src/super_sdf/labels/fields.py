@@ -83,7 +83,7 @@ def label_fields(
     low[0], high[0] = low[1:].min(0), high[1:].max(0)
     holder, times = np.repeat(own[None], nodes, axis=0), np.zeros(len(own), np.int16)
     lowest, able = np.full(holder.shape, np.inf, np.float32), np.zeros(holder.shape, np.int8)
-    contest, part = Contest(holder, lowest, able, times), part_of_node(factor)[0]
+    contest, part = Contest(holder, lowest, able, times), part_of_node(factor)
     fields: dict[int, tuple[NDArray[np.int64], FloatArray]] = {}
     for turn, label in enumerate((*range(1, count + 1), 0)):
         start = np.maximum(low[label] - MARGIN, 0)

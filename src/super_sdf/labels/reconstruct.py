@@ -155,10 +155,10 @@ def find_image(
 
 def in_order(labels: Any) -> list[int] | None:
     """Return labels in ascending order, each once; None for all."""
-    given = options.check_labels(labels)
+    given = options.OPTIONS["labels"].check(labels)
     if isinstance(given, str):
         return None
-    chosen = sorted({options.check_label(label, "--labels") for label in given})
+    chosen = sorted({options.LABEL.check(label, "--labels") for label in given})
     if not 0 < len(chosen) <= MOST_LABELS:
         raise OptionError(f"--labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
     return chosen

@@ -9,8 +9,8 @@ surface, and was not cut off. If too many contradict others, the field is noisy,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ from ..errors import GridError, NoSurfaceError
 from ..grid.samples import let_go, over_three, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
 from ..threads import over_threads
-from .bounds import FARTHEST, TrustedSamples
+from .bounds import FARTHEST, SampleSpheres
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
 # Patch values are clipped to this (3 h): samples that are farther from the surface do not matter to
@@ -46,26 +46,27 @@ CELLS = 64  # along the longest axis, of the counts by which a large grid is cut
 ROUNDING = 1e-3  # so that the offset that an error suggests works
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class BandSummary:
     """What the band of a whole grid says, whichever part of the grid is worked on."""
 
-    told: int  # voxels whose samples tell whether the field is noisy
-    noisy: int  # those of them round which samples differ by more than distances can
-    low: float  # the lowest and the highest sample, in half voxels
-    high: float
-    leaves: bool  # whether a sample on the border of the grid is inside: the solid leaves it
-    cells: NDArray[np.int64]  # (a, b, c), voxels of the band in cubes of ``side`` samples
-    side: int = 1
+    side: int  # samples along the edge of each of the cubes into which the grid is cut
+    cells: NDArray[np.int64]  # (a, b, c), voxels of the band in each cube
+    told: int = 0  # voxels whose samples tell whether the field is noisy
+    noisy: int = 0  # those of them round which samples differ by more than distances can
+    low: float = np.inf  # the lowest and the highest sample, in half voxels
+    high: float = -np.inf
+    leaves: bool = False  # whether a sample on the border is inside: the solid leaves the grid
 
-    @property
-    def is_noisy(self) -> bool:
-        """Whether no sample can be taken as exact."""
-        return not self.told or self.noisy / self.told > MAX_NOISY_SHARE
-
-
-class BandTooLargeError(Exception):
-    """A band has more voxels than fit in memory."""
+    def add(self, found: _Found) -> None:
+        """Count what was found in some planes."""
+        sample = found.patches[:, CENTRE]
+        np.add.at(self.cells, tuple((found.voxel_ijk // self.side).T), 1)
+        self.told += int(np.count_nonzero(found.sampled))
+        self.noisy += int(np.count_nonzero(found.sampled & ~found.lipschitz))
+        self.low = min(self.low, float(sample.min(initial=np.inf)))
+        self.high = max(self.high, float(sample.max(initial=-np.inf)))
+        self.leaves |= bool(found.leaves.any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Band:
     exact: BoolArray  # (V,), which own samples can be taken as exact distances
     # samples beyond the band may be exact distances if they lie between these, in half voxels
     limits: tuple[float, float]
-    trusted: TrustedSamples  # the samples whose spheres can be trusted, in the band and beyond
+    trusted: SampleSpheres  # of the samples that are exact, and of some beyond the band
     leaves: bool  # see ``BandSummary``
 
     def count_noisy(self) -> int:
@@ -102,62 +103,62 @@ class _Found(NamedTuple):
     value: FloatArray  # (n,), of these
     leaves: BoolArray  # (1,), whether a sample on the border of the grid is inside
 
-    def figures(self) -> tuple[int, int, float, float, bool]:
-        """Return the first five figures of ``BandSummary``."""
-        noisy, sample = self.sampled & ~self.lipschitz, self.patches[:, CENTRE]
-        ends = float(sample.min(initial=np.inf)), float(sample.max(initial=-np.inf))
-        return int(self.sampled.sum()), int(noisy.sum()), *ends, bool(self.leaves.any())
-
 
 def survey(
+    grid: SdfGrid, offset: float = 0.0, *, threads: int = 1, whole: BandSummary | None = None
+) -> Band:
+    """Return the band of a cubic grid, which is read once.
+
+    With ``whole`` the grid is a part of another one, of which that is the summary.
+    """
+    (band,), _ = survey_within(grid, offset, threads=threads, whole=whole)
+    return band
+
+
+def survey_within(
     grid: SdfGrid,
     offset: float = 0.0,
+    most: float = np.inf,
     *,
     threads: int = 1,
     whole: BandSummary | None = None,
-    most: float = np.inf,
-) -> Band:
-    """Read a cubic grid once and return its band.
+) -> tuple[list[Band], BandSummary]:
+    """Return the band, in a list that is empty if there are over ``most`` voxels; and its summary.
 
-    With ``whole`` the grid is a part of another one, of which that is the summary.
-    BandTooLargeError is raised as soon as there are more than ``most`` voxels.
+    See ``survey``.
     """
+    side = -(-max(grid.shape) // CELLS)
+    summary = BandSummary(side, np.zeros([-(-n // side) for n in grid.shape], np.int64))
+    parts, count, limits = list[_Found](), 0, (0.0, 0.0)
     low, high = ((limit - offset) * 2 / grid.voxel_size for limit in grid.field.exact)
-    limits = 0.0, 0.0  # what is interpolated beyond the band promises little
-    if grid.on_sample is None:
+    if grid.on_sample is None:  # what is interpolated beyond the band promises little
         ends = [(end - offset) * 2 / grid.voxel_size for end in (grid.low, grid.high)]
         lowest, highest = map(float, np.clip(ends, -FAR, FAR).astype(np.float32))
         limits = max(low, lowest), min(high, highest)  # at its ends a field may be cut off
-    parts, count = list[_Found](), 0
-    for found in _found(grid, offset, threads, limits, is_checked=whole is None):
-        parts.append(found)
+    step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), planes_at_once(grid.samples))
+    blocks = [(at, min(at + step, grid.shape[0])) for at in range(0, grid.shape[0], step)]
+    for found in over_threads(partial(_find, grid, offset, limits), blocks, threads):
+        if offset and not whole:  # distances must not be cut off near it; at 0 none is better
+            _check_offset(grid, offset, found.patches)
+        summary.add(found)
         count += len(found.voxel_ijk)
+        parts.append(found)
         if count > most:
-            raise BandTooLargeError
+            parts.clear()
+    if not parts:
+        return [], summary
+    whole = whole or summary
     every = _Found(*map(np.concatenate, zip(*parts)))
     del parts, found
-    whole = whole or BandSummary(*every.figures(), np.zeros((0, 0, 0), np.int64))
     exact, sample = _exact(every, whole), every.patches[:, CENTRE]
     exact &= (sample > low) & (sample < high)
-    trusted = TrustedSamples(grid.shape, every.number[:0], every.value[:0])
+    own = np.ravel_multi_index(tuple(every.voxel_ijk[exact].T), grid.shape)
+    number, value = np.append(own, every.number), np.append(sample[exact], every.value)
     # whether limits are beyond the band is the same for all parts of a grid
-    if exact.any() and (limits[0] < -HALF_BAND or limits[1] > HALF_BAND):
-        own = np.ravel_multi_index(tuple(every.voxel_ijk[exact].T), grid.shape)
-        number, value = np.append(own, every.number), np.append(sample[exact], every.value)
-        order = np.argsort(number, kind="stable")
-        trusted = TrustedSamples(grid.shape, number[order], value[order])
-    return Band(grid, offset, *every[:5], exact, limits, trusted, whole.leaves)
-
-
-def summarise(grid: SdfGrid, offset: float = 0.0, threads: int = 1) -> BandSummary:
-    """Return what the band of a cubic grid says, without keeping it; the grid is read once."""
-    side = -(-max(grid.shape) // CELLS)
-    cells, figures = np.zeros([-(-n // side) for n in grid.shape], np.int64), []
-    for found in _found(grid, offset, threads):
-        np.add.at(cells, tuple((found.voxel_ijk // side).T), 1)
-        figures.append(found.figures())
-    told, noisy, low, high, leaves = zip(*figures)
-    return BandSummary(sum(told), sum(noisy), min(low), max(high), any(leaves), cells, side)
+    is_trusted = exact.any() and (limits[0] < -HALF_BAND or limits[1] > HALF_BAND)
+    order = np.argsort(number, kind="stable") if is_trusted else slice(0)
+    trusted = SampleSpheres(grid.shape, number[order], value[order])
+    return [Band(grid, offset, *every[:5], exact, limits, trusted, whole.leaves)], summary
 
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
@@ -167,59 +168,58 @@ def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     )
 
 
-def _found(
-    grid: SdfGrid,
-    offset: float,
-    threads: int,
-    limits: tuple[float, float] = (0.0, 0.0),
-    *,
-    is_checked: bool = True,
-) -> Iterator[_Found]:
-    """Yield what is found in the planes of a grid, in order.
+def _find(
+    grid: SdfGrid, offset: float, limits: tuple[float, float], planes: tuple[int, int]
+) -> _Found:
+    """Return what is found from one plane of a grid to before another."""
+    (first, last), count = planes, grid.shape[0]
+    low, is_spline = max(first - 1, 0), grid.field.network is None
+    rescaled = rescale(grid, offset, low, min(last + 1, count))
+    let_go(grid.samples)
+    own, unseen = slice(first - low, last - low), grid.field.unseen
+    known = True if unseen is None else ~np.asarray(unseen[first:last])
+    active = (is_near if is_spline else is_active)(rescaled)[own] & known
+    ijk = np.argwhere(active).astype(np.int32)
+    patches = gather_patches(rescaled, ijk + np.array([own.start, 0, 0], np.int32))
+    ijk[:, 0] += first
 
-    An offset ``is_checked``: distances must not be cut off near it. At 0 no other one is better.
+    # Samples of a resampled grid are judged by samples alone: interpolated values do not tell
+    # whether these are noisy. Interpolated values that contradict no others count as exact,
+    # since thin parts need them (docs/guides/formats.md).
+    lipschitz, sampled = is_lipschitz(patches), on_samples(grid, ijk)
+    if grid.on_sample is not None:
+        lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
+    # Only a patch that can be distances proves, by a sample far from the surface, that the
+    # voxel holds none.
+    decoded: BoolArray = (np.abs(patches[:, CENTRE]) <= DECODE_LIMIT) | ~lipschitz | is_spline
+    if grid.field.sides_only:
+        decoded = np.asarray((patches > 0).any(1) & (patches <= 0).any(1))
+
+    inner = rescaled[own]
+    faces = [inner[:, [0, -1]], inner[:, :, [0, -1]]]
+    faces += [inner[0]] * (first == 0) + [inner[-1]] * (last == count)
+    leaves = np.array([any((face <= 0).any() for face in faces)])
+    lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
+    beyond = known & (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
+    number, value = np.flatnonzero(beyond) + first * inner[0].size, inner[beyond]
+    return _Found(ijk, patches, lipschitz, sampled, decoded, number, value, leaves)
+
+
+def _exact(found: _Found, whole: BandSummary) -> BoolArray:
+    """Return which samples of a band can be taken as exact distances, (V,): see the module.
+
+    A truncated sample is the lowest or the highest of the ``whole`` band, and has no neighbour
+    towards which the field is as steep as a distance.
     """
-    unseen, count = grid.field.unseen, grid.shape[0]
-    is_spline = grid.field.network is None
-
-    def look(planes: tuple[int, int]) -> _Found:
-        first, last = planes
-        low = max(first - 1, 0)
-        rescaled = rescale(grid, offset, low, min(last + 1, count))
-        let_go(grid.samples)
-        own = slice(first - low, last - low)
-        known = True if unseen is None else ~np.asarray(unseen[first:last])
-        active = (is_near if is_spline else is_active)(rescaled)[own] & known
-        ijk = np.argwhere(active).astype(np.int32)
-        patches = gather_patches(rescaled, ijk + np.array([own.start, 0, 0], np.int32))
-        ijk[:, 0] += first
-        if is_checked and offset:
-            _check_offset(grid, offset, patches)
-
-        # Samples of a resampled grid are judged by samples alone: interpolated values do not tell
-        # whether these are noisy. Interpolated values that contradict no others count as exact,
-        # since thin parts need them (docs/guides/formats.md).
-        lipschitz, sampled = is_lipschitz(patches), on_samples(grid, ijk)
-        if grid.on_sample is not None:
-            lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
-        # Only a patch that can be distances proves, by a sample far from the surface, that the
-        # voxel holds none.
-        decoded: BoolArray = (np.abs(patches[:, CENTRE]) <= DECODE_LIMIT) | ~lipschitz | is_spline
-        if grid.field.sides_only:
-            decoded = np.asarray((patches > 0).any(1) & (patches <= 0).any(1))
-
-        inner = rescaled[own]
-        faces = [inner[:, [0, -1]], inner[:, :, [0, -1]]]
-        faces += [inner[0]] * (first == 0) + [inner[-1]] * (last == count)
-        leaves = np.array([any((face <= 0).any() for face in faces)])
-        lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
-        beyond = known & (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
-        number, value = np.flatnonzero(beyond) + first * inner[0].size, inner[beyond]
-        return _Found(ijk, patches, lipschitz, sampled, decoded, number, value, leaves)
-
-    step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), planes_at_once(grid.samples))
-    blocks = [(first, min(first + step, count)) for first in range(0, count, step)]
-    yield from over_threads(look, blocks, threads)
+    patches, sample = found.patches, found.patches[:, CENTRE]
+    if not whole.told or whole.noisy / whole.told > MAX_NOISY_SHARE:
+        return np.zeros(len(sample), bool)
+    exact: BoolArray = found.lipschitz & (np.abs(sample) < MAX_DISTANCE)
+    ends = np.where(sample > 0, np.float32(whole.high), np.float32(whole.low))
+    at_limit = np.flatnonzero(exact & (sample == ends))
+    slope = np.abs(patches[at_limit] - sample[at_limit, None]) / np.maximum(MAX_DIFFERENCE, 1)
+    exact[at_limit] = slope.max(1) >= MIN_SLOPE
+    return exact
 
 
 def _check_offset(grid: SdfGrid, offset: float, patches: FloatArray) -> None:
@@ -232,11 +232,11 @@ def _check_offset(grid: SdfGrid, offset: float, patches: FloatArray) -> None:
     if cut_off.any():
         end = offset + float(centre[cut_off][0]) * grid.voxel_size / 2
         room = HALF_BAND / 2 * grid.voxel_size
-        limit, which = (end - room, "largest") if end > 0 else (end + room, "smallest")
-        works = f"the {which} that works is {limit:.6g}" if limit * end > 0 else "only 0 works"
+        limit = np.copysign(max(abs(end) - room, 0), end)
         raise GridError(
             f"offset {offset:g} needs distances {HALF_BAND / 2:g} spacings ({room:.6g}) to either "
-            f"side of it, but they end at {end:.6g}: {works}"
+            f"side of it, but they end at {end:.6g}: the {'largest' if end > 0 else 'smallest'} "
+            f"that works is {limit:.6g}"
         )
 
 
@@ -338,18 +338,3 @@ def is_lipschitz(patches: FloatArray, places: slice | NDArray[np.intp] = slice(N
     """
     apart = np.abs(patches[:, places] - patches[:, CENTRE, None])
     return np.asarray((apart <= MAX_DIFFERENCE[places]).all(1))
-
-
-def _exact(found: _Found, whole: BandSummary) -> BoolArray:
-    """Return which samples of a band can be taken as exact distances, (V,): see the module.
-
-    A truncated sample is the lowest or the highest of the ``whole`` band, and has no neighbour
-    towards which the field is as steep as a distance.
-    """
-    patches, sample = found.patches, found.patches[:, CENTRE]
-    exact: BoolArray = found.lipschitz & (np.abs(sample) < MAX_DISTANCE) & (not whole.is_noisy)
-    low, high = np.float32(whole.low), np.float32(whole.high)
-    at_limit = np.flatnonzero(exact & (sample == np.where(sample > 0, high, low)))
-    slope = np.abs(patches[at_limit] - sample[at_limit, None]) / np.maximum(MAX_DIFFERENCE, 1)
-    exact[at_limit] = slope.max(1) >= MIN_SLOPE
-    return exact

@@ -15,12 +15,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import count as count_up
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, STRIDES, BoolArray, FloatArray, IntArray
+from ..arrays import CENTRE, STRIDES, FloatArray, IntArray
 from ..threads import CHUNK, chunks_of, map_chunks
 from .nodes import SharedParts, average_shared, block_ijk, block_offsets
 
@@ -41,24 +40,23 @@ TEMPORARIES, PAIRS = 1024, 4096  # numbers of each block in a chunk; spheres and
 
 
 @dataclass(frozen=True, eq=False)
-class TrustedSamples:
-    """All samples whose spheres can be trusted: exact ones of the band, and some beyond it."""
+class SampleSpheres:
+    """The spheres of exact samples: the surface touches each and pierces none."""
 
     shape: tuple[int, int, int]  # samples of the grid along each axis
-    number: NDArray[np.int64]  # (n,), of the samples in C order of the whole grid
-    value: FloatArray  # (n,)
+    number: NDArray[np.int64]  # (n,), of the samples in C order of the whole grid, ascending
+    distance: FloatArray  # (n,), signed, in half voxels
 
     def planes(self, first: int, last: int) -> FloatArray:
-        """Return planes ``first`` to before ``last``, NaN where no sample is trusted.
+        """Return distances in planes ``first`` to before ``last``, NaN where there is no sphere.
 
         Across, they reach ``REACH_OF_SAMPLES`` beyond the grid on either side.
         """
         ny, nz = self.shape[1:]
         planes = np.full((last - first, ny * nz), np.nan, np.float32)
         rows = slice(*np.searchsorted(self.number, np.array([first, last]) * (ny * nz)))
-        planes.ravel()[self.number[rows] - first * (ny * nz)] = self.value[rows]
-        beyond = (REACH_OF_SAMPLES,) * 2
-        widths = (0, 0), beyond, beyond
+        planes.ravel()[self.number[rows] - first * (ny * nz)] = self.distance[rows]
+        widths = (0, 0), (REACH_OF_SAMPLES,) * 2, (REACH_OF_SAMPLES,) * 2
         return np.pad(planes.reshape(-1, ny, nz), widths, constant_values=np.nan)
 
 
@@ -67,7 +65,7 @@ def keep_within_bounds(
     parts: SharedParts,
     factor: int,
     voxel_ijk: IntArray,
-    samples: TrustedSamples,
+    samples: SampleSpheres,
     threads: int = 1,
 ) -> None:
     """Move values that clearly exceed the samples' bounds to the nearest that these allow.
@@ -76,7 +74,7 @@ def keep_within_bounds(
     that they share with others, which are averaged again. ``blocks`` (Q, D + 1) of voxels (D, 3),
     in C order, are changed in place; the last column is 0.
     """
-    if factor < LEAST_FACTOR or not len(samples.value):
+    if factor < LEAST_FACTOR or not len(samples.distance):
         return
     thin, steps = np.zeros(blocks.shape[1], bool), sample_places()[0]
 
@@ -91,10 +89,9 @@ def keep_within_bounds(
             first = rows.start + some.start
             values = np.ascontiguousarray(blocks[:, first : rows.start + some.stop].T)
             row, moved = _bounded(values, factor, planes.take(start[some, None] + around))
-            before = values[row]
-            lost = np.count_nonzero((before <= 0) & (moved > 0), axis=1)
-            inside = np.count_nonzero(before <= 0, axis=1)
-            thin[first + row] = lost > MOST_LOST * inside
+            inside = values[row] <= 0
+            lost = np.count_nonzero(inside & (moved > 0), axis=1)
+            thin[first + row] = lost > MOST_LOST * np.count_nonzero(inside, axis=1)
             moves.append((first + row, moved))
         return moves
 
@@ -127,30 +124,26 @@ def _bounded(
     block += count * (size < 0)
     size = np.abs(size)
     to_nodes, looked_at = node_distances(factor)
-    to_looked, looked = (array.take(looked_at, 1) for array in (to_nodes, values))
-    looked, near, exceeds = np.concatenate([-looked, looked]), [], []
+    to_looked, looked = to_nodes.take(looked_at, 1), values.take(looked_at, 1)
+    looked, over = np.concatenate([-looked, looked]), np.empty_like(size)
     for some in chunks_of(len(block), CHUNK // PAIRS):
-        over = looked.take(block[some], 0)
-        over -= to_looked.take(place[some], 0)  # by how much it is, less the size of the sphere
-        at = np.flatnonzero(_any_of_32(over > (-MARGIN - size[some])[:, None]))
-        near.append(some.start + at)
-        exceeds.append(_any_of_32(over.take(at, 0) > (EXCEEDED - size[near[-1]])[:, None]))
-    chosen, bounded = np.concatenate(near), np.zeros((2, count), bool)
-    block, place, size = block[chosen], place[chosen], size[chosen]
-    bounded.ravel()[block[np.concatenate(exceeds)]] = True
+        beyond = looked.take(block[some], 0)
+        beyond -= to_looked.take(place[some], 0)
+        over[some] = beyond.max(1)  # by how much it is, less the size of the sphere
+    bounded = np.zeros((2, count), bool)
+    bounded.ravel()[block[over > EXCEEDED - size]] = True
     bounded[:, np.isnan(own) | (slack < -CONTRADICTION).any(1)] = False
-    chosen = np.flatnonzero(bounded.ravel()[block])
+    chosen = np.flatnonzero((over > -MARGIN - size) & bounded.ravel()[block])
     chosen = chosen[np.argsort(block[chosen], kind="stable")]
     block, place, size = block[chosen], place[chosen], size[chosen]
     spheres = np.bincount(block, minlength=2 * count)
     most = np.argsort(-spheres, kind="stable")[: np.count_nonzero(spheres)]  # those with most first
-    first = (np.cumsum(spheres) - spheres)[most]
+    first, times = (np.cumsum(spheres) - spheres)[most], spheres[most]
     tightest = np.full((len(most), values.shape[1]), -np.inf, np.float32)
-    for end, nth in zip(np.searchsorted(-spheres[most], -np.arange(spheres.max())), count_up()):
-        number = first[:end] + nth  # the first sphere of each block, then the second
-        bound = to_nodes.take(place.take(number), 0)
-        np.subtract(size.take(number)[:, None], bound, out=bound)
-        np.maximum(tightest[:end], bound, out=tightest[:end])
+    for nth in range(spheres.max()):  # the first sphere of each block, then the second
+        number = first[: np.count_nonzero(times > nth)] + nth
+        bound = size.take(number)[:, None] - to_nodes.take(place.take(number), 0)
+        np.maximum(tightest[: len(number)], bound, out=tightest[: len(number)])
     moved, outside = values.copy(), most < count
     row = most[outside]
     moved[row] = np.maximum(moved[row], tightest[outside])
@@ -160,12 +153,6 @@ def _bounded(
     moved[:, middle] = values[:, middle]  # the block's own sample
     row = np.flatnonzero(bounded.any(0))
     return row, moved[row]
-
-
-def _any_of_32(found: BoolArray) -> BoolArray:
-    """Return in which rows of (k, 32) any is True, (k,); eight in each number: faster than any."""
-    a, b, c, d = found.view(np.uint64).T
-    return np.asarray(a | b | c | d, bool)
 
 
 @lru_cache
@@ -181,11 +168,10 @@ def sample_places() -> tuple[IntArray, FloatArray]:
 
 @lru_cache
 def node_distances(factor: int) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Return the distances from the samples round a block to its nodes, (m, Q), and some nodes.
+    """Return the distances from the samples round a block to its nodes, (m, Q), and 27 nodes.
 
-    Those are the 27 at the ends and in the middle of the block, filled up to 32 by the last.
+    Those are at the ends and in the middle of the block.
     """
     apart = 2 * sample_places()[0][:, None] - block_offsets(factor).astype(np.float64)
     distance: FloatArray = np.linalg.norm(apart, axis=2).astype(np.float32)
-    nodes = np.flatnonzero((block_ijk(factor) % (factor // 2) == 0).all(1))
-    return distance, np.pad(nodes, (0, 5), mode="edge")
+    return distance, np.flatnonzero((block_ijk(factor) % (factor // 2) == 0).all(1))

@@ -18,32 +18,19 @@ from ..errors import OptionError
 from ..grid.interpret import NONE_EXACT, Field
 from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
+from ..threads import chunks_of
 from .band import rescale
+from .bounds import SampleSpheres
 from .nodes import (
     BARELY_INSIDE,
     BARELY_OUTSIDE,
     SharedParts,
-    VoxelIndex,
     block_ijk,
+    nodes_of_part,
     number_parts,
-    part_of_node,
 )
 
-COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes", "pinned_nodes")
-
-
-@dataclass(frozen=True, eq=False)
-class SampleSpheres:
-    """The spheres of exact samples: the surface touches each and pierces none."""
-
-    shape: tuple[int, int, int]  # samples of the grid along each axis
-    voxel_ijk: IntArray  # (m, 3), the samples, in C order
-    distance: FloatArray  # (m,), signed, in half voxels
-
-    @cached_property
-    def index(self) -> VoxelIndex:
-        """Finds which sample lies in a voxel."""
-        return VoxelIndex(self.voxel_ijk, self.shape)
+COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -75,9 +62,14 @@ class FineField:
     leaves : bool
         Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
         that crosses the border all the same is closed there.
+    border_inside : (n, 3) int32, optional
+        Voxels on the border that are inside and have no block. None: they are found in the grid.
     octants : (D,) uint8, optional
         A bit for each octant of each voxel: whether all eight samples round it are known. Where
         one is not, the surface ends. None if all are known.
+    found : two ints
+        Voxels of the band, and those of them whose samples differ from others by more than
+        distances can.
     """
 
     shape: tuple[int, int, int]
@@ -89,11 +81,9 @@ class FineField:
     offset: float = 0.0
     spheres: SampleSpheres | None = None
     leaves: bool = True
-    # (n, 3), voxels on the border that are inside and have no block; None: found in the grid
     border_inside: IntArray | None = None
     octants: NDArray[np.uint8] | None = None
-    found: tuple[int, int] = (0, 0)  # ``band_voxels`` and ``noisy_voxels`` of ``count``
-    pinned: IntArray | None = None  # (D,), how many ``pinned_nodes`` each voxel owns
+    found: tuple[int, int] = (0, 0)
 
     def __repr__(self) -> str:
         shape, nodes = " x ".join(map(str, self.shape)), self.parts.count_nodes(self.factor)
@@ -101,15 +91,9 @@ class FineField:
         return f"FineField(factor {self.factor}, {nodes:,} nodes of {voxels})"
 
     def count(self, own: slice | BoolArray = slice(None)) -> dict[str, int]:
-        """Return counts by name; of decoded voxels and nodes, those of some voxels.
-
-        ``noisy_voxels`` are those of the band round which samples differ by more than distances
-        can. The sign of ``pinned_nodes`` had to be changed to that of a voxel that holds no
-        surface: if there are any, the input is not a distance field there, or the network failed.
-        """
-        pinned = 0 if self.pinned is None else int(self.pinned[own].sum())
+        """Return how many voxels and nodes there are, by name; of those decoded, only some."""
         nodes = self.parts.count_nodes(self.factor, own)
-        return dict(zip(COUNTS, (*self.found, len(self.voxel_ijk[own]), nodes, pinned)))
+        return dict(zip(COUNTS, (*self.found, len(self.voxel_ijk[own]), nodes)))
 
     @cached_property
     def numbers(self) -> IntArray:
@@ -117,9 +101,11 @@ class FineField:
 
         OptionError if there are more nodes than 32-bit numbers.
         """
+        numbers = np.empty(self.blocks.shape[::-1], np.int32)
         starts, _ = number_parts(self.parts, self.factor)
-        part, place = part_of_node(self.factor)
-        return starts.T[:, part] + place
+        for first, nodes in zip(starts, nodes_of_part(self.factor)):
+            numbers[:, nodes] = first[:, None] + np.arange(len(nodes))
+        return numbers
 
     @cached_property
     def values(self) -> FloatArray:
@@ -146,9 +132,9 @@ class FineField:
         """Return the signed distances at ``positions``, (n,), in world units, negative inside."""
         return self.in_world_units(self.values)
 
-    def block_distances(self, rows: slice = slice(None)) -> NDArray[np.float64]:
-        """Return the distances at the nodes of voxels' blocks, (m, Q), in world units."""
-        return self.in_world_units(self.blocks[:, rows].T)
+    def block_distances(self) -> NDArray[np.float64]:
+        """Return the distances at the nodes of each voxel's block, (D, Q), in world units."""
+        return self.in_world_units(self.blocks.T)
 
     def in_world_units(self, values: FloatArray) -> NDArray[np.float64]:
         """Return values in half voxels as distances in world units, float64: without rounding."""
@@ -229,15 +215,12 @@ class FineLattice(SamplePlanes):
 
         ends = (first - 1) // factor, (last - 1) // factor + 1  # of the voxels with nodes there
         rows = slice(*np.searchsorted(field.voxel_ijk[:, 0], ends).tolist())
-        i, j, k = factor * field.voxel_ijk[rows].T.astype(np.int64)
-        side, (_, ny, nz) = factor + 1, self.shape
-        face = (np.arange(side)[:, None] * nz + np.arange(side)).ravel()
-        flat = planes.reshape(-1)
-        for layer, values in enumerate(field.blocks[:, rows].reshape(side, side * side, -1)):
-            at = i + layer - first
-            here = np.flatnonzero((at >= 0) & (at < len(planes)))
-            corner = (at[here] * ny + j[here]) * nz + k[here]
-            flat[corner + face[:, None]] = values[:, here]
+        corner, nodes = factor * field.voxel_ijk[rows].T, block_ijk(factor).T[:, :, None]
+        corner[0] -= first
+        for some in chunks_of(corner.shape[1], 8 * nodes.shape[1]):
+            i, j, k = corner[:, None, some] + nodes
+            here = (i >= 0) & (i < len(planes))
+            planes[i[here], j[here], k[here]] = field.blocks[:, rows][:, some][here]
         scale = grid.voxel_size / 2
         return np.multiply(planes, scale, out=planes, dtype=np.float64, casting="same_kind")
 

@@ -46,26 +46,17 @@ def block_offsets(factor: int) -> FloatArray:
 
 
 @lru_cache
-def part_of_node(factor: int) -> tuple[IntArray, IntArray]:
-    """Return the part of each node of a block, (Q,) in 0..26, and its index in the part, (Q,)."""
+def part_of_node(factor: int) -> IntArray:
+    """Return the part of each node of a block, (Q,) in 0..26."""
     block = block_ijk(factor)
-    part = (np.where(block == 0, 0, np.where(block == factor, 2, 1)) @ STRIDES).astype(np.int32)
-    place = np.empty_like(part)
-    for number in range(27):
-        place[part == number] = np.arange((part == number).sum())
-    return part, place
+    side = np.where(block == 0, 0, np.where(block == factor, 2, 1))
+    return np.asarray(side @ STRIDES, np.int32)
 
 
 @lru_cache
 def nodes_of_part(factor: int) -> list[NDArray[np.intp]]:
     """Return the nodes of each of the 27 parts, as indices into the block."""
-    part, _ = part_of_node(factor)
-    return [np.flatnonzero(part == number) for number in range(27)]
-
-
-def part_sizes(factor: int) -> NDArray[np.int64]:
-    """Return the number of nodes of each part, (27,): of one voxel with factor 2, 1 of each."""
-    return np.asarray((factor - 1) ** (NEIGHBOURHOOD == 0).sum(1), np.int64)
+    return [np.flatnonzero(part_of_node(factor) == part) for part in range(27)]
 
 
 def seen_from(part: int, neighbour: int | np.integer[Any]) -> int:
@@ -108,8 +99,8 @@ class SharedParts:
 
     def count_nodes(self, factor: int, rows: slice | BoolArray = slice(None)) -> int:
         """Return the number of nodes that voxels own."""
-        owned = self.owner[:, rows] == CENTRE
-        return int(np.count_nonzero(owned, axis=1) @ part_sizes(factor))
+        owned = np.count_nonzero(self.owner[:, rows] == CENTRE, axis=1).tolist()
+        return sum(count * len(nodes) for count, nodes in zip(owned, nodes_of_part(factor)))
 
 
 def share_parts(table: IntArray) -> SharedParts:
@@ -129,16 +120,14 @@ def number_parts(parts: SharedParts, factor: int) -> tuple[IntArray, int]:
     They come in the order of the voxels that own them. OptionError if there are more nodes than
     32-bit numbers.
     """
-    owned, sizes = parts.owner == CENTRE, part_sizes(factor)
-    count = check_count(int(np.count_nonzero(owned, axis=1) @ sizes), "nodes")
-    starts = np.cumsum(owned * sizes[:, None].astype(np.int32), axis=0, dtype=np.int32)
-    before = np.cumsum(starts[-1], dtype=np.int32) - starts[-1]  # of earlier voxels
-    starts += before - sizes[:, None].astype(np.int32)
+    count = check_count(parts.count_nodes(factor), "nodes")
+    size = np.array([[len(nodes)] for nodes in nodes_of_part(factor)], np.int32)
+    ends = np.cumsum((parts.owner == CENTRE) * size, axis=0, dtype=np.int32)
+    starts = ends - size + (np.cumsum(ends[-1], dtype=np.int32) - ends[-1])  # after earlier voxels
     for part, sharing in enumerate(SHARING):
         for place in sharing[sharing < CENTRE]:
             rows = np.flatnonzero(parts.owner[part] == place)
-            neighbour = parts.table[place].take(rows)
-            starts[part][rows] = starts[seen_from(part, place)].take(neighbour)
+            starts[part, rows] = starts[seen_from(part, place), parts.table[place, rows]]
     return starts, count
 
 
@@ -147,24 +136,24 @@ def average_shared(
     parts: SharedParts,
     factor: int,
     threads: int = 1,
-    which: BoolArray | None = None,
+    which: BoolArray | slice = slice(None),
 ) -> None:
     """Set each copy of a shared node to the mean of the copies (Eq. 7), in ``blocks`` (Q, D + 1).
 
-    Only nodes owned by the voxels ``which`` (D,), if given. Sums are taken in the order of the
-    voxels and in double precision (of two numbers in single), so that all copies are equal.
+    Only nodes owned by the voxels ``which`` (D,). Sums are taken in the order of the voxels and in
+    double precision (of two numbers in single), so that all copies are equal.
     """
-    nodes = nodes_of_part(factor)
+    nodes, chosen = nodes_of_part(factor), np.zeros(parts.table.shape[1], bool)
+    chosen[which] = True
 
     def average(part: int) -> None:
         """Average the nodes of one part in the blocks of the voxels that own it."""
-        owned = parts.owner[part] == CENTRE
-        own = np.flatnonzero(owned if which is None else owned & which)
+        own = np.flatnonzero((parts.owner[part] == CENTRE) & chosen)
         later = SHARING[part][SHARING[part] > CENTRE]  # those that also have it
-        voxels = [parts.table[place].take(own) for place in later]
-        there = [np.flatnonzero(voxel >= 0) for voxel in voxels]
+        voxels = parts.table[later].take(own, 1)
         kind = np.float32 if len(SHARING[part]) == 2 else np.float64
-        times = 1 + np.sum([voxel >= 0 for voxel in voxels], 0, kind)
+        times = 1 + np.sum(voxels >= 0, 0, kind)
+        there = [np.flatnonzero(voxel >= 0) for voxel in voxels]
         for copies in zip(nodes[part], *(nodes[seen_from(part, place)] for place in later)):
             total = blocks[copies[0]].take(own).astype(kind, copy=False)
             for node, voxel in zip(copies[1:], voxels):
@@ -200,29 +189,25 @@ def pin_to_skipped(
     voxel_ijk: IntArray,
     patches: FloatArray,
     shape: tuple[int, int, int],
-) -> IntArray:
+) -> None:
     """Give the nodes shared with a skipped voxel that voxel's sign, in ``blocks`` (Q, D).
 
     A skipped voxel was not decoded, so it holds no surface, and all its nodes have the sign of its
     sample. Once they do, no sign change reaches the boundary of the decoded voxels (D, 3), and the
-    isosurface has no hole there. ``patches`` (D, 27) are the samples round these. Returned is how
-    many nodes were changed that each voxel owns, (D,).
+    isosurface has no hole there. ``patches`` (D, 27) are the samples round these.
     """
-    # the sign of each neighbour, 0 of decoded ones
-    skipped: NDArray[np.int8] = np.zeros(parts.table.shape, np.int8)
+    skipped = np.zeros((27, len(voxel_ijk)), np.int8)  # the sign of neighbours, 0 of decoded ones
     for place, step in enumerate(NEIGHBOURHOOD):
         at = np.flatnonzero(parts.table[place] < 0)
         at = at[within(voxel_ijk[at] + step, shape)]
         skipped[place, at] = np.where(patches[at, place] > 0, 1, -1)
-    changed = np.zeros(len(voxel_ijk), np.int32)
-    for part, nodes in enumerate(nodes_of_part(factor)):
-        sign = np.zeros(skipped.shape[1], np.int8)
-        for signs in skipped[SHARING[part]]:
+    for sharing, nodes in zip(SHARING, nodes_of_part(factor)):
+        sign = np.zeros(len(voxel_ijk), np.int8)
+        for signs in skipped[sharing]:
             np.copyto(sign, signs, where=signs != 0)
-        known, outside = sign != 0, sign > 0
+        known = np.flatnonzero(sign)
+        outside = sign[known] > 0
+        barely = np.where(outside, BARELY_OUTSIDE, BARELY_INSIDE)
         for node in nodes:
-            wrong = known & ((blocks[node] > 0) != outside)
-            if wrong.any():
-                blocks[node, wrong] = np.where(outside[wrong], BARELY_OUTSIDE, BARELY_INSIDE)
-                changed += wrong & (parts.owner[part] == CENTRE)
-    return changed
+            values = blocks[node].take(known)
+            blocks[node, known] = np.where((values > 0) == outside, values, barely)

@@ -77,20 +77,11 @@ class Look(NamedTuple):
     clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
 
 
-class FootPoints(NamedTuple):
-    """Foot points of samples, and the field's value there."""
-
-    rows: IntArray  # (n,), the block that each lies in
-    place: FloatArray  # (3, n), the position in the block, 0 to 1 along each axis
-    values: FloatArray  # (n,), the field there: the error, since it should be 0
-    weights: FloatArray  # (n,), how far to trust it, 0 to 1
-
-
 def fit_to_spheres(
     blocks: FloatArray,
     parts: SharedParts,
     factor: int,
-    spheres: Spheres,
+    band: Band,
     index: VoxelIndex,
     threads: int = 1,
 ) -> None:
@@ -100,22 +91,23 @@ def fit_to_spheres(
     ``blocks`` (Q, D + 1), in half voxels, are changed in place; the last column is 0. ``parts`` and
     ``index`` are of the D voxels.
     """
-    if not len(spheres.distance):  # in a noisy field, for example
+    if not band.exact.any():  # in a noisy field, for example
         return
+    spheres = spheres_of_band(band, threads)
 
-    def touch(rows: slice) -> FootPoints:
+    def touch(rows: slice) -> tuple[NDArray[Any], ...]:
         return find_foot_points(blocks, factor, spheres.some(rows), index)
 
     feet = map_chunks(touch, len(spheres.distance), TEMPORARIES, threads)
-    correction = find_correction(FootPoints(*map(_joined, zip(*feet))), parts)
+    correction = find_correction(parts, *(np.concatenate(each, -1) for each in zip(*feet)))
 
     def subtract(rows: slice) -> None:
         blocks[:, rows] -= prolong(correction[:, rows], 2, factor)
 
     map_chunks(subtract, correction.shape[1], len(blocks), threads)
-    own = spheres.some(np.abs(spheres.distance) < MAX_DISTANCE)
-    rows = index.find(own.centre.T)
-    blocks[len(blocks) // 2, rows[rows >= 0]] = own.distance[rows >= 0]
+    rows = index.find(band.voxel_ijk[band.exact])
+    sample = band.patches[band.exact, CENTRE]
+    blocks[len(blocks) // 2, rows[rows >= 0]] = sample[rows >= 0]
 
 
 def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
@@ -126,40 +118,43 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
     gradient; one that was cut off does not rise as distances do.
     """
     exact, (low, high) = np.flatnonzero(band.exact), band.limits
+    centre, own = band.voxel_ijk[exact], band.patches[exact, CENTRE]
 
-    def gather(rows: slice) -> tuple[Spheres, Spheres, FloatArray]:
-        patch = band.patches[exact[rows]]  # (n, 27)
-        gradient = _unit((patch[:, CENTRE + STRIDES] - patch[:, CENTRE - STRIDES]).T)
-        centre = np.ascontiguousarray(band.voxel_ijk[exact[rows]].T)
-        own = Spheres(centre, patch[:, CENTRE].copy(), gradient)
-        size, sign = np.abs(patch), np.copysign(np.float32(1), own.distance)
-        slope = (sign[:, None] * patch - np.abs(own.distance)[:, None]) / APART
-        found = np.asarray((size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND))
-        found &= (slope >= MIN_SLOPE) & (patch > low) & (patch < high)
-        found &= within(own.centre.T[:, None] + NEIGHBOURHOOD, band.grid.shape)
-        row, step = np.nonzero(found)
-        centre = own.centre[:, row] + NEIGHBOURHOOD[step].T
-        beyond = Spheres(centre, patch[row, step], own.direction[:, row])
-        return own, beyond, slope[row, step]
+    def find_beyond(rows: slice) -> tuple[NDArray[Any], ...]:
+        patch, sample = band.patches[exact[rows]], own[rows, None]
+        size = np.abs(patch)
+        slope = (np.copysign(np.float32(1), sample) * patch - np.abs(sample)) / APART
+        found = (size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND) & (slope >= MIN_SLOPE)
+        found &= (patch > low) & (patch < high)
+        found &= within(centre[rows, None] + NEIGHBOURHOOD, band.grid.shape)
+        row, place = np.nonzero(found)
+        return rows.start + row, place, slope[row, place]
 
-    parts = map_chunks(gather, len(exact), 4 * TEMPORARIES, threads) or [gather(slice(0))]
-    own, beyond = (Spheres(*map(_joined, zip(*each))) for each in list(zip(*parts))[:2])
-    slope = np.concatenate([part[2] for part in parts])
-    keys = np.ravel_multi_index(tuple(beyond.centre), band.grid.shape)
-    order = np.lexsort((-slope, keys))  # of equal samples the steepest
-    beyond = beyond.some(order[np.diff(keys[order], prepend=-1) > 0])
-    return Spheres(*map(_joined, zip(own, beyond)))
+    parts = map_chunks(find_beyond, len(exact), 4 * TEMPORARIES, threads)
+    row, place, slope = map(np.concatenate, zip(*parts))
+    keys = np.ravel_multi_index(tuple((centre[row] + NEIGHBOURHOOD[place]).T), band.grid.shape)
+    order = np.lexsort((-slope, keys))
+    steepest = order[np.diff(keys[order], prepend=-1) > 0]  # of those of the same sample
+    row, place = row[steepest], place[steepest]
+    beside = band.patches[exact[:, None], CENTRE + STRIDES * np.array([[[1]], [[-1]]])]
+    direction = _unit((beside[0] - beside[1]).T)
+    return Spheres(
+        np.concatenate([centre, centre[row] + NEIGHBOURHOOD[place]]).T,
+        np.concatenate([own, band.patches[exact[row], place]]),
+        np.concatenate([direction, direction[:, row]], 1),
+    )
 
 
 def find_foot_points(
     blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex
-) -> FootPoints:
-    """Return the foot points of samples, leaving out those outside all blocks (Q, D + 1).
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Return foot points of samples: their blocks, places in these, errors and weights.
 
-    The weight falls with the angle between direction and normal, with the error (a Cauchy weight: a
-    large error is probably a place on the wrong part of the surface), and with the sample's
-    distance, since an error of the direction matters more. Spheres from beyond the band mostly
-    touch edges, which linear cells cut off: that they are clear of them is no error.
+    Those outside all blocks (Q, D + 1) are left out. The weight, 0 to 1, falls with the angle
+    between direction and normal, with the error (a Cauchy weight: a large error is probably a place
+    on the wrong part of the surface), and with the sample's distance, since an error of the
+    direction matters more. Spheres from beyond the band mostly touch edges, which linear cells cut
+    off: that they are clear of them is no error.
     """
     found, size = _touch(blocks, factor, spheres, index), np.abs(spheres.distance)
     clear = (size >= MAX_DISTANCE) & (found.clearance > 0)
@@ -172,7 +167,7 @@ def find_foot_points(
     weights = aligned / penalty
     values = np.clip(found.value, -MAX_ERROR, MAX_ERROR)
     kept = (found.rows >= 0) & (weights > MIN_WEIGHT)
-    return FootPoints(found.rows[kept], found.place[:, kept], values[kept], weights[kept])
+    return found.rows[kept], found.place[:, kept], values[kept], weights[kept]
 
 
 def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Look:
@@ -222,11 +217,6 @@ def _unit(vectors: FloatArray) -> FloatArray:
     return vectors / length
 
 
-def _joined(parts: tuple[NDArray[Any], ...]) -> NDArray[Any]:
-    """Return arrays joined along the last axis."""
-    return np.concatenate(parts, -1)
-
-
 def sample_trilinear(
     blocks: FloatArray, rows: IntArray, place: FloatArray, factor: int
 ) -> tuple[FloatArray, FloatArray]:
@@ -252,32 +242,32 @@ def sample_trilinear(
 
 
 def _find_cell(place: FloatArray, cells: int) -> tuple[IntArray, FloatArray]:
-    """Return the cells of places (3, n), (3, n) int32, and the positions in them, 0 to 1."""
+    """Return the cell of each place (3, n) in a block, (3, n), and the position in it, 0 to 1."""
     scaled = place * np.float32(cells)
     low = np.minimum(scaled.astype(np.int32), cells - 1)
     return low, scaled - low.astype(np.float32)
 
 
-def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
+def find_correction(
+    parts: SharedParts, rows: IntArray, place: FloatArray, errors: FloatArray, weights: FloatArray
+) -> FloatArray:
     """Return the correction on the lattice of 2 cells per block, (27, D), in half voxels.
 
-    It is the mean error at the corners of voxels, interpolated to the finer lattice, plus the means
-    there of the errors that are left each time. Where errors disagree, means are smaller. Errors
+    It is the mean error of foot points at the corners of voxels, plus the means at the nodes of the
+    lattice of the errors that are left each time. Where errors disagree, means are smaller. Errors
     are summed in the order of the samples, some at a time, to save memory.
     """
     numbers, count = number_parts(parts, 2)  # one node per part
-    left, voxels = feet.values.copy(), numbers.shape[1]
-    correction = np.zeros((len(numbers), voxels), np.float32)
+    correction, left = np.zeros(numbers.shape, np.float32), errors.copy()
 
-    def nodes_round(rows: slice, cells: int) -> tuple[NDArray[np.intp], FloatArray]:
+    def nodes_round(some: slice) -> tuple[IntArray, FloatArray]:
         """Return the 8 nodes round foot points, (8, n), and their trilinear weights there."""
-        low, inside = _find_cell(feet.place[:, rows], cells)
+        low, inside = _find_cell(place[:, some], cells)
         step = STRIDES * (2 // cells)
-        at = (step @ low + (CORNERS @ step)[:, None]) * voxels + feet.rows[rows]
         upper = np.stack([1 - inside, inside])  # (2, 3, n)
         x, y, z = CORNERS.T
-        shares: FloatArray = upper[x, 0] * upper[y, 1] * upper[z, 2]
-        return numbers.ravel().take(at).astype(np.intp), shares
+        at = step @ low + (CORNERS @ step)[:, None]
+        return numbers[at, rows[some]], upper[x, 0] * upper[y, 1] * upper[z, 2]
 
     def mean(some: slice) -> FloatArray:
         weight, total, squares = sums[:, some]
@@ -286,23 +276,21 @@ def find_correction(feet: FootPoints, parts: SharedParts) -> FloatArray:
         agreement = plain**2 / np.maximum(plain**2 + VARIANCE_PENALTY * variance, 1e-12)
         return np.asarray(agreement * total / (weight + PRIOR_WEIGHT), np.float32)
 
-    cells_before, means = 0, left[:0]
     for cells in CELLS:
-        sums = np.zeros((3, count))  # of weights, values and squares
-        for rows in chunks_of(len(left), TEMPORARIES):
-            if cells_before:
-                at, shares = nodes_round(rows, cells_before)
-                left[rows] -= (means.take(at) * shares).sum(0)
-            if cells != cells_before:
-                at, shares = nodes_round(rows, cells)
-            place, weight = at.T.ravel(), (shares * feet.weights[rows]).T.astype(np.float64)
+        sums = np.zeros((3, count))  # of weights, errors and squares
+        for some in chunks_of(len(rows), TEMPORARIES):
+            at, shares = nodes_round(some)
+            weight = (shares * weights[some]).T.astype(np.float64)
             for total in sums:
-                np.add.at(total, place, weight.ravel())
-                weight *= left[rows, None]
-        cells_before, means = cells, np.concatenate([left[:0], *map_chunks(mean, count, 8)])
+                np.add.at(total, at.T.ravel(), weight.ravel())
+                weight *= left[some, None]
+        means = np.concatenate(map_chunks(mean, count, 8))
+        for some in chunks_of(len(rows), TEMPORARIES):
+            at, shares = nodes_round(some)
+            left[some] -= (means.take(at) * shares).sum(0)
         own = CORNER_PARTS if cells == 1 else slice(None)
-        for rows in chunks_of(voxels, 4 * len(correction)):
-            correction[:, rows] += prolong(means.take(numbers[own, rows]), cells, 2)
+        for some in chunks_of(len(correction[0]), 4 * len(correction)):
+            correction[:, some] += prolong(means.take(numbers[own, some]), cells, 2)
     return correction
 
 
@@ -313,13 +301,10 @@ def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
     ((cells + 1)^3, n) become ((finer + 1)^3, n). If the copies of shared nodes were equal before,
     they are equal, bit for bit.
     """
+    low, rest = np.divmod(np.arange(finer + 1) * cells, finer)
     block = values.reshape(*(cells + 1,) * 3, -1)
     for axis in range(3):
-        source = np.moveaxis(block, axis, 0)
-        block = np.empty((*block.shape[:axis], finer + 1, *block.shape[axis + 1 :]), np.float32)
-        for number, plane in enumerate(np.moveaxis(block, axis, 0)):
-            low, rest = divmod(number * cells, finer)
-            plane[:] = source[low]
-            if rest:
-                plane += (source[low + 1] - source[low]) * np.float32(rest / finer)
+        share = (rest / finer).astype(np.float32).reshape(-1, *(1,) * (3 - axis))
+        below = block.take(low, axis)
+        block = below + (block.take(np.minimum(low + 1, cells), axis) - below) * share
     return block.reshape(len(block) ** 3, -1)

@@ -188,7 +188,7 @@ def values_at(field: FineField, node: NDArray[Any], row: NDArray[Any]) -> FloatA
 @lru_cache
 def part_of_edge(factor: int) -> IntArray:
     """Return the part of the block in which each edge lies, (3 Q,); the part's owner owns it."""
-    side = np.tile(NEIGHBOURHOOD[part_of_node(factor)[0]], (3, 1, 1))
+    side = np.tile(NEIGHBOURHOOD[part_of_node(factor)], (3, 1, 1))
     side[np.arange(3), :, np.arange(3)] = 0  # not at either end of its axis
     part: IntArray = ((side.reshape(-1, 3) + 1) @ STRIDES).astype(np.int32)
     return part

@@ -34,7 +34,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import BoolArray, Index, IntArray, Numbers, Vectors, dot, inner, length, unit
-from ...refine.field import FineField, SampleSpheres
+from ...refine.bounds import SampleSpheres
+from ...refine.field import FineField
 from ...threads import map_chunks
 from ..marching import CAP_HEIGHT, Crossings, tables
 from ..mesh import CLEARANCE
@@ -421,8 +422,8 @@ def find_spheres(wedges: Wedges, voxel: IntArray, spheres: SampleSpheres) -> Nea
     kept = (np.abs(off) < FARTHEST_SPHERE) & (np.abs(along) < FARTHEST_ALONG)
     wedge, place = np.nonzero(kept)
     number = number[of_wedge[wedge], place]
-    centre, tangent = spheres.voxel_ijk.take(number, 0).T + 0.5, wedges.tangent.take(wedge, 1)
-    convex = wedges.convex[wedge]
+    centre = np.stack(np.unravel_index(spheres.number[number], spheres.shape)) + 0.5
+    tangent, convex = wedges.tangent.take(wedge, 1), wedges.convex[wedge]
     may_touch = (np.sign(spheres.distance[number]) == convex) & tangent.any(0)
     outward = -convex * wedges.sides.take(wedge, 2)
     columns = centre, radius[number].astype(np.float64), tangent, outward, wedges.cosine[wedge]
@@ -434,7 +435,7 @@ def _samples_around(voxel: IntArray, spheres: SampleSpheres) -> Index:
 
     A line of them along the last axis is searched for at once: (v, 125).
     """
-    keys, (nx, ny, nz) = spheres.index.keys, spheres.shape
+    keys, (nx, ny, nz) = spheres.number, spheres.shape
     di, dj = np.indices((2 * NEAR + 1,) * 2).reshape(2, -1) - NEAR
     i, j, k = voxel[:, 0, None] + di, voxel[:, 1, None] + dj, voxel[:, 2, None]
     line = (i * ny + j) * nz
