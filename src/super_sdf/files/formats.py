@@ -172,31 +172,29 @@ def check_beside(path: Path, name: str) -> Path:
 
 
 def split_header(path: Path) -> tuple[bytes, list[str], int]:
-    """Return the header of a NRRD or MetaImage file without the entry that names its data files.
+    """Return the header of a MetaImage or NRRD file before the entry that names its data files.
 
     And these names, and where in the file the entry ends: 0 if there is none. The entry is a name,
-    ``NAME%03d.raw 1 20 1``, or ``LIST`` before a name in each line.
+    or of MetaImage ``NAME%03d.raw 1 20 1``, or ``LIST`` before a name in each line.
     """
     with path.open("rb") as file:
         text = file.read(LONGEST_HEADER)
-    is_nrrd = path.suffix.lower() in (".nrrd", ".nhdr")
-    if is_nrrd:  # after a blank line there is data
+    if path.suffix.lower() in (".nrrd", ".nhdr"):  # after a blank line there is data
         text = re.split(rb"\n\r?\n", text, maxsplit=1)[0]
     if not (found := DATA.search(text)):
         return text, [], 0
-    before, rest = text[: found.start()], text[found.end() :]
     entry = found[1].decode(errors="surrogateescape").strip()
-    if entry.upper().startswith("LIST"):
-        listed = rest.decode(errors="surrogateescape").splitlines()
-        return before, [name for name in listed if name.strip()], found.end()
     names = [entry]
-    if "%" in entry:
+    if entry.upper().startswith("LIST"):
+        listed = text[found.end() :].decode(errors="surrogateescape").splitlines()
+        names = [name for name in listed if name.strip()]
+    elif "%" in entry:
         pattern, *numbers = entry.split()
         if not re.fullmatch("[^%]*%0?[0-9]?d[^%]*", pattern) or len(numbers) < 2:
             raise FileError(f"its data file is {seen(entry)}: give NAME%03d.raw 1 20 1")
         first, last, step = (int(number) for number in (*numbers, "1")[:3])
         names = [pattern % number for number in range(first, last + 1, step)]
-    return before + (rest if is_nrrd else b""), names, found.end()
+    return text[: found.start()], names, found.end()
 
 
 def is_store(path: str | Path) -> bool:
