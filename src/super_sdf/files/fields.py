@@ -173,7 +173,7 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     Raises
     ------
     OptionError
-        If the suffix is unknown, or voxels are too small or too large for OpenVDB.
+        If the suffix is unknown.
     FileError
         If the file exists and ``force`` is not set, or cannot be written; if the field is one from
         a file and the format is not .npz: others take the coarse samples; if VTK is missing for a
