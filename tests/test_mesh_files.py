@@ -112,8 +112,8 @@ def test_a_format_holds_the_mesh_or_refuses_it(name, suffix):
     else:
         done, back = convert(*run), read(target)
         assert np.isfinite(back.vertices).all() and back.is_closed() and back.volume() > 0
-        assert len(back.vertices) == done.counts["vertices"]
-        assert len(back.faces) == done.counts["triangles"]
+        assert len(back.vertices) == done.facts["vertices"]
+        assert len(back.faces) == done.facts["triangles"]
 
 
 def test_a_mesh_that_its_format_would_flatten_is_refused(mesh):

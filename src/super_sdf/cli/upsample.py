@@ -98,7 +98,7 @@ def command(source: str, target: str, **given: Any) -> None:
     if given["as_json"]:
         main.print_stdout(report, f"{target} is written")
     if not given["quiet"]:
-        lines = lines_of(report, [*done.notes, *network.notes], given["verbose"])
+        lines = lines_of(report, [*report["inferred"], *network.notes], given["verbose"])
         lines += [f"Check: {certificate.summary()}"] if certificate else []
         main.print_stderr(*lines, *[f"Report: {page}"] * bool(page))
 
