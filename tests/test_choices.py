@@ -227,15 +227,6 @@ def test_depth_is_turned():
         assert np.array_equal(volume.direction[:, 0], [0, 0, -1])
 
 
-WAYS_OUT = ("a.vtr", "pyvista"), ("a.vtu", "pyvista"), ("a.mnc", "nibabel"), ("a.HEAD", "nibabel")
-
-
-@pytest.mark.parametrize("name, library", [*WAYS_OUT, ("a.cube", "vtk")])
-def test_what_is_no_grid_file_has_a_recipe(name, library):
-    said = refusal(SuperSdfError, read_grid, name)
-    assert f'{name} is not read: convert it by python -c "import {library} as p; ' in said
-
-
 def test_a_number_of_several_at_each_point_of_vtk():
     image = pyvista.ImageData(dimensions=ONE.shape[::-1])
     image["v"] = TWO.reshape(2, -1).T

@@ -140,7 +140,7 @@ def test_links_and_pipes_in_a_store():
     )
     chunk.unlink()
     os.mkfifo(chunk)
-    assert said_of("a.zarr") == "a.zarr/c/0/0/0 is a named pipe: give a file"
+    assert said_of("a.zarr") == "a.zarr/c/0/0/0 is no regular file: give a file"
 
 
 PICKLE = {"name": "pickle"}

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from .arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from .errors import OptionError
 from .files.grids import read_grid
-from .files.meshes import write_coloured_ply
+from .files.meshes import World, write_meshes
 from .files.output import check_free
 from .grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from .options import LENGTHS, Options
@@ -385,7 +385,8 @@ def check_coloured(path: Path, *, force: bool = False) -> None:
 def write_coloured(certificate: Certificate, path: Path, *, force: bool = False) -> None:
     """Write the mesh of a certificate as PLY, with a colour and ``residual`` for each vertex."""
     residuals = certificate.residuals_at(certificate.mesh.vertices)
-    write_coloured_ply(certificate.mesh, residuals, colours(residuals), path, force=force)
+    more = {"residual": residuals, **dict(zip(("red", "green", "blue"), colours(residuals).T))}
+    write_meshes({path: {"": certificate.mesh}}, force=force, world=World(columns=more))
 
 
 def colours(residuals: FloatArray) -> NDArray[np.uint8]:

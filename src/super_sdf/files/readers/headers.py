@@ -112,11 +112,11 @@ def read_metaimage(request: Request) -> Volume:
     """Read a ``.mha`` file, or a ``.mhd`` file and the data files that it names."""
     import SimpleITK
 
-    path, stated = request.path, split_header(request.path)
-    if not stated.start:  # ITK might find another one
+    path, (text, named, start) = request.path, split_header(request.path)
+    if not start:  # ITK might find another one
         raise FileError("its header is damaged: it has no ElementDataFile")
-    is_local = stated.entry.lower() == "local"
-    files = [check_beside(path, name) for name in stated.names() if not is_local]
+    is_local = [name.lower() for name in named] == ["local"]
+    files = [check_beside(path, name) for name in named if not is_local]
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
@@ -131,8 +131,8 @@ def read_metaimage(request: Request) -> Volume:
     one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
     promised = prod(size) * dtype.itemsize
-    true = set(TRUE.findall(stated.before))
-    data, start = (files[0], 0) if files else (path, stated.start)
+    true = set(TRUE.findall(text))
+    data, start = (files[0], 0) if files else (path, start)
 
     def load(index: Index) -> Any:
         if len(files) > 1:

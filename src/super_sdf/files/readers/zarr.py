@@ -8,6 +8,7 @@ metadata names when it opens an array: they are checked before.
 
 from __future__ import annotations
 
+import json
 import os
 import zipfile
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError, GridError, seen
-from ..formats import check_beside, parse_json
+from ..formats import check_beside
 from . import Request, Volume
 from .axes import Axis, measured, placed, stored
 
@@ -41,8 +42,8 @@ def read_zarr(request: Request) -> Volume:
 
     path = request.path
     store: Any = str(path)
-    for name, metadata in _metadata_of(request):
-        for codec in _codecs_in(parse_json(metadata, f"{path}/{name}")):
+    for _, metadata in _metadata_of(request):
+        for codec in _codecs_in(json.loads(metadata)):
             if codec not in CODECS:
                 raise FileError(
                     f"{path} names the codec {seen(codec)}, which is not among those that are "
