@@ -150,9 +150,8 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
     Raises
     ------
     OptionError, FileError, OutOfMemoryError
-        If the suffix is unknown, or OpenVDB takes no voxels of this size; if the file cannot be
-        written, VTK is missing for a .vti, or the field is from a file and the format is not .npz;
-        if a .vti would not fit in memory.
+        If the suffix is unknown; if the file cannot be written, VTK is missing for a .vti, or the
+        field is from a file and the format is not .npz; if a .vti would not fit in memory.
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")

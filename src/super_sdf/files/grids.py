@@ -191,14 +191,14 @@ def grid_from_image(
 
     Raises
     ------
-    GridError, OptionError
+    FileError, GridError, OptionError
         If there is no such array, or no usable grid; if ``image`` is no image data.
     """
     Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image
 
-    volume = volume_of_image(image, scalars)
-    request = Request(Path(NAME), None, (), "zyx", ExitStack(), memory_left(max_memory))
+    request = Request(Path(NAME), scalars, (), "zyx", ExitStack(), memory_left(max_memory))
+    volume = volume_of_image(image, request)
     return make_grid(**_taken(volume, request, {}), **values)
 
 

@@ -63,27 +63,19 @@ class Request:
         if not names:
             raise FileError(f"{self.path} holds no {what}")
         listed = ", ".join(names[:MOST_NAMED]) + ", ..." * (len(names) > MOST_NAMED)
-        if self.member is not None:
-            same = [name for name in names if name.strip("/") == self.member.strip("/")]
-            if not same:
-                raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
-            return same[0]
-        if len(names) > 1:
+        if self.member is None and len(names) > 1:
             example = f"{self.path}:{names[0]}"
             raise FileError(f"{self.path} holds several arrays, {listed}: give {example}, say")
-        return names[0]
+        wanted = (self.member or names[0]).strip("/")
+        if same := [name for name in names if name.strip("/") == wanted]:
+            return same[0]
+        raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
 
     def choose_array(
         self, shapes: Mapping[str, Sequence[int]], what: str = "array of three axes"
     ) -> str:
-        """Return the name of the array to read, of three axes or more, by the shapes of all.
-
-        Without a name, those with more than three axes longer than 1 count only beside a number,
-        or if there are no others.
-        """
-        arrays = {name: sum(n > 1 for n in s) > 3 for name, s in shapes.items() if len(s) >= 3}
-        wanted = [name for name, is_more in arrays.items() if is_more == bool(self.numbers)]
-        return self.choose(list(arrays) if self.member or not wanted else wanted, what)
+        """Return the name of the array to read, of three axes or more, by the shapes of all."""
+        return self.choose([name for name, shape in shapes.items() if len(shape) >= 3], what)
 
     def pick(
         self, shape: Sequence[int], kept: Sequence[int] | None = None, names: Sequence[str] = ()
