@@ -33,7 +33,7 @@ MESH_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
 SCENES = (".glb", ".3mf")  # have parts with names and colours, and a unit
 STL_CHUNK = 1 << 18  # triangles at a time
 STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-PLY_TYPES = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
+PLY_TYPES = {"<f4": "float", "<f8": "double"}
 PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 TEXT_CHUNK = 1 << 14  # rows of text at a time: Python numbers take ten times the memory
 GLB_MOST_BYTES = 2**32 - 2**22  # the length in the header has 32 bits; there are headers, too
@@ -51,7 +51,6 @@ class World:
     unit: str | None = None
     space: str | None = None  # anatomical: RAS or LPS
     colours: Mapping[str, Colour] = field(default_factory=dict)  # of some parts, by name
-    columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # of vertices, in a .ply
 
     @property
     def note(self) -> str:
@@ -165,16 +164,13 @@ def _as_single(mesh: Mesh, origin: Any = 0.0) -> FloatArray:
 def write_ply(file: IO[bytes], parts: Parts, world: World) -> None:
     """Write binary little-endian PLY."""
     (mesh,) = parts.values()
-    columns = {**dict(zip("xyz", mesh.vertices.T)), **world.columns}
-    kinds = {name: column.dtype.newbyteorder("<") for name, column in columns.items()}
-    rows, faces = np.empty(len(mesh.vertices), list(kinds.items())), mesh.faces
-    for name, column in columns.items():
-        rows[name] = column
+    kind, faces = mesh.vertices.dtype.newbyteorder("<"), mesh.faces
+    rows = np.ascontiguousarray(mesh.vertices.astype(kind, copy=False))
     triangles = np.empty(len(faces), PLY_FACE)
     triangles["count"], triangles["corners"] = 3, faces
     header = ["ply", "format binary_little_endian 1.0", "comment made by super-sdf"]
     header += [f"comment {world.note}"] * bool(world.note) + [f"element vertex {len(rows)}"]
-    header += [f"property {PLY_TYPES[kind.str]} {name}" for name, kind in kinds.items()]
+    header += [f"property {PLY_TYPES[kind.str]} {axis}" for axis in "xyz"]
     header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
     file.write("\n".join([*header, ""]).encode("ascii"))
     file.write(rows.data)
