@@ -337,7 +337,7 @@ def touch(mesh: Mesh, band: Band, grid: SdfGrid, surface: Surface) -> Certificat
     rows = np.flatnonzero(trusted & band.sampled)  # what is interpolated promises nothing
     sampled = int(np.count_nonzero(band.sampled))
     # if none is exact, too many are no distances for any to be taken for one
-    noisy = band.count_noisy() if len(rows) else sampled
+    noisy = int(np.count_nonzero(band.sampled & ~band.lipschitz)) if len(rows) else sampled
     ijk, values = band.voxel_ijk[rows], values[rows] * np.float32(0.5)
     points, solid = grid.to_world(ijk), Solid(mesh)
     found, faces, feet = solid.nearest(points)

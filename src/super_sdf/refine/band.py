@@ -86,10 +86,6 @@ class Band:
     trusted: SampleSpheres  # of the samples that are exact, and of some beyond the band
     leaves: bool  # see ``BandSummary``
 
-    def count_noisy(self) -> int:
-        """Count the voxels whose own samples differ from others by more than distances can."""
-        return int(np.count_nonzero(~self.lipschitz & self.sampled))
-
 
 class _Found(NamedTuple):
     """What is found in some planes of a grid."""
