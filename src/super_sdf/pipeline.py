@@ -154,7 +154,7 @@ def upsample(
         raise no_surface(grid, offset)
     steps.finish("band")
     field = refine_band(band, chosen, factor, threads, steps)
-    if not field.has_surface:
+    if not field.blocks.min(initial=1) <= 0 < field.blocks.max(initial=0):
         raise no_surface(grid, offset)
     return field
 

@@ -64,7 +64,7 @@ def write_sparse(field: FineField, path: Path) -> None:
         "direction": grid.direction,
         "offset": field.offset,
         "leaves": field.leaves,
-        "values": field.block_distances().astype(exact).reshape(-1, side, side, side),
+        "values": field.in_world_units(field.blocks.T).astype(exact).reshape(-1, side, side, side),
         "voxels": field.voxel_ijk,
         "sample_voxels": np.stack(np.unravel_index(samples.number, field.shape), 1).astype("i4"),
         "sample_distances": field.in_world_units(samples.distance).astype(exact),

@@ -35,8 +35,8 @@ COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes")
 class FineField:
     """Values at the nodes of the decoded voxels' blocks.
 
-    ``positions`` and ``distances`` are the nodes in world units, each once; ``block_distances`` are
-    block by block. The arrays below are in index space.
+    ``positions`` and ``distances`` are the nodes in world units, each once. The arrays below are in
+    index space.
 
     Attributes
     ----------
@@ -122,10 +122,6 @@ class FineField:
         """Return the signed distances at ``positions``, (n,), in world units, negative inside."""
         return self.in_world_units(self.values)
 
-    def block_distances(self) -> NDArray[np.float64]:
-        """Return the distances at the nodes of each voxel's block, (D, Q), in world units."""
-        return self.in_world_units(self.blocks.T)
-
     def in_world_units(self, values: FloatArray) -> NDArray[np.float64]:
         """Return values in half voxels as distances in world units, float64: without rounding."""
         return np.multiply(values, self.placed.voxel_size / 2, dtype=np.float64)
@@ -136,11 +132,6 @@ class FineField:
         if self.grid is None:
             raise OptionError("the field has no grid: make it with upsample(grid, network)")
         return self.grid
-
-    @property
-    def has_surface(self) -> bool:
-        """Whether nodes have both signs; 0 counts as inside."""
-        return bool(self.blocks.size and self.blocks.min() <= 0 < self.blocks.max())
 
 
 class FineLattice(SamplePlanes):

@@ -19,7 +19,7 @@ not depend on how many are worked on together.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +55,10 @@ SAMPLE_TO_FOOT = 2  # (MAX_DISTANCE + BEYOND) / 2, rounded
 REACH_IN_VOXELS = len(CELLS) + 2 * SAMPLE_TO_FOOT + 1
 
 
+Spheres: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
+"""Samples (3, n), their signed distances (n,), and directions, about the gradients there (3, n)."""
+
+
 class Look(NamedTuple):
     """The field at a place on each of n spheres."""
 
@@ -85,7 +89,7 @@ def fit_to_spheres(
 
     def touch(some: slice) -> tuple[NDArray[Any], ...]:
         spheres = centre[:, some], distance[some], direction[:, some]
-        return find_foot_points(blocks, factor, *spheres, index)
+        return find_foot_points(blocks, factor, spheres, index)
 
     feet = map_chunks(touch, len(distance), TEMPORARIES, threads)
     correction = find_correction(parts, *(np.concatenate(each, -1) for each in zip(*feet)))
@@ -99,13 +103,12 @@ def fit_to_spheres(
     blocks[len(blocks) // 2, rows[rows >= 0]] = sample[rows >= 0]
 
 
-def spheres_of_band(band: Band, threads: int = 1) -> tuple[IntArray, FloatArray, FloatArray]:
+def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
     """Return the spheres of the exact samples of a band, then of those a voxel beyond.
 
-    They are n samples (3, n), their signed distances, and directions of length 1 (3, n): about the
-    gradient. Samples beyond have no sphere unless they lie between the band's limits. Of each, the
-    direction is that of the exact sample beside it from which it rises most steeply, about by 1
-    along the gradient; one that was cut off does not rise as distances do.
+    Samples beyond have no sphere unless they lie between the band's limits. Of each, the direction
+    is that of the exact sample beside it from which it rises most steeply, about by 1 along the
+    gradient; one that was cut off does not rise as distances do.
     """
     exact, (low, high) = np.flatnonzero(band.exact), band.limits
     centre, own = band.voxel_ijk[exact], band.patches[exact, CENTRE]
@@ -136,12 +139,7 @@ def spheres_of_band(band: Band, threads: int = 1) -> tuple[IntArray, FloatArray,
 
 
 def find_foot_points(
-    blocks: FloatArray,
-    factor: int,
-    centre: IntArray,
-    distance: FloatArray,
-    direction: FloatArray,
-    index: VoxelIndex,
+    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     """Return foot points of samples: their blocks, places in these, errors and weights.
 
@@ -151,6 +149,7 @@ def find_foot_points(
     direction matters more. Spheres from beyond the band mostly touch edges, which linear cells cut
     off: that they are clear of them is no error.
     """
+    centre, distance, direction = spheres
 
     def look(which: NDArray[Any] | slice, direction: FloatArray) -> Look:
         """Return what the field is where directions (3, n) meet some spheres."""
@@ -162,8 +161,8 @@ def find_foot_points(
         return Look(direction, rows, place, value, _unit(gradient))
 
     found = _turned(look, distance, direction)
-    size, is_clear = np.abs(distance), distance * found.value > 0
-    is_clear &= size >= MAX_DISTANCE
+    size = np.abs(distance)
+    is_clear = (size >= MAX_DISTANCE) & (distance * found.value > 0)
     unusual = found.value / np.where(is_clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
     aligned = np.clip(inner(found.direction, found.normal), 0, 1)
     for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
@@ -176,11 +175,7 @@ def find_foot_points(
     return found.rows[kept], found.place[:, kept], values[kept], weights[kept]
 
 
-def _turned(
-    look: Callable[[NDArray[Any] | slice, FloatArray], Look],
-    distance: FloatArray,
-    direction: FloatArray,
-) -> Look:
+def _turned(look: Callable[..., Look], distance: FloatArray, direction: FloatArray) -> Look:
     """Return the places where spheres touch the surface.
 
     A sphere that touches the surface lies on the sample's side of it everywhere else. So the place
