@@ -66,7 +66,7 @@ MAKE_ONE = "make one with make_grid(values, spacing=...) or read_grid(path)"
 OF_OTHER_TYPES = {
     f"grid is an array of shape (20, 20, 20): {MAKE_ONE}": {"grid": VALUES},
     f"grid is 'part.npz': {MAKE_ONE}": {"grid": "part.npz"},
-    "network is 'fast': give one from load_network()": {"network": "fast"},
+    "network is 3: give one from load_network()": {"network": 3},
     f"factor is [4]: {EVEN}": {"factor": [4]},
     f"factor is True: {EVEN}": {"factor": True},
     "offset is [1]: give a finite number, in world units": {"offset": [1]},

@@ -36,16 +36,16 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together: they may shrink only; the design's figure beside
-    TOP: 1515,  # 1,250
+    TOP: 1460,  # 1,250
     "grid": 2994,  # 1,800
     "network": 500,
     "refine": 1363,  # 1,300
     "surface": 2187,
     "tiles": 300,
-    "files": 3521,  # 2,700: readers of twelve libraries have 2,150
+    "files": 2919,  # 2,700: readers of twelve libraries
     "functions": 600,
     "labels": 1126,  # 900
-    "simplify check truth": 1517,  # 1,100: with the walls between labels
+    "simplify check truth": 1323,  # 1,100: with the walls between labels
     "batch": 938,  # 900
     "pages": 414,  # 400
     "cli": 1055,  # 800

@@ -65,7 +65,7 @@ def test_compressed_metaimage_is_whole_and_has_the_promised_size():
     for line in (f"CompressedDataSize = {len(packed)}", "Comment = no size"):
         grid = read_grid(mha("CompressedData = True", line, data=packed))
         assert np.array_equal(grid.values, VALUES)
-    said = "a.mha is damaged: 32,640 bytes are promised, and its compressed data is torn"
+    said = "a.mha is truncated or damaged: 32,640 bytes are promised"
     longer, shorter = zlib.compress(RAW + bytes(10)), zlib.compress(RAW[:-4])
     for data in (packed[:-2], packed[: len(packed) // 2], shorter, longer):
         assert said_of(mha("CompressedData = True", data=data)).startswith(said)
@@ -98,7 +98,7 @@ def test_sizes_that_no_file_has_are_refused_at_once(size, first):
 
 def test_what_is_loaded_whole_is_refused_if_it_would_not_fit():
     save("a.tif")
-    said = "a.tif, 17 x 20 x 24 float32, 32,640 bytes, is loaded whole, which takes 0 MB of memory"
+    said = "a.tif, 17 x 20 x 24 float32, is loaded whole, which takes 0 MB of memory"
     assert said_of("a.tif", max_memory=1000).startswith(said)
     np.savez_compressed("bomb.npz", values=np.zeros((200, 200, 200), np.float32))
     assert "is loaded whole, which takes 64 MB of memory" in said_of("bomb.npz", max_memory=1000)
@@ -136,8 +136,8 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
     above = ("../out.raw", "below/../../out.raw", "link.raw", "up/out.raw")
     for data, said in {
         **dict.fromkeys((str(tmp_path / "out.raw"), *above), APART),
-        "pipe.raw": "pipe.raw is a named pipe: give a file",
-        "zero.raw": "zero.raw is a device: give a file",
+        "pipe.raw": "pipe.raw is no regular file: give a file",
+        "zero.raw": APART,
         "none.raw": "none.raw does not exist",
         "below": "below is a folder: give a file",
     }.items():
@@ -214,7 +214,7 @@ def test_files_of_an_ome_set_are_read_beside_the_file(tmp_path):
         assert said_of("a.ome.tif").endswith(f"names the file {name!r}, {APART}")
     os.mkfifo("pipe.tif")
     ome_set("pipe.tif")
-    assert said_of("a.ome.tif").endswith("pipe.tif is a named pipe: give a file")
+    assert said_of("a.ome.tif").endswith("pipe.tif is no regular file: give a file")
 
 
 # What is no regular file
@@ -222,16 +222,13 @@ def test_files_of_an_ome_set_are_read_beside_the_file(tmp_path):
 
 WHAT_IS_WRONG = {
     "folder.npy": "is a folder: give a file",
-    "pipe.npy": "is a named pipe: give a file",
-    "socket.npy": "is a socket: give a file",
-    "zero.npy": "is a device: give a file",
+    **dict.fromkeys(("pipe.npy", "socket.npy", "zero.npy"), "is no regular file: give a file"),
     "loop.npy": "cannot be read: Too many levels of symbolic links",
     "dangling.npy": "does not exist",
     "missing.npy": "does not exist",
-    "file/in.npy": "does not exist: the path before its last / is not a folder",
+    "file/in.npy": "does not exist",
     "n" * 300 + ".npy": "cannot be read: File name too long",
-    "a\0.npy": "is not a valid file name",
-    "a\ud800.npy": "is not a valid file name",
+    "a\0.npy": "cannot be read: embedded null byte",
 }
 
 
@@ -244,19 +241,16 @@ def test_what_is_no_regular_file_is_named_as_grid_and_as_mesh(name):
     for link, end in {"zero": "/dev/zero", "loop": "loop.npy", "dangling": "nothing.npy"}.items():
         Path(f"{link}.npy").symlink_to(end)
     write("file")
-    shown = name if name.isprintable() else repr(name)
-    assert refusal(FileError, read_grid, name) == f"{shown} {WHAT_IS_WRONG[name]}"
+    assert refusal(FileError, read_grid, name) == f"{name} {WHAT_IS_WRONG[name]}"
     if name in ("folder.npy", "pipe.npy", "zero.npy", "loop.npy", "dangling.npy"):
         Path("a.ply").symlink_to(name)
         assert refusal(FileError, read_mesh, "a.ply") == f"a.ply {WHAT_IS_WRONG[name]}"
 
 
-def test_links_to_files_are_read_unless_they_may_not_be(monkeypatch):
+def test_links_to_files_are_read():
     np.save("file", VALUES)
     Path("link.npy").symlink_to("file.npy")
     assert np.array_equal(read_grid("link.npy", spacing=0.5).values, VALUES)
-    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may read everything
-    assert said_of("link.npy") == "link.npy cannot be read: permission denied"
 
 
 def test_a_mesh_that_names_a_pipe_is_read_without_it():

@@ -7,16 +7,16 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .files.formats import files_of
 from .files.grids import read_grid
-from .files.meshes import check_target, write_mesh
-from .files.output import check_apart, check_free
-from .grid.sdf_grid import SdfGrid, cubic_grid, describe_place, mean_spacing, volume_of_samples
-from .pipeline import mesh_grid
+from .files.meshes import World, check_target, write_meshes
+from .files.output import check_apart
+from .grid.sdf_grid import SdfGrid, describe_place, mean_spacing, volume_of_samples
+from .pipeline import Result, mesh_grid
 from .threads import TOTAL, Progress, Stopwatch, part_of
 
 if TYPE_CHECKING:
@@ -25,10 +25,6 @@ if TYPE_CHECKING:
     from .simplify.simplify import Simplified
     from .surface.mesh import Mesh
 
-CAPPED = (
-    "the solid runs out of the grid: its surface is closed along the border (leave it open with "
-    "--open)"
-)
 READ, MESHED = 0.1, 0.3  # of the time, when the grid is read, and before a mesh is simplified
 
 
@@ -38,30 +34,12 @@ class Conversion:
 
     grid: SdfGrid  # as it was read
     mesh: Mesh  # as it was written
-    counts: dict[str, int]
-    closed: bool  # no edge is open; else the surface leaves the grid and is not capped
-    capped: bool  # the solid runs out of the grid, and was closed along the border
-    warnings: tuple[str, ...]  # on what may be wrong with the result
-    simplified: dict[str, Any] | None  # ``Simplified.report``; distances in voxels
-    notes: tuple[str, ...] = ()  # on what was inferred, and what the samples do not show
-    seconds: dict[str, float] = field(default_factory=dict)  # per stage
-    saved_field: dict[str, Any] | None = None  # its path; shape, spacing, origin of the lattice
+    facts: dict[str, Any]  # as ``--json`` has them: docs/reference/json.md
+    seconds: dict[str, float]  # per stage
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
-        points = self.mesh.vertices
-        some = {"saved_field": self.saved_field, "simplified": self.simplified}
-        return {
-            **describe_place(self.grid),
-            **self.counts,
-            "bounds": [points.min(0).tolist(), points.max(0).tolist()],  # in world units
-            "closed": self.closed,
-            "capped": self.capped,
-            "field": self.grid.field.report(),
-            **{key: value for key, value in some.items() if value},
-            "inferred": list(self.notes),
-            "warnings": list(self.warnings),
-        }
+        return self.facts
 
 
 def convert(
@@ -83,59 +61,34 @@ def convert(
     complete at the end, or neither is written. ``how`` is passed to ``mesh_grid``.
 
     SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
-    Nothing is written then.
     """
-    watch, files = Stopwatch(), files_of(source)
+    watch, files, saved = Stopwatch(), files_of(source), dict[str, Any]()
     check_target(target, force=force, unit=options.unit)
     check_apart(target, files)
-    with _saving(save_field, files, force=force) as file:
+    with _saving(save_field, files, force=force) as write:
         grid = read_grid(source, **options.reading())
         if options.keep_volume:
             from .labels.volumes import check_has_volume  # imported here, as few need it
 
             check_has_volume(grid, options.offset, cap=options.cap)
-        lattice = cubic_grid(grid, options.offset)
-        factor = options.factor_for(mask=grid.field.sides_only)
-        if file:
-            file.check_fits(grid.shape, factor)
-            how["save_field"] = file.write
+        if write:
+            how["save_field"] = lambda field: saved.update(write(field))
         watch.lap("read")
         if progress:
             progress(round(READ * TOTAL), TOTAL)
         shown = part_of(progress, READ, MESHED if options.goals() else 1)
         made = mesh_grid(grid, network, options, progress=shown, **how)
         watch.take(made.seconds)
-        mesh, simplified, off = reworked(made.mesh, grid, options, part_of(progress, MESHED, 1))
+        mesh, simplified, off = _reworked(made.mesh, grid, options, part_of(progress, MESHED, 1))
         watch.lap("simplify" if simplified else "isosurface")
-
-        def both_appear(part: Path) -> None:
-            if file:
-                check_free(file.path, force=force)
-
-        stated: Any = {"unit": options.unit, "space": grid.space}
-        write_mesh(mesh, target, force=force, before_rename=both_appear, **stated)
+        world, beside = World(options.unit, grid.space), [Path(save_field)] if save_field else []
+        write_meshes({Path(target): {"": mesh}}, force=force, world=world, beside=beside)
         watch.lap("write")
-    is_open = made.open_edges > 0
-    warnings = find_warnings(grid, options.offset, made.counts, is_open=is_open)
-    capped = options.cap and made.leaves
-    notes = [*lattice.notes, *off, *[CAPPED] * capped]
-    if options.mesher == "sharp" and not lattice.field.has_exact:
-        why = f"{lattice.field.kind} values show no edges"
-        notes.append(f"{why}: the mesh is that of marching cubes")
-    sizes = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-    sizes |= {"tiles": made.tiles, "factor": factor}
-    return Conversion(
-        grid,
-        mesh,
-        {**made.counts, **sizes},
-        closed=simplified.mesh.is_closed() if simplified else not is_open,
-        capped=capped,
-        warnings=(*warnings, *(simplified.warnings if simplified else ())),
-        simplified=simplified.report(grid.voxel_size) if simplified else None,
-        notes=tuple(notes),
-        seconds=watch.seconds,
-        saved_field=file.report if file else None,
-    )
+    facts = _facts(grid, mesh, made, options, simplified)
+    facts["inferred"] += off
+    if saved:
+        facts["saved_field"] = saved
+    return Conversion(grid, mesh, facts, watch.seconds)
 
 
 def _saving(path: str | Path | None, others: list[Path], *, force: bool) -> Any:
@@ -148,7 +101,7 @@ def _saving(path: str | Path | None, others: list[Path], *, force: bool) -> Any:
     return saving_field(path, force=force)
 
 
-def reworked(
+def _reworked(
     mesh: Mesh, grid: SdfGrid, options: Options, progress: Progress | None
 ) -> tuple[Mesh, Simplified | None, list[str]]:
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
@@ -173,23 +126,49 @@ def reworked(
     return mesh, simplified, volume_notes({"the mesh": (mesh.volume(), volume)})  # may be off now
 
 
-def find_warnings(
-    grid: SdfGrid, offset: float, counts: dict[str, int], *, is_open: bool
-) -> list[str]:
+def _facts(
+    grid: SdfGrid, mesh: Mesh, made: Result, options: Options, simplified: Simplified | None
+) -> dict[str, Any]:
+    """Return what is known of a mesh, for JSON."""
+    notes, warnings = list(made.lattice.notes), _warnings(grid, made, options.offset)
+    capped = options.cap and made.leaves
+    if capped:
+        closed = "its surface is closed along the border (leave it open with --open)"
+        notes.append(f"the solid runs out of the grid: {closed}")
+    if options.mesher == "sharp" and not made.lattice.field.has_exact:
+        notes.append(f"{grid.field.kind} values show no edges: the mesh is that of marching cubes")
+    facts = {
+        **describe_place(grid),
+        **made.counts,
+        "vertices": len(mesh.vertices),
+        "triangles": len(mesh.faces),
+        "tiles": made.tiles,
+        "factor": options.factor_for(mask=grid.field.sides_only),
+        "bounds": [mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()],  # in world units
+        "closed": mesh.is_closed() if simplified else not made.open_edges,
+        "capped": capped,
+        "field": grid.field.report(),
+        "inferred": notes,
+        "warnings": warnings,
+    }
+    if simplified:
+        facts["simplified"] = simplified.report(grid.voxel_size)
+        warnings += simplified.warnings
+    return facts
+
+
+def _warnings(grid: SdfGrid, made: Result, offset: float) -> list[str]:
     """Return a sentence on each thing that may be wrong with the mesh of a grid."""
-    warnings = []
-    if is_open and grid.field.unseen is not None:
+    counts, warnings = made.counts, list[str]()
+    if made.open_edges and grid.field.unseen is not None:
         warnings.append("the surface ends where samples are unknown, and is open there")
-    elif is_open:
+    elif made.open_edges:
         warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if grid.field.sides_only or grid.field.network is None:
-        return warnings  # only distances can be noisy, or contradict each other
-    if counts["noisy_voxels"]:
+    if counts["noisy_voxels"] and grid.field.network and not grid.field.sides_only:
         share = 100 * counts["noisy_voxels"] / counts["band_voxels"]
-        percent = f"{share:.2g}" if share < 9.95 else f"{share:.0f}"
-        differ = f"in {percent} % of the band the values differ by more than distances can"
+        differ = f"in {share:.3g} % of the band the values differ by more than distances can"
         warnings.append(f"{differ}: they are taken as noisy there, and corrected")
     return warnings

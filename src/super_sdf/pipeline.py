@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
+from .errors import OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
@@ -115,15 +115,8 @@ def upsample(
         axes, they are resampled to the finest first; the field has that spacing.
     network : Network
         From ``load_network``.
-    factor : int, optional
-        How many times finer per axis, K: an even number from 2 to 16; by default 2 for masks,
-        else 4.
-    offset : float
-        Refine the surface at this distance from the solid (world units) instead of the solid's own
-        (Sec. 5.3). Positive is outwards, whichever sign the input had inside, since ``grid.values``
-        are always negative inside. The distances must reach 1.5 spacings beyond the offset.
-    progress : callable, optional
-        Called with (done, total), see ``threads.Progress``; an exception in it ends the work.
+    factor, offset, progress
+        As in ``reconstruct``.
 
     Returns
     -------
@@ -132,30 +125,20 @@ def upsample(
 
     Raises
     ------
-    OptionError
-        If the factor is odd or out of range, or another argument is invalid.
-    ModelError
-        If the network returns values that are not finite.
-    GridError
-        If the distances end within 1.5 spacings of the offset; if the grid is so far from the
-        origin that floating-point numbers cannot resolve its vertices; if there is no surface,
-        which shows only at the end: a thin part may lie between samples that are all outside.
+    SuperSdfError
+        As ``reconstruct``.
     """
-    check_grid(grid)
-    options.check_called(network, progress)
     asked = Options(factor, offset=offset)  # checks them
-    factor, offset = asked.factor_for(mask=grid.field.sides_only), asked.offset
+    lattice, decoder = _prepared(grid, network, asked, progress)
     steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
-    lattice, chosen = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
-    vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
-    threads = useful_threads(chosen.threads)
-    band = survey(lattice, offset, threads=threads)  # Eqs. 2 and 4
+    threads = useful_threads(decoder.threads)
+    band = survey(lattice, asked.offset, threads=threads)  # Eqs. 2 and 4
     if not band.decoded.any():
-        raise no_surface(grid, offset)
+        raise no_surface(grid, asked.offset)
     steps.finish("band")
-    field = refine_band(band, chosen, factor, threads, steps)
+    field = refine_band(band, decoder, asked.factor_for(mask=grid.field.sides_only), threads, steps)
     if not field.blocks.min(initial=1) <= 0 < field.blocks.max(initial=0):
-        raise no_surface(grid, offset)
+        raise no_surface(grid, asked.offset)
     return field
 
 
@@ -165,7 +148,6 @@ def extract_mesh(
     *,
     mesher: options.MesherName = options.AUTO,
     cap: bool = True,
-    function: Function | None = None,
 ) -> Mesh:
     """Return the zero level of a field as triangles in world coordinates; a node of 0 is inside.
 
@@ -176,81 +158,65 @@ def extract_mesh(
     grid : SdfGrid, optional
         A coarse grid for spacing, origin and direction. Default: the one that the field was made
         from. A field that was made without its grid stays open.
-    mesher, cap, function
+    mesher, cap
         As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
 
     Raises
     ------
     OptionError
-        If there is no such mesher; if there are more vertices than 32-bit numbers.
-    OptionTypeError
-        If an argument is something else.
+        If an argument is invalid; if there are more vertices than 32-bit numbers.
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
-    grid = field.placed if grid is None else grid
+    grid, samples, asked = (
+        field.placed if grid is None else grid,
+        field.spheres,
+        Options(mesher=mesher),
+    )
     check_grid(grid)
-    samples = field.spheres
-    asked = Options(mesher=mesher, cap=cap)  # checks them
     chosen = asked.mesher_for(exact=samples is not None and len(samples.distance) > 0)
-    cap = asked.cap and field.grid is not None
+    cap = Options(cap=cap).cap and field.grid is not None
     check_can_close(grid, cap=cap)
-    mesh, _ = extract(field, cubic_grid(grid), mesher=chosen, cap=cap)
-    if function is None:
-        return mesh
-    from .functions.function import as_function
-    from .functions.zero import put_on_zero
-
-    return put_on_zero(mesh, as_function(function), grid, field.factor, field.offset)
+    return extract(field, cubic_grid(grid), mesher=chosen, cap=cap)[0]
 
 
 def reconstruct(
     grid: SdfGrid | None = None,
-    network: Decoder | None = None,
+    network: Decoder | str | Path = options.DEFAULT_QUALITY,
     factor: int | None = None,
     *,
     function: Function | None = None,
     bounds: ArrayLike | None = None,
     spacing: ArrayLike | None = None,
-    quality: options.Quality | str | Path | None = None,
     offset: float = 0.0,
     cap: bool = True,
     mesher: options.MesherName = options.AUTO,
     max_memory: int | None = None,
     progress: Progress | None = None,
-    device: options.Device | None = None,
-    precision: options.Precision | None = None,
-    threads: int | None = None,
 ) -> Mesh:
     """Turn a coarse grid, or a function, into a fine mesh.
-
-    Parameters and errors are those of ``upsample``, except for these:
 
     Parameters
     ----------
     grid : SdfGrid, optional
         Coarse signed distances. Without a grid the function is sampled.
-    network : Network, optional
-        From ``load_network``, to load it once for many grids.
+    network : Network, str or path
+        From ``load_network``, to load it once for many grids or on a device; or what it loads.
+    factor : int, optional
+        How many times finer per axis, K: an even number from 2 to 16; by default 2 for masks,
+        else 4.
     function : callable or DistanceFunction, optional
-        What the grid has samples of; vertices are then put where it is 0. See
-        ``DistanceFunction``.
+        What the grid has samples of; vertices are then put where it is 0.
     bounds, spacing : optional
         The box and the distance of the samples, without a grid; see ``DistanceFunction.sample``.
-    quality : str or path, optional
-        Without a network: "fast", "base" (default) or "best", or an ONNX file.
-    device, precision, threads : optional
-        Without a network, where it runs: see ``load_network``.
-    cap : bool
-        Close a surface that leaves the grid along the grid's border. Left open there, meshes of
-        neighbouring grids can be joined. A surface leaves the grid where samples on the border are
-        inside.
-    mesher : str
-        "marching" for marching cubes, which cuts off edges and corners; "sharp" also puts vertices
-        on them; "auto" is "sharp" for distances and "marching" for masks and noise.
-    max_memory : int, optional
-        Bytes that the process may hold in all; by default a share of the free memory. A grid that
-        needs more is cut into tiles.
+    offset : float
+        Mesh the surface at this distance from the solid (world units, Sec. 5.3); positive is
+        outwards. The distances must reach 1.5 spacings beyond the offset.
+    cap, mesher, max_memory
+        As the options of ``super-sdf upsample``. With ``cap=False`` meshes of neighbouring grids
+        can be joined.
+    progress : callable, optional
+        Called with (done, total), see ``threads.Progress``; an exception in it ends the work.
 
     Returns
     -------
@@ -260,7 +226,11 @@ def reconstruct(
     Raises
     ------
     OptionError
-        If there is a network, and besides what would load one.
+        If an argument is invalid, such as an odd factor.
+    GridError
+        If there is no surface, or the distances end within 1.5 spacings of the offset.
+    ModelError
+        If the network returns values that are not finite.
     OutOfMemoryError
         If not even small tiles of the grid fit in the memory.
     """
@@ -272,13 +242,7 @@ def reconstruct(
         exact = None if function is None else as_function(function)
         grid = sampled(grid, exact, bounds, spacing, chosen.offset)
     grid = check_grid(grid)
-    where = {"model": quality, "device": device, "precision": precision, "threads": threads}
-    asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
-    if network is None:
-        network = load_network(**asked)
-    elif asked:
-        name = next(iter(asked)).replace("model", "quality")
-        raise OptionError(f"a network and {name} are given: give only one of them")
+    network = load_network(network) if isinstance(network, (str, Path)) else network
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh
@@ -287,11 +251,22 @@ def reconstruct(
     return put_on_zero(mesh, exact, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
 
 
+def _prepared(
+    grid: SdfGrid, network: Decoder, chosen: Options, progress: Progress | None
+) -> tuple[SdfGrid, Adapter]:
+    """Check what is given; return the cubic lattice of a grid, and the network for its field."""
+    options.check_called(network, progress)
+    lattice = cubic_grid(check_grid(grid), chosen.offset)
+    vertex_type(lattice, chosen.factor_for(mask=grid.field.sides_only))  # raises beyond float64
+    return lattice, adapt(network_for(network, grid.field.network))
+
+
 @dataclass(frozen=True, eq=False)
 class Result:
     """The mesh of a grid, and what is known of how it was made."""
 
     mesh: Mesh
+    lattice: SdfGrid  # the grid, made cubic
     open_edges: int
     counts: dict[str, int]  # see ``FineField``
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
@@ -332,21 +307,17 @@ def mesh_grid(
     ``save_field`` is called with the fine field, which needs one piece. ``map_tiles`` has tiles
     made elsewhere, ``least_tiles`` or more, each within the memory bound.
     """
-    check_grid(grid)
-    options.check_called(network, progress)
+    lattice, decoder = _prepared(grid, network, chosen, progress)
     check_can_close(grid, cap=chosen.cap)
-    factor = chosen.factor_for(mask=grid.field.sides_only)
-    steps, offset = StepCounter(progress), chosen.offset
-    lattice, decoder = cubic_grid(grid, offset), adapt(network_for(network, grid.field.network))
-    vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
+    steps, factor = StepCounter(progress), chosen.factor_for(mask=grid.field.sides_only)
     mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
     most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
-    bands, whole = survey_within(lattice, offset, most, threads=threads)
+    bands, whole = survey_within(lattice, chosen.offset, most, threads=threads)
+    steps.finish("band")
     if bands:
-        steps.finish("band")
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:
         raise OutOfMemoryError(
@@ -355,13 +326,11 @@ def mesh_grid(
         )
     else:
         margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
-        tiles = plan(shape, whole, margin, room, least_tiles)
-        steps.finish("band")
+        tiles, parts = plan(shape, whole, margin, room, least_tiles), list[Part]()
         tasks = (
             replace(task, tile=tile, grid=crop(lattice, tile.low, tile.high), whole=whole)
             for tile in tiles
         )
-        parts = []
         for part in (map_tiles or map)(partial(make_tile, network=decoder), tasks):
             parts.append(part)
             steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
@@ -372,11 +341,11 @@ def mesh_grid(
     counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
     mesh, names = join(parts)
     if not len(mesh.faces):
-        raise no_surface(grid, offset)
+        raise no_surface(grid, chosen.offset)
     ends = lattice.field.unseen is not None
     edges = check_closed(mesh, lattice, names, cap=chosen.cap, ends=ends)
     steps.finish("isosurface")
-    return Result(mesh, edges, counts, leaves, steps.seconds, count)
+    return Result(mesh, lattice, edges, counts, leaves, steps.seconds, count)
 
 
 def make_tile(
@@ -387,15 +356,15 @@ def make_tile(
     save_field: Callable[[FineField], None] | None = None,
 ) -> Part:
     """Return the part of the mesh that belongs to a tile, which may be the whole grid."""
-    tile, chosen, factor = task.tile, task.options, task.factor
-    band = band or survey(task.grid, chosen.offset, threads=task.threads, whole=task.whole)
+    tile, chosen, factor, threads = task.tile, task.options, task.factor, task.threads
+    band = band or survey(task.grid, chosen.offset, threads=threads, whole=task.whole)
     if not band.decoded.any():
         return Part.without_surface(tile)
-    field = refine_band(band, network, factor, task.threads, steps)
+    field = refine_band(band, network, factor, threads, steps)
     del band
     if save_field:
         save_field(field)
-    how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": task.threads}
+    how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
     counts = field.count(tile.owns(field.voxel_ijk + np.array(tile.low)))
     leaves = field.leaves

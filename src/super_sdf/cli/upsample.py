@@ -9,7 +9,7 @@ import click
 
 from .. import __version__
 from ..errors import SuperSdfError
-from ..files.formats import NAMED, list_formats
+from ..files.formats import LISTED, NAMED
 from ..options import MESH_FORMATS, OPTIONS, Options
 from ..threads import Stopwatch
 from . import main
@@ -17,7 +17,7 @@ from .main import SHARED, option, table_option
 
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
 
-IN is a grid file: {list_formats()}. FILE:NAME names one of several arrays in a {NAMED}
+IN is a grid file: {LISTED}. FILE:NAME names one of several arrays in a {NAMED}
 file. An .npz file has the keys values, spacing, origin and direction.
 
 OUT is a mesh file: {", ".join(f".{name}" for name in MESH_FORMATS[:-1])} or .{MESH_FORMATS[-1]}.
@@ -98,7 +98,7 @@ def command(source: str, target: str, **given: Any) -> None:
     if given["as_json"]:
         main.print_stdout(report, f"{target} is written")
     if not given["quiet"]:
-        lines = lines_of(report, [*done.notes, *network.notes], given["verbose"])
+        lines = lines_of(report, [*report["inferred"], *network.notes], given["verbose"])
         lines += [f"Check: {certificate.summary()}"] if certificate else []
         main.print_stderr(*lines, *[f"Report: {page}"] * bool(page))
 

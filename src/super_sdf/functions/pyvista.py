@@ -17,7 +17,7 @@ import pyvista
 
 from .. import SdfGrid, grid_from_image, reconstruct
 from ..errors import FileError, check_modules, how_to_install
-from ..options import AUTO, MesherName, Options, Quality, Values
+from ..options import AUTO, DEFAULT_QUALITY, MesherName, Options, Values
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -68,8 +68,7 @@ class ImageAccessor:
         factor: int | None = None,
         *,
         scalars: str | None = None,
-        quality: Quality | str | Path | None = None,
-        network: Decoder | None = None,
+        network: Decoder | str | Path = DEFAULT_QUALITY,
         residuals: bool = False,
         offset: float = 0.0,
         cap: bool = True,
@@ -84,7 +83,7 @@ class ImageAccessor:
 
         Parameters
         ----------
-        factor, quality, network, offset, cap, mesher, max_memory, progress
+        factor, network, offset, cap, mesher, max_memory, progress
             See ``reconstruct``.
         scalars, inside, field, label, level, scale
             See ``grid``.
@@ -101,7 +100,7 @@ class ImageAccessor:
         Raises
         ------
         SuperSdfError
-            As ``grid`` and ``reconstruct`` raise it; if ``quality`` and ``network`` are both given.
+            As ``grid`` and ``reconstruct`` raise it.
         """
         if residuals:
             check_modules("residuals=True", "report", ("igl",))
@@ -110,7 +109,6 @@ class ImageAccessor:
             grid,
             network,
             factor,
-            quality=quality,
             offset=offset,
             cap=cap,
             mesher=mesher,

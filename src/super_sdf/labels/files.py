@@ -11,6 +11,7 @@ CSV, TSV                1,liver
 from __future__ import annotations
 
 import csv
+import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import FileError, MeshError, OptionError, flag, seen
-from ..files.formats import check_regular_file, files_of, parse_json
+from ..files.formats import check_regular_file, files_of
 from ..files.grids import names_in
 from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, write_meshes
 from ..files.output import check_apart
@@ -194,7 +195,7 @@ def read_names(path: str | Path) -> Names:
             colour = rgb if len(rgb) == 3 and max(rgb) <= 255 else None
             if plain := plain[:LONGEST].strip():
                 names[int(label)] = LabelName(plain, colour)
-    except (OSError, ValueError, csv.Error) as error:
+    except (OSError, ValueError, RecursionError, csv.Error) as error:
         raise FileError(f"{path} cannot be read as a table of labels: {error}") from error
     if not names:
         raise FileError(f"{path} names no label: give lines such as '1 liver'")
@@ -203,7 +204,7 @@ def read_names(path: str | Path) -> Names:
 
 def _of_json(text: str) -> Iterator[tuple[Any, str, list[str]]]:
     """Yield the labels and names of an object that maps numbers to names, or names to numbers."""
-    found = parse_json(text, "it")
+    found = json.loads(text)
     found = found.get("labels", found) if isinstance(found, dict) else found
     if not isinstance(found, dict):
         raise ValueError("it is no object of names")

@@ -27,7 +27,6 @@ from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.contract import Decoder, adapt
 from ..network.network import load_network, network_for
 from ..simplify.collapsing import Unsimplified, collapse_edges, within
-from ..simplify.measuring import Original
 from ..simplify.walls import Walls, faults, meshes_of
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import Progress
@@ -228,11 +227,11 @@ def label_meshes(
     else:
         walls = spared(walls, SLIGHT * voxel, voxel / factor)
     if error := chosen.error(voxel):
-        found = within(Unsimplified(walls, [*map(Original, meshes_of(walls, count))]), error)
+        found = within(Unsimplified(walls), error)
         if not found:
             warnings.append("the meshes were not simplified: no way was found within the error")
         walls = found or walls
-    return meshes_of(walls, count), notes, warnings
+    return meshes_of(walls), notes, warnings
 
 
 def spared(walls: Walls, distance: float, spacing: float) -> Walls:

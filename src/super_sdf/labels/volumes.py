@@ -142,7 +142,7 @@ def _mean_normals(walls: Walls, count: int, cell: float) -> _Lattice:
     _, ny, nz = (corners.max((0, 1)) + 1).tolist()
     _, nodes = np.unique(corners @ [ny * nz, nz, 1], return_inverse=True)
     nodes = nodes.reshape(-1, 8)
-    mesh, point, first, _ = labels_apart(walls, count)
+    mesh, point, first, _ = labels_apart(walls)
     label = np.repeat(np.arange(count), np.diff(first))
     slopes = face_normals(mesh.vertices, mesh.faces).repeat(3, 0) / 6
     slopes = sums_at(mesh.faces.ravel().astype(np.int64), slopes, len(point))
