@@ -63,15 +63,15 @@ def level_set(field) -> tuple[np.ndarray, np.float32]:
     return values.clip(-background, background).astype(np.float32), background
 
 
-def held(path, grid: SdfGrid) -> tuple[np.ndarray, np.ndarray, dict]:
-    """Return the values in a file, the voxel that is the first, and what is said of the grid."""
+def held(path, grid: SdfGrid) -> tuple[np.ndarray, np.ndarray]:
+    """Return the values in a file, and the voxel that is the first."""
     with open_volume(path) as (volume, _):
         values = volume.read()
         columns = np.array(grid.direction) * grid.spacing
         np.testing.assert_allclose(volume.direction * volume.spacing, columns, atol=1e-15)
         first = np.linalg.solve(columns, np.array(volume.origin) - grid.origin)
         np.testing.assert_allclose(first, np.rint(first), atol=1e-9)
-        return values, np.rint(first).astype(int), volume.about
+        return values, np.rint(first).astype(int)
 
 
 @pytest.mark.parametrize("factor", [2, 4, 6])
@@ -81,9 +81,10 @@ def test_every_voxel_comes_back(name, factor):
     field = upsample(GRIDS[name](), trilinear, factor)
     write_field(field, "a.vdb")
     expected, background = level_set(field)
-    found, first, said = held("a.vdb", fine_grid(field))
+    found, first = held("a.vdb", fine_grid(field))
     count = int((np.abs(expected) < background).sum())
-    assert said == {"class": "level set", "active voxels": count}
+    stated = text("file_voxel_count") + text("int64") + struct.pack("<Iq", 8, count)
+    assert stated in Path("a.vdb").read_bytes()
     box = tuple(slice(f + PAD, f + PAD + n) for f, n in zip(first, found.shape))
     assert min(part.start for part in box) >= 0
     np.testing.assert_allclose(found, expected[box], rtol=1e-6)

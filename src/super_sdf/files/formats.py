@@ -129,7 +129,7 @@ def mesh_path(path: PurePath, suffix: str, label: int | None = None) -> PurePath
 # Files
 
 HEADERS = (".mhd", ".mha", ".nhdr", ".nrrd")  # text that may name data files, a line each
-LONGEST_HEADER = 1 << 20  # bytes, with a list of files
+LONGEST_HEADER = 1 << 20  # bytes
 DATA = re.compile(rb"^[ \t]*(?:ElementDataFile *[=:]|data ?file[ \t]*:=?) *([^\n]*)\n?", re.M)
 
 
@@ -171,30 +171,19 @@ def check_beside(path: Path, name: str) -> Path:
     return check_regular_file(other)
 
 
-def split_header(path: Path) -> tuple[bytes, list[str], int]:
-    """Return the header of a MetaImage or NRRD file before the entry that names its data files.
+def split_header(path: Path) -> tuple[bytes, str, int]:
+    """Return the header of a MetaImage or NRRD file before the entry that names its data file.
 
-    And these names, and where in the file the entry ends: 0 if there is none. The entry is a name,
-    or of MetaImage ``NAME%03d.raw 1 20 1``, or ``LIST`` before a name in each line.
+    And this name, and where in the file the entry ends: 0 if there is none.
     """
     with path.open("rb") as file:
         text = file.read(LONGEST_HEADER)
     if path.suffix.lower() in (".nrrd", ".nhdr"):  # after a blank line there is data
         text = re.split(rb"\n\r?\n", text, maxsplit=1)[0]
     if not (found := DATA.search(text)):
-        return text, [], 0
+        return text, "", 0
     entry = found[1].decode(errors="surrogateescape").strip()
-    names = [entry]
-    if entry.upper().startswith("LIST"):
-        listed = text[found.end() :].decode(errors="surrogateescape").splitlines()
-        names = [name for name in listed if name.strip()]
-    elif "%" in entry:
-        pattern, *numbers = entry.split()
-        if not re.fullmatch("[^%]*%0?[0-9]?d[^%]*", pattern) or len(numbers) < 2:
-            raise FileError(f"its data file is {seen(entry)}: give NAME%03d.raw 1 20 1")
-        first, last, step = (int(number) for number in (*numbers, "1")[:3])
-        names = [pattern % number for number in range(first, last + 1, step)]
-    return text[: found.start()], names, found.end()
+    return text[: found.start()], entry, found.end()
 
 
 def is_store(path: str | Path) -> bool:
@@ -213,7 +202,7 @@ def files_of(path: str | Path) -> list[Path]:
     kind, names = file.suffix.lower(), list[str]()
     try:
         if kind in HEADERS and file.is_file():  # opening a pipe would block
-            names = split_header(file)[1]
+            names = [split_header(file)[1]]
         elif kind == ".hdr":
             names = [f"{file.stem}.img", f"{file.stem}.img.gz"]
         return [file, *(part for name in names if (part := file.parent / name).is_file())]

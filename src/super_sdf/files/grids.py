@@ -159,13 +159,13 @@ def memory_left(max_memory: int | None = None) -> int | None:
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
     """Return values (nx, ny, nz), place and hint of a volume, for ``make_grid``."""
     check_kind(volume.dtype, volume.shape)
-    placement = find_placement(volume, given)
-    place = {**placement.place, "hint": volume.hint}
-    is_ordered = placement.order == (0, 1, 2) and all(step.step > 0 for step in placement.steps)
+    order, steps, place = find_placement(volume, given)
+    place["hint"] = volume.hint
+    is_ordered = order == (0, 1, 2) and all(step.step > 0 for step in steps)
     if volume.is_mapped and is_ordered:
         return {"values": volume.read(), **place}
     request.check_fits(volume.shape, volume.dtype)
-    values = placement.ordered(volume.read())
+    values = volume.read()[steps].transpose(order)
     return {"values": np.ascontiguousarray(values, values.dtype.newbyteorder("=")), **place}
 
 
@@ -203,10 +203,10 @@ def grid_from_image(
 
 
 def describe_grid_file(path: str | Path) -> dict[str, Any]:
-    """Return format, shape (x, y, z), type, place and storage of the array in a grid file.
+    """Return format, shape (x, y, z), type and place of the array in a grid file.
 
     No sample is read where the format allows it. What the file does not state is None or missing.
-    Chunks and shards are in the order of the array's own axes. Raises as ``read_grid``.
+    Raises as ``read_grid``.
     """
     path = check_path(path, "path")
     with open_volume(path) as (volume, _):
@@ -226,7 +226,6 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
         "axes in the file": "".join("xyz"[order.index(axis)] for axis in range(3)),
         **facts,
         **({"space": volume.space} if volume.space else {}),
-        **volume.about,
         "notes": list(volume.notes),
     }
 

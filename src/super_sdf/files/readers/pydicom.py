@@ -230,6 +230,5 @@ def _of_segments(
         "dtype": np.dtype(np.uint8 if chosen or max(labels) < 256 else np.uint16),
         "hint": "" if chosen else LABELS,
         "names": {1: names[chosen[0]]} if chosen else names,
-        "about": {"segments": list(labels.values())},
     }
     return _volume(frames, planes, step, EVEN_FRAMES, use, **about)

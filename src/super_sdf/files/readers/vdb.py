@@ -79,7 +79,6 @@ def read_vdb(request: Request) -> Volume:
     margin = 0 if np.isnan(tree.empty) else MARGIN
     low, high = np.min(tree.ends, 0) - margin, np.max(tree.ends, 0) + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
-    kind = metadata.get("class", "unknown")
 
     def load(index: Any) -> NDArray[Any]:
         voxels = tree.voxels(low, high)
@@ -89,9 +88,8 @@ def read_vdb(request: Request) -> Volume:
     return Volume(
         *(load, tuple((high - low).tolist()), tree.dtype),
         **from_affine(matrix),
-        hint=DISTANCE if kind == "level set" else "",
+        hint=DISTANCE if metadata.get("class") == "level set" else "",
         notes=("lengths are in millimetres, as PicoGK states",) * (size != 1),
-        about={"class": kind, "active voxels": tree.active_count},
     )
 
 

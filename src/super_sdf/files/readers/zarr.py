@@ -57,18 +57,16 @@ def read_zarr(request: Request) -> Volume:
     array, axes = nodes.get(name), _image_axes(nodes, name)
     if not isinstance(array, zarr.Array):
         raise FileError(f"{path} is damaged: its metadata names no array at {name!r}")
-    attributes, version = array.attrs.asdict(), array.metadata.zarr_format
+    attributes = array.attrs.asdict()
     if axes is None:
         axes = _named_axes(nodes, name)
     elif {*"xyz"} <= {axis.name for axis in axes} and len(axes) == array.ndim:
         attributes = {}
     else:
         raise GridError(f"its {array.ndim} axes are not named z, y, x by its metadata")
-    none = array.fill_value if version == 2 else None  # as xarray takes it
-    sizes = {name: getattr(array, name, None) for name in ("chunks", "shards")}
-    about = {"zarr format": version, **{name: list(size) for name, size in sizes.items() if size}}
+    none = array.fill_value if array.metadata.zarr_format == 2 else None  # as xarray takes it
     place = placed(request, axes, attributes, array.shape)
-    return Volume(*stored(array, attributes, none), **place, about=about)
+    return Volume(*stored(array, attributes, none), **place)
 
 
 def _metadata_of(request: Request) -> Iterator[tuple[str, bytes]]:
