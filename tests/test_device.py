@@ -108,8 +108,8 @@ def test_cuda_that_works_is_used_with_each_input_copied_once(cuda_session, reque
         ("libcuda.so.1", "there is no libcuda.so.1: install the NVIDIA driver"),
         (
             "libcublasLt.so.13",
-            f"{VERSION} does not find libcublasLt.so.13: pip install 'onnxruntime-gpu[cuda,cudnn]' "
-            "brings CUDA's libraries",
+            f"{VERSION} does not load, libcublasLt.so.13: cannot open shared object file: No such "
+            "file or directory: pip install 'onnxruntime-gpu[cuda,cudnn]' brings CUDA's libraries",
         ),
     ],
 )

@@ -18,7 +18,7 @@ from .main import SHARED, option, table_option
 HELP = """Show versions, devices and the shipped networks.
 
 With GRID, show instead what that grid file states: shape, type, spacing, origin, and how it is
-stored; of an OpenVDB file, all its grids. With --check, test the installation: each network refines
+stored. With --check, test the installation: each network refines
 a ball on the CPU and on CUDA, and what is missing is listed with the command that installs it.
 
 \b
@@ -73,15 +73,11 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
 
 
 def in_words(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield facts as lines: a line each, and one for each note and each grid of an OpenVDB file."""
+    """Yield facts as lines: a line each, and one for each note."""
     for key, value in facts.items():
         values = value if isinstance(value, (list, tuple)) else [value]
         if key == "notes":
             yield from (f"note: {note}" for note in values)
-        elif key == "grids":
-            for name, kind, class_, count in map(dict.values, values):
-                active = f", {count:,} active voxels" if count is not None else ""
-                yield f"grid: {name}, {kind}, {class_}{active}"
         elif values:
             yield f"{key.replace('_', ' ')}: {', '.join(map(in_word, values))}"
 

@@ -104,7 +104,7 @@ def names_in(path: str | Path) -> Names:
     """Return the names of labels, and their colours, that a grid file states."""
     if find_format(path).key not in NAMING:
         return {}
-    with open_volume(Path(path), None, describes=True) as (volume, _):
+    with open_volume(Path(path)) as (volume, _):
         return volume.names
 
 
@@ -114,14 +114,11 @@ def open_volume(
     axes: str | None = None,
     left: int | None = None,
     direction: Any = None,
-    *,
-    describes: bool = False,
 ) -> Iterator[tuple[Volume, Request]]:
     """Yield the volume in a file, and what was asked for.
 
     Whatever a library raises in the block becomes a FileError of one line, and what it says
-    meanwhile is dropped. ``left`` is how many bytes of memory it may take, None if unknown;
-    ``describes`` says that no sample will be read.
+    meanwhile is dropped. ``left`` is how many bytes of memory it may take, None if unknown.
     """
     format_, (file, named) = find_format(path), split_member(path)
     check_grid_file(path)
@@ -140,8 +137,7 @@ def open_volume(
             warnings.simplefilter("ignore")
             logging.disable(logging.CRITICAL)  # what matters is raised
             readers = import_module(f".readers.{format_.module}", __package__)
-            about = member or None, numbers, order, files, left, describes, bool(axes)
-            request = Request(file, *about)
+            request = Request(file, member or None, numbers, order, files, left)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
         if str(file) in error.flagged:
@@ -219,7 +215,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     Chunks and shards are in the order of the array's own axes. Raises as ``read_grid``.
     """
     path = check_path(path, "path")
-    with open_volume(path, describes=True) as (volume, _):
+    with open_volume(path) as (volume, _):
         order, _, place = find_placement(volume, {})
     shape = [volume.shape[axis] for axis in order]
     facts: dict[str, Any] = {

@@ -2,17 +2,17 @@
 
 Inputs are ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,) and ``offsets`` (Q, 3); the
 output is ``values`` (D, Q). Distances and offsets are in half voxels. The metadata, the model card,
-holds the receptive field, the training factors, data and accuracy. Its entry ``inputs`` is what the
+holds the training factors, data and accuracy, the width (``channels``), and the receptive field; a
+network that sees farther, up to the whole grid, states none. Its entry ``inputs`` is what the
 network was trained on: ``EXACT_DISTANCES``, hardly any of them noisy; or ``MASKS``; without the
 entry, distances of which some were noisy.
-
-Any function with these inputs and output can stand in for a network: see ``Decoder``.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,9 +32,7 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT = {"values": "tensor(float)"}
-# Whole numbers of a card with unit and largest value. A receptive field is to each side; a network
-# that sees farther, up to the whole grid, states none. The width decides the memory of a run.
-WHOLE = {"receptive_field": ("voxels", 1000), "channels": ("channels of width", 10_000)}
+WHOLE = ("receptive_field", "channels")  # of a card: voxels to each side, and width
 TRIAL: dict[str, Any] = {  # one voxel, and two offsets to notice an output with its axes swapped
     "patches": np.zeros((1, 27), np.float32),
     "neighbours": np.full((1, 27), -1, np.int32),
@@ -53,29 +51,20 @@ def read_card(session: Any, path: Path) -> dict[str, Any]:
     try:
         inputs = {given.name: given.type for given in session.get_inputs()}
         outputs = {made.name: made.type for made in session.get_outputs()}
-        metadata = session.get_modelmeta().custom_metadata_map
+        card = dict(session.get_modelmeta().custom_metadata_map)
     except UnicodeDecodeError as error:
         raise ModelError(f"{path} is damaged: it has names that are not UTF-8 text") from error
-    version, again = metadata.get("format_version"), "export it again with export/to_onnx.py"
+    fault, version = "", card.get("format_version")
     if (inputs, outputs, version) != (INPUTS, OUTPUT, str(FORMAT_VERSION)):
-        raise ModelError(
-            f"{path} is no super-sdf network of format {FORMAT_VERSION} (format {seen(version)}, "
-            f"inputs {seen(inputs)}, outputs {seen(outputs)}): {again}"
-        )
-    card: dict[str, Any] = {}
-    for key, text in metadata.items():
-        try:
+        fault = f"format {seen(version)}, inputs {seen(inputs)}, outputs {seen(outputs)}"
+    for key, text in card.items():
+        with suppress(ValueError, RecursionError):  # others stay text
             card[key] = json.loads(text)
-        except json.JSONDecodeError:
-            card[key] = text
-        except (ValueError, RecursionError) as error:  # thousands of digits; nested too deep
-            said = f"its metadata {seen(key)} cannot be read, {seen(text)}"
-            raise ModelError(f"{path}: {said}; {again}") from error
-    for key, (unit, most) in WHOLE.items():
-        value = card.get(key, 1)
-        if type(value) is not int or not 1 <= value <= most:  # True is an int, too
-            must = f"it must be a whole number of {unit} from 1 to {most}"
-            raise ModelError(f"{path}: its {key} is {seen(value)}; {must}: {again}")
+        if key in WHOLE and (type(card[key]) is not int or card[key] < 1):  # True is an int, too
+            fault = f"{key} {seen(card[key])}"
+    if fault:
+        said = f"{path} is no super-sdf network of format {FORMAT_VERSION} ({fault})"
+        raise ModelError(f"{said}: export it again with export/to_onnx.py")
     return card
 
 
@@ -122,21 +111,17 @@ def decode(
             f"the network gave {getattr(values, 'dtype', type(values).__name__)} of shape "
             f"{np.shape(values)} instead of float32 of shape {(count, width)}, (voxels, offsets)"
         )
-    blocks = np.empty((width, count + 1), np.float32)
-    blocks[:, count] = 0
+    blocks = np.zeros((width, count + 1), np.float32)
 
-    def transpose_and_check(rows: slice) -> int:
-        with np.errstate(over="ignore"):  # values that are too large are counted
+    def transpose_and_check(rows: slice) -> bool:
+        with np.errstate(over="ignore"):  # values that are too large are found
             some = values[rows].astype(np.float32, copy=False)
         blocks[:, rows] = some.T
-        if some.min() >= -MAX_VALUE and some.max() <= MAX_VALUE:  # both are False for NaN
-            return 0
-        return int(np.count_nonzero(~(np.abs(some) <= MAX_VALUE)))
+        return bool(some.min() >= -MAX_VALUE and some.max() <= MAX_VALUE)  # False for NaN
 
-    bad = sum(map_chunks(transpose_and_check, count, 4 * width, threads))
-    if bad:
+    if not all(map_chunks(transpose_and_check, count, 4 * width, threads)):
         raise ModelError(
-            f"{bad:,} of the {values.size:,} values that the network gave are NaN, infinite or "
-            "beyond 1e15: it cannot be used for this grid; use another --model"
+            "the network gave values that are NaN, infinite or beyond 1e15: it cannot be used for "
+            "this grid; use another --model"
         )
     return blocks

@@ -1,7 +1,4 @@
-"""The network: an ONNX file that fulfils the ``contract``, on a device.
-
-Masks and noisy distances have networks of their own, see ``network_for``.
-"""
+"""The network: an ONNX file that fulfils the ``contract``, on a device."""
 
 from __future__ import annotations
 
@@ -16,8 +13,8 @@ import numpy as np
 
 from .. import options
 from ..arrays import NEIGHBOURHOOD, STRIDES, FloatArray, IntArray
-from ..errors import DeviceError, FileError, ModelError, OptionError
-from ..options import AUTO, FLOAT32, INT8, OPTIONS, QUALITIES
+from ..errors import DeviceError, FileError
+from ..options import AUTO, FLOAT32, INT8, OPTIONS, QUALITIES, Device, Precision, Quality
 from ..threads import cores_of_system, useful_threads
 from .contract import EXACT_DISTANCES, INPUTS, MASKS, TRIAL, Decoder, read_card
 from .onnx import has_driver, open_session, run
@@ -36,7 +33,7 @@ class Network:
 
     session: Any  # of onnxruntime
     card: Mapping[str, Any]  # receptive field, training factors, data, commit, accuracy
-    device: options.Device  # "cpu" or "cuda"
+    device: Device  # "cpu" or "cuda"
     symmetries: int = 1  # half turns over which the values are averaged, see ``HALF_TURNS``
     threads: int = 0  # of the CPU; 0 for one per core
     notes: tuple[str, ...] = ()  # what the user should know about device and threads
@@ -44,11 +41,8 @@ class Network:
     path: Path = Path()  # of its file
 
     def __repr__(self) -> str:
-        threads = self.threads or "all"
-        return (
-            f"Network({self.card.get('name', 'unnamed')}, receptive field {self.receptive_field}, "
-            f"symmetries {self.symmetries}, device {self.device}, threads {threads})"
-        )
+        name, reach = self.card.get("name", "unnamed"), self.receptive_field
+        return f"Network({name}, receptive field {reach}, device {self.device})"
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Return how another process, which unpickles it, loads the same file."""
@@ -60,7 +54,7 @@ class Network:
         return self.card.get("receptive_field")
 
     @property
-    def precision(self) -> options.Precision:
+    def precision(self) -> Precision:
         """The arithmetic of the file: "float32" or "int8"."""
         return INT8 if self.card.get("precision") == INT8 else FLOAT32
 
@@ -111,7 +105,7 @@ def find_model(model: str | Path, precision: str = AUTO) -> tuple[Path, int]:
     """Return the file for the CPU, and the number of symmetries to average over.
 
     ``model`` is a quality, the name of a shipped network, or a file, which "auto" leaves as it is.
-    FileError if there is no such regular file, OptionError if there is none of this precision.
+    FileError if there is no such regular file.
     """
     OPTIONS["precision"].check(precision)
     shipped, (name, symmetries) = shipped_models(), QUALITIES.get(str(model), (str(model), 1))
@@ -122,21 +116,18 @@ def find_model(model: str | Path, precision: str = AUTO) -> tuple[Path, int]:
         path = shipped.get(f"{name}-{INT8}", path)
     elif precision == INT8:
         path = path.with_name(f"{path.stem}-{INT8}.onnx")  # beside the float32 file
-        if not isfile(path):
-            way_out = "write one with export.quantize"
-            raise OptionError(f"{model} has no int8 variant, {path}: {way_out}")
     if not isfile(path):
         names = ", ".join(QUALITIES)
-        raise FileError(f"no model {str(model)!r}: give an ONNX file or one of: {names}")
+        raise FileError(f"no model {str(path)!r}: give an ONNX file or one of: {names}")
     return path, symmetries
 
 
 def load_network(
-    model: options.Quality | str | Path = options.DEFAULT_QUALITY,
+    model: Quality | str | Path = options.DEFAULT_QUALITY,
     *,
-    device: options.Device = AUTO,
+    device: Device = AUTO,
     threads: int = 0,
-    precision: options.Precision = AUTO,
+    precision: Precision = AUTO,
 ) -> Network:
     """Load a network.
 
@@ -154,24 +145,19 @@ def load_network(
 
     Raises
     ------
-    FileError, OptionError
-        If there is no such file, or none of this precision; if an argument is invalid.
-    ModelError
-        If the file is not a network of this format.
-    DeviceError
-        If the device is "cuda" and CUDA cannot run.
+    FileError, OptionError, ModelError, DeviceError
+        If there is no such file; if an argument is invalid; if the file is not a network of this
+        format; if the device is "cuda" and CUDA cannot run.
     """
     asked, threads = OPTIONS["device"].check(device), OPTIONS["threads"].check(threads)
     path, symmetries = find_model(options.check_path(model, "model"), precision)
     if precision == INT8 and asked == "cuda":
         raise DeviceError("int8 is for the CPU: use --precision float32 with --device cuda")
     used, notes, failure = useful_threads(threads), list[str](), None
-    if threads > used:
-        notes = [f"--threads {threads} is cut to {used}, the cores that this process may use"]
-    elif not threads and used == cores_of_system():
+    if not threads and used == cores_of_system():
         used = 0  # onnxruntime's default, one thread per physical core
     session: Any = None
-    runs_on: options.Device = "cpu"
+    runs_on: Device = "cpu"
     if asked != "cpu" and precision != INT8:
         on_cuda, _ = find_model(model, FLOAT32)
         try:  # a session can open although it cannot run: a GPU may be too old, or its memory full
@@ -183,28 +169,18 @@ def load_network(
     if runs_on == "cpu":
         session = open_session(path, "cpu", used)  # the file may be the cause of the failure
         if failure and asked == "cuda":
-            raise DeviceError(
-                f"cuda was asked for, but {failure}; or use --device cpu"
-            ) from failure
+            said = f"cuda was asked for, but {failure}; or use --device cpu"
+            raise DeviceError(said) from failure
         if failure and has_driver():
             notes += [f"a GPU seems to be here, but the network runs on the CPU: {failure}"]
     card = read_card(session, path)
-    if runs_on == "cpu":
-        try:
-            run(session, TRIAL)
-        except DeviceError as error:
-            raise ModelError(f"{path} does not run with its own inputs: {error}") from error
     shipped = path.parent == MODELS and card.get("inputs") != MASKS
     return Network(session, card, runs_on, symmetries, used, tuple(notes), shipped, path)
 
 
 @lru_cache(maxsize=4)
 def _load_once(
-    model: str | Path,
-    device: options.Device,
-    threads: int,
-    symmetries: int,
-    precision: options.Precision = AUTO,
+    model: str | Path, device: Device, threads: int, symmetries: int, precision: Precision = AUTO
 ) -> Network:
     loaded = load_network(model, device=device, threads=threads, precision=precision)
     return replace(loaded, symmetries=symmetries)

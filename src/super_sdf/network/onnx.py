@@ -154,14 +154,13 @@ def check_cuda() -> None:
     if hasattr(ort, "preload_dlls"):  # since 1.21; finds libraries that pip installed
         with redirect_stdout(io.StringIO()):  # it prints
             ort.preload_dlls()
+    library = Path(ort.__file__).parent / "capi" / "libonnxruntime_providers_cuda.so"
     try:
-        ctypes.CDLL(str(Path(ort.__file__).parent / "capi" / "libonnxruntime_providers_cuda.so"))
+        if sys.platform == "linux":
+            ctypes.CDLL(str(library))
     except OSError as error:
-        library, _, reason = str(error).partition(": ")
-        if "cannot open shared object file" in reason:  # in words of Linux; Windows names no file
-            way_out = "pip install 'onnxruntime-gpu[cuda,cudnn]' brings CUDA's libraries"
-            said = f"{VERSION} does not find {library}: {way_out}"
-            raise DeviceError(said) from error
+        way_out = "pip install 'onnxruntime-gpu[cuda,cudnn]' brings CUDA's libraries"
+        raise DeviceError(f"{VERSION} does not load, {error}: {way_out}") from error
 
 
 def has_driver() -> bool:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Triple
 from ...errors import FileError, GridError, OptionError, OutOfMemoryError
-from ...grid.samples import as_direction, check_direction
+from ...grid.samples import as_direction, as_triple, check_direction
 from ...threads import in_words
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
@@ -47,16 +47,13 @@ class Request:
     axes: str  # the order in a file that does not state one: "xyz" or "zyx"
     files: ExitStack  # closes what the reader opens, once the samples are read
     left: int | None = None  # bytes of memory that the process may still take, if that is known
-    describes: bool = False  # no sample will be read: the file is described
-    axes_given: bool = False  # whether the user gave the order
 
     def check_fits(self, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
         """Raise OutOfMemoryError if an array that is loaded whole does not fit."""
-        size = prod(map(int, shape)) * dtype.itemsize
-        need, listed = COPIES * size, " x ".join(map(str, shape))
+        need = COPIES * prod(map(int, shape)) * dtype.itemsize
         if self.left is not None and need > self.left:
             raise OutOfMemoryError(
-                f"{self.path}, {listed} {dtype}, {size:,} bytes, is loaded whole, which takes "
+                f"{self.path}, {' x '.join(map(str, shape))} {dtype}, is loaded whole, which takes "
                 f"{in_words(need)} of memory, {in_words(self.left)} are left; allow more "
                 "(--max-memory), or save it as .npy in C order"
             )
@@ -65,19 +62,20 @@ class Request:
         """Return the name of the array to read: the one asked for, else the only one."""
         if not names:
             raise FileError(f"{self.path} holds no {what}")
-        more = f" and {len(names) - MOST_NAMED:,} more" * (len(names) > MOST_NAMED)
-        listed = ", ".join(names[:MOST_NAMED]) + more
+        listed = ", ".join(names[:MOST_NAMED]) + ", ..." * (len(names) > MOST_NAMED)
         if self.member is not None:
             same = [name for name in names if name.strip("/") == self.member.strip("/")]
             if not same:
                 raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
             return same[0]
         if len(names) > 1:
-            said = f"{self.path} holds several arrays, {listed}"
-            raise FileError(f"{said}: give {self.path}:{names[0]}, say")
+            example = f"{self.path}:{names[0]}"
+            raise FileError(f"{self.path} holds several arrays, {listed}: give {example}, say")
         return names[0]
 
-    def choose_array(self, shapes: Mapping[str, Sequence[int]], what: str) -> str:
+    def choose_array(
+        self, shapes: Mapping[str, Sequence[int]], what: str = "array of three axes"
+    ) -> str:
         """Return the name of the array to read, of three axes or more, by the shapes of all.
 
         Without a name, those with more than three axes longer than 1 count only beside a number,
@@ -96,8 +94,7 @@ class Request:
         the longest are in space.
         """
         if len(shape) < 3:
-            said = f"{self.path} has shape {tuple(shape)}"
-            raise GridError(f"{said}: give a file of three axes (x, y, z)")
+            raise GridError(f"{self.path} has shape {tuple(shape)}: give a file of three axes")
         if kept is None:
             by_length = sorted(range(len(shape)), key=lambda axis: (shape[axis], axis))
             kept = by_length[-3:]
@@ -106,14 +103,13 @@ class Request:
             raise OptionError(f"{self.path} has {len(others)} axes to choose from by [0], [1], ...")
         chosen = dict(zip(others, self.numbers))
         for axis in others:
-            called, count = (names[axis] if names else "") or axis, shape[axis]
-            if axis not in chosen:
+            if chosen.get(axis, shape[axis]) >= shape[axis]:
+                called = (names[axis] if names else "") or axis
                 name = f"{self.path}:{self.member}" if self.member else self.path
-                said = f"{self.path}: its axis {called} has {count} entries"
-                raise GridError(f"{said}: choose one, {name}{'[0]' * len(others)}, say")
-            if chosen[axis] >= count:
-                said = f"its axis {called} has {count} entries, from 0 on"
-                raise GridError(f"{said}: there is none with the number {chosen[axis]}")
+                raise GridError(
+                    f"{self.path}: its axis {called} has {shape[axis]} entries, from 0 on: choose "
+                    f"one, {name}{'[0]' * len(others)}, say"
+                )
         whole = slice(None)
         return tuple(whole if n in kept else chosen.get(n, 0) for n in range(len(shape)))
 
@@ -138,7 +134,7 @@ class Volume:
     space: str | None = None  # "RAS" or "LPS", if the file states one of them
     notes: tuple[str, ...] = ()  # sentences on what the file says, for the user
     about: dict[str, Any] = field(default_factory=dict)  # how it is stored, for ``info``
-    # spacing, origin, direction of x, y, z as the file has them, unchecked, instead of those above
+    # spacing, origin, direction of x, y, z: see ``stated_place``; they replace those above
     place: dict[str, Any] = field(default_factory=dict)
     is_mapped: bool = False  # the samples stay in the file
     hint: str = ""  # what the file says its values are: LABELS, DENSITY, DISTANCE
@@ -191,6 +187,12 @@ def from_affine(matrix: NDArray[Any]) -> dict[str, Any]:
 def kept_of(index: Index) -> list[int]:
     """Return the axes of an array that are in space."""
     return [axis for axis, at in enumerate(index) if isinstance(at, slice)]
+
+
+def stated_place(said: Mapping[str, Any]) -> dict[str, Any]:
+    """Return spacing, origin and direction that a file states by these names, as far as it does."""
+    place: dict[str, Any] = {k: as_triple(said[k], k) for k in PLACE[:2] if k in said}
+    return place | {k: check_direction(np.squeeze(said[k])) for k in PLACE[2:] if k in said}
 
 
 def axes_direction(axes: str) -> NDArray[np.float64]:

@@ -14,13 +14,9 @@ from . import PLACE, Request, Volume, of_array, triple
 from .axes import Axis, measured, placed, stored
 
 NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
-IMARIS = "DataSetInfo/Image"  # where its files state extents
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
-ORDER = (
-    "its axes are taken as x, y, z, the order of ndgrid; of an array in the order of meshgrid, "
-    "which is y, x, z, save permute(V, [2 1 3])"
-)
+ORDER = "its axes are taken as x, y, z, the order of ndgrid; of meshgrid save permute(V, [2 1 3])"
 
 
 def read_hdf5(request: Request) -> Volume:
@@ -45,28 +41,27 @@ def read_hdf5(request: Request) -> Volume:
         }
         return _volume_of(image["VoxelData"], place)
     values = file[request.choose_array(shapes, "3D dataset")]
-    about, beside = dict(values.attrs), dict(file[IMARIS].attrs) if IMARIS in file else {}
-    return _volume_of(values, placed(request, _axes(values), about, values.shape, beside=beside))
+    return _volume_of(values, placed(request, _axes(values), values.attrs, values.shape))
 
 
 def _axes(values: Any) -> list[Axis]:
     """Return what a dataset says of its axes: by ``axistags``, as of ilastik, or scales."""
     tags = json.loads(values.attrs.get("axistags", "{}")).get("axes", ())
     if len(tags) == values.ndim:
-        return [
-            Axis(str(tag.get("key", "")), step=float(tag.get("resolution") or 0) or None)
-            for tag in tags
-        ]
+        steps = (float(tag.get("resolution") or 0) or None for tag in tags)
+        return [Axis(str(tag.get("key", "")), step=step) for tag, step in zip(tags, steps)]
     axes = []
     for dim, count in zip(values.dims, values.shape):
         scale = dim[0] if len(dim) else None
         name = dim.label or ("" if scale is None else (scale.name or "").rsplit("/", 1)[-1])
-        places, about = None, {}
-        if scale is not None and scale.shape == (count,):
-            about = dict(scale.attrs)
-            is_bare = NO_COORDINATES in bytes(about.get("NAME", b""))
-            places = None if is_bare else _check_own(scale)[:]
-        axes.append(measured(name, places, about))
+        if (
+            scale is None
+            or scale.shape != (count,)
+            or NO_COORDINATES in bytes(scale.attrs.get("NAME", b""))
+        ):
+            axes.append(Axis(name))
+        else:
+            axes.append(measured(name, _check_own(scale)[:], scale.attrs))
     return axes
 
 
@@ -79,11 +74,8 @@ def _check_own(values: Any) -> Any:
 
 def _volume_of(values: Any, place: dict[str, Any]) -> Volume:
     """Return a dataset at its place."""
-    _check_own(values)
-    chunks = values.id.get_num_chunks() if values.chunks else 0
-    numbers = stored(values, dict(values.attrs), chunks=chunks, fill=values.fillvalue)
     about = {"chunks": list(values.chunks)} if values.chunks else {}
-    return Volume(*numbers, **place, about=about)
+    return Volume(*stored(_check_own(values), values.attrs), **place, about=about)
 
 
 def read_netcdf(request: Request) -> Volume:
@@ -97,13 +89,13 @@ def read_netcdf(request: Request) -> Volume:
     variables = file.variables
     shapes = {f"/{name}": values.shape for name, values in variables.items()}
     values = variables[request.choose_array(shapes, "variable of three axes")[1:]]
-    about = values._attributes
-    axes = []
-    for name in values.dimensions:
-        scale = variables.get(name)
-        axes.append(Axis(name) if scale is None else measured(name, scale.data, scale._attributes))
-    place = placed(request, axes, about, values.shape)
-    return Volume(*stored(values.data, about), **place)
+    scales = [variables.get(name) for name in values.dimensions]
+    axes = [
+        Axis(name) if scale is None else measured(name, scale.data, scale._attributes)
+        for name, scale in zip(values.dimensions, scales)
+    ]
+    place = placed(request, axes, values._attributes, values.shape)
+    return Volume(*stored(values.data, values._attributes), **place)
 
 
 def read_mat(request: Request) -> Volume:
@@ -115,23 +107,19 @@ def read_mat(request: Request) -> Volume:
     import h5py
     from scipy.io import loadmat, whosmat
 
-    what, shapes = "array of three axes", dict[str, tuple[int, ...]]()
     is_hdf5 = h5py.is_hdf5(request.path)
     if is_hdf5:
         file = request.files.enter_context(h5py.File(request.path, "r"))
-        for name, entry in file.items():
-            if str(entry.attrs.get("MATLAB_class", b""), "ascii") in NUMBERS:
-                shapes[name] = entry.shape or ()
-        values = file[request.choose_array(shapes, what)]
-        stated = {key: file[key][()].T for key in PLACE if key in file}
+        kinds = {key: str(file[key].attrs.get("MATLAB_class", b""), "ascii") for key in file}
+        shapes = {key: file[key].shape or () for key, kind in kinds.items() if kind in NUMBERS}
+        values = file[request.choose_array(shapes)]
+        stated = {key: _check_own(file[key])[()].T for key in PLACE if key in file}
     else:
         shapes = {name: shape for name, shape, kind in whosmat(request.path) if kind in NUMBERS}
-        name = request.choose_array(shapes, what)
+        name = request.choose_array(shapes)
         variables = loadmat(request.path, variable_names=[name, *PLACE])
         stated = {key: variables[key] for key in PLACE if key in variables}
         values = variables[name].T  # planes of the last axis are contiguous
-        if values.shape[::-1] != shapes[name]:
-            raise FileError(f"it is damaged: {name} has shape {values.shape[::-1]}")
     axes = [Axis()] * len(values.shape)
     place = placed(request, axes, stated, values.shape, request.axes[::-1])
     place["notes"] = (ORDER,) if request.axes == "xyz" else ()

@@ -3,7 +3,7 @@
 Both libraries open whatever file a header names: names are checked before. Coordinates of NRRD are
 those of the file's own space (LPS, RAS, ...). SimpleITK turns them all to LPS, takes spacings by
 axis mins and maxs for 1, and refuses bzip2, an axis of time, and spacings beside a space; and of
-MetaImage, which is LPS, it takes a torn zlib stream for data, so that is unpacked here.
+MetaImage, which is LPS, it takes a torn zlib stream for data, so the stream is checked here.
 """
 
 from __future__ import annotations
@@ -11,58 +11,39 @@ from __future__ import annotations
 import re
 import zlib
 from math import prod
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
 from ...options import LPS, RAS
 from ..formats import check_beside, split_header
 from . import LABELS, Index, Names, Request, Volume, from_affine, kept_of, triple
-from .axes import in_unit, one_unit
+from .axes import one_unit
 
-CENTERING = (
-    "it states axis mins, but no centerings: its samples are taken as cells, half a spacing from "
-    "them, as ITK does"
-)
 IN_SPACE = ("domain", "space", "???", "none")  # kinds of axes; others are lists, vectors, time
 SPACES = {"right-anterior-superior": RAS, "ras": RAS, "left-posterior-superior": LPS, "lps": LPS}
 # Fields in one spelling of those that the format allows
 SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
 
+# What a MetaImage file may state: that data is a zlib stream, which byte of a number is first
+TRUE = re.compile(rb"^ *(CompressedData|\w+ByteOrderMSB) *[=:] *[Tt1]", re.M)
+
 
 def read_nrrd(request: Request) -> Volume:
-    """Read a ``.nrrd`` file, or a ``.nhdr`` file and the data files that it names."""
+    """Read a ``.nrrd`` file, or a ``.nhdr`` file and the data file that it names."""
     import nrrd
 
-    path, stated = request.path, split_header(request.path)
-    with path.open("rb") as file:
-        raw = nrrd.read_header(stated.before.splitlines(True) if stated.lists else file)
-    named = [raw.pop(name) for name in ("data file", "datafile") if name in raw]
-    if len(named) != (stated.start > 0 and not stated.lists):  # pynrrd would open another one
-        raise FileError("its header is damaged: it does not name one data file")
-    files = [check_beside(path, name) for name in stated.names()]
+    path = request.path
+    raw = nrrd.read_header(str(path))
+    for field in {"data file", "datafile"} & raw.keys():
+        check_beside(path, raw[field])
     header = {SPELT.get(name, name): value for name, value in raw.items()}
     sizes = tuple(int(size) for size in header["sizes"])
-    if header["dimension"] != len(sizes) or min(sizes) < 1:
-        raise FileError(f"its sizes are {sizes}")
     index = request.pick(sizes, _axes_in_space(header))
-
-    def load(index: Index) -> Any:
-        if not files:
-            return nrrd.read(str(path))[0][index]
-        part = {**raw, "sizes": np.array([*sizes[:-1], sizes[-1] // len(files)])}
-        parts = [
-            nrrd.read_data({**part, "data file": str(each.absolute())}, None, str(path))
-            for each in files
-        ]
-        return np.concatenate(parts, axis=-1)[index]
-
     layer = next((at for at in index if not isinstance(at, slice)), 0)
     return Volume(
-        *(load, sizes, nrrd.reader._determine_datatype(raw)),
+        *(lambda at: nrrd.read(str(path))[0][at], sizes, nrrd.reader._determine_datatype(raw)),
         **_place(header, kept_of(index)),
         index=index,
         space=SPACES.get(str(header.get("space", "")).lower()),
@@ -85,15 +66,14 @@ def _segments(raw: dict[str, Any], layer: int) -> Names:
     return names
 
 
-def _axes_in_space(header: dict[str, Any]) -> tuple[int, ...] | None:
+def _axes_in_space(header: dict[str, Any]) -> list[int] | None:
     """Return the axes that the header says are in space, None if these are not three."""
-    count = len(header["sizes"])
-    is_in_space = [kind in IN_SPACE for kind in header.get("kinds", ["???"] * count)]
+    is_in_space = [kind in IN_SPACE for kind in header.get("kinds", ["???"] * len(header["sizes"]))]
     if header.get("space directions") is not None:
         along = np.nan_to_num(np.asarray(header["space directions"], np.float64)[:, :3])
         is_in_space = (along != 0).any(1).tolist()
-    axes = tuple(axis for axis, is_one in enumerate(is_in_space) if is_one)
-    return axes if len(axes) == 3 and len(is_in_space) == count else None
+    axes = np.flatnonzero(is_in_space).tolist()
+    return axes if len(axes) == 3 else None
 
 
 def _place(header: dict[str, Any], space: list[int]) -> dict[str, Any]:
@@ -102,35 +82,30 @@ def _place(header: dict[str, Any], space: list[int]) -> dict[str, Any]:
     def of_axes(name: str, default: Any) -> Any:
         said = header.get(name, ())
         said = said.split() if isinstance(said, str) else said  # pynrrd does not split some
-        return [said[axis] for axis in space] if len(said) > max(space) else default
+        return [said[axis] for axis in space] if len(said) > max(space) else [default] * 3
 
-    notes: tuple[str, ...] = ()
-    columns: NDArray[np.float64] | None
     origin, units = header.get("space origin"), header.get("space units")
+    place: dict[str, Any] = {}
     if header.get("space directions") is not None:
-        columns = np.asarray(header["space directions"], np.float64)[space, :3].T
-        if columns.shape != (3, 3) or not np.isfinite(columns).all():
-            raise FileError(f"its space directions are {columns.T.tolist()}: give three of three")
+        place = from_affine(np.asarray(header["space directions"], np.float64)[space, :3].T)
     else:
         names = ("spacings", "axis mins", "axis maxs")
-        steps, low, high = (np.array(of_axes(name, [np.nan] * 3), float) for name in names)
+        steps, low, high = (np.array(of_axes(name, np.nan), float) for name in names)
         # what is not stated is a cell, as for ITK and teem: its first sample is half a step further
-        is_cell = np.array([each != "node" for each in of_axes("centerings", ["cell"] * 3)])
+        is_cell = np.array([each != "node" for each in of_axes("centerings", "cell")])
         counts = np.maximum(np.asarray(header["sizes"])[space] - ~is_cell, 1)
         steps = np.where(np.isfinite(steps), steps, (high - low) / counts)
-        columns = np.diag(steps) if (np.isfinite(steps) & (steps != 0)).all() else None
-        units = units or of_axes("units", None)
-        low = low + np.where(is_cell, steps / 2, 0)
-        if origin is None and columns is not None and np.isfinite(low).all():
-            origin = low
-            notes = (CENTERING,) if "centerings" not in header else ()
-    is_one, told = one_unit([unit.strip('"') for unit in (units or [])[:3]])
+        if (np.isfinite(steps) & (steps != 0)).all():
+            place = from_affine(np.diag(steps))
+            units = units or of_axes("units", "")
+            low = low + np.where(is_cell, steps / 2, 0)
+            origin = low if origin is None else origin  # which holds beside ``spacings``, too
+    is_one, notes = one_unit([unit.strip('"') for unit in (units or [])[:3]])
     if not is_one:
-        return {"notes": notes + told}
-    if origin is not None:  # it holds beside ``spacings``, too
-        origin = triple(origin[:3]) if np.isfinite(origin[:3]).all() else None
-    place = {} if columns is None else from_affine(columns)
-    return {**place, "origin": origin, "notes": notes + told}
+        return {"notes": notes}
+    if origin is not None and np.isfinite(origin[:3]).all():
+        place["origin"] = triple(origin[:3])
+    return {**place, "notes": notes}
 
 
 def read_metaimage(request: Request) -> Volume:
@@ -138,12 +113,8 @@ def read_metaimage(request: Request) -> Volume:
     import SimpleITK
 
     path, stated = request.path, split_header(request.path)
-    if not stated.start:
+    if not stated.start:  # ITK might find another one
         raise FileError("its header is damaged: it has no ElementDataFile")
-    lines = stated.before.decode(errors="replace").splitlines()
-    pairs = (re.split("[=:]", line, maxsplit=1) for line in lines)
-    fields = {pair[0].strip(): pair[-1].strip() for pair in pairs}
-    true = {name for name, value in fields.items() if value[:1] in ("T", "t", "1")}  # as in ITK
     is_local = stated.entry.lower() == "local"
     files = [check_beside(path, name) for name in stated.names() if not is_local]
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
@@ -159,36 +130,26 @@ def read_metaimage(request: Request) -> Volume:
         raise GridError(f"{path} has {components} numbers a sample: give a file of three axes")
     one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
+    promised = prod(size) * dtype.itemsize
+    true = set(TRUE.findall(stated.before))
     data, start = (files[0], 0) if files else (path, stated.start)
-    promised, follow = prod(size) * dtype.itemsize, data.stat().st_size - start
-    is_packed = "CompressedData" in true and len(files) <= 1
-    if not is_packed and len(files) <= 1 and promised > follow:
-        raise FileError(f"{data} is truncated: {promised:,} bytes are promised, {follow:,} follow")
 
     def load(index: Index) -> Any:
-        if not is_packed:
+        if len(files) > 1:
             return SimpleITK.GetArrayFromImage(reader.Execute()).T[index]
-        is_big = {"BinaryDataByteOrderMSB", "ElementByteOrderMSB"} & true
-        numbers = _unpacked(data, start, promised)
-        values = np.frombuffer(numbers, dtype.newbyteorder(">" if is_big else "<"))
-        return values.reshape(size[::-1]).T[index]
+        if b"CompressedData" in true:
+            unpacker = zlib.decompressobj()
+            numbers = unpacker.decompress(data.read_bytes()[start:], promised + 1)
+            if len(numbers) == promised and unpacker.eof:
+                kind = dtype.newbyteorder(">" if len(true) > 1 else "<")
+                return np.frombuffer(numbers, kind).reshape(size[::-1]).T[index]
+        elif data.stat().st_size - start >= promised:
+            return SimpleITK.GetArrayFromImage(reader.Execute()).T[index]
+        raise FileError(f"{data} is truncated or damaged: {promised:,} bytes are promised")
 
     index = request.pick(size)
     kept = kept_of(index)
     steps, origin = (np.array(said)[kept] for said in (reader.GetSpacing(), reader.GetOrigin()))
     direction = np.array(reader.GetDirection()).reshape(len(size), -1)[np.ix_(kept, kept)]
     place = triple(np.abs(steps)), triple(origin), direction * np.sign(steps)
-    notes = in_unit(re.sub("^(mm|UNKNOWN|[?])$", "", fields.get("DistanceUnits", "")))
-    if not {"ElementSpacing", "ElementSize"} & set(fields):
-        notes += ("it states no ElementSpacing: taken as 1, as ITK does",)
-    return Volume(load, size, dtype, *place, index, notes=notes, space=LPS)
-
-
-def _unpacked(data: Path, start: int, promised: int) -> bytes:
-    """Return what a zlib stream in a file holds."""
-    unpacker = zlib.decompressobj()
-    numbers = unpacker.decompress(data.read_bytes()[start:], promised + 1)
-    if len(numbers) != promised or not unpacker.eof:
-        said = f"{data} is damaged: {promised:,} bytes are promised, and its compressed data is"
-        raise FileError(f"{said} torn or has others ({len(numbers):,})")
-    return numbers
+    return Volume(load, size, dtype, *place, index, space=LPS)

@@ -31,25 +31,21 @@ def read_mrc(request: Request) -> Volume:
     sizes = tuple(int(header[f"n{axis}"]) for axis in "zyx")
     order = [int(header[name]) - 1 for name in ("maps", "mapr", "mapc")]
     order = [2, 1, 0] if order == [-1] * 3 else order
-    cell, angles, stated = (
+    cell, angles, origin = (
         np.array(header[name].tolist(), np.float64) for name in ("cella", "cellb", "origin")
     )
-    is_sound = np.isfinite([cell, angles, stated]).all() and min(sizes) > 0
-    if not is_sound or sorted(order) != [0, 1, 2]:
-        raise FileError("its header is damaged: its sizes, axes, cell or origin cannot be")
     if header.ispg >= VOLUME_STACKS and header.mz != header.nz:
         raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
     if angles.any() and np.abs(angles - 90).max() > RIGHT:
-        said = f"the angles of its unit cell are {_listed(angles)} degrees, not 90"
+        listed = ", ".join(f"{angle:g}" for angle in angles)
+        said = f"the angles of its unit cell are {listed} degrees, not 90"
         raise GridError(f"{said}: resample it on a grid with right angles")
     counts = np.array([int(header[name]) for name in ("mx", "my", "mz")])
-    steps, starts = cell / np.maximum(counts, 1), np.zeros(3)
+    steps = cell / np.maximum(counts, 1)
     is_stated = bool((cell > 0).all() and (counts > 0).all())
-    starts[order] = [int(header[f"n{axis}start"]) for axis in "zyx"]
-    in_cell, notes = starts * steps, tuple[str, ...]()
-    if stated.any() and in_cell.any() and not np.allclose(stated, in_cell, atol=steps.max() / 100):
-        both = f"its origin is {_listed(stated)} and its nstart means {_listed(in_cell)}"
-        notes = (f"{both}: the origin is taken",)
+    if not origin.any():
+        origin[order] = [int(header[f"n{axis}start"]) for axis in "zyx"]
+        origin *= steps
 
     def load(index: Any) -> Any:
         with mrcfile.open(request.path, permissive=True) as opened:
@@ -57,11 +53,5 @@ def read_mrc(request: Request) -> Volume:
                 raise FileError("it is truncated")
             return opened.data
 
-    spacing = triple(steps[order]) if is_stated else None
-    place = spacing, triple(stated if stated.any() else in_cell), XYZ[:, order]
-    dtype = data_dtype_from_header(header)
-    return Volume(load, sizes, dtype, *place, notes=notes, hint=DENSITY)
-
-
-def _listed(numbers: Any) -> str:
-    return ", ".join(f"{number:g}" for number in numbers)
+    place = triple(steps[order]) if is_stated else None, triple(origin), XYZ[:, order]
+    return Volume(load, sizes, data_dtype_from_header(header), *place, hint=DENSITY)

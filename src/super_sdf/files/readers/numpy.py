@@ -13,15 +13,14 @@ from __future__ import annotations
 
 import re
 import struct
-from math import prod
-from typing import IO, Any
+from typing import Any
 from zipfile import is_zipfile
 
 import numpy as np
 from numpy.lib import format as npy
 
-from ...errors import FileError, GridError
-from . import PLACE, Request, Volume, axes_direction, of_array, triple
+from ...errors import FileError
+from . import PLACE, Request, Volume, axes_direction, of_array, stated_place, triple
 
 OPEN3D = ("key", "voxel_size", "block_resolution", "attr_name_tsdf", "attr_name_weight")
 SDF_HEADER = struct.Struct("<3i6f")
@@ -30,34 +29,13 @@ SDF_TEXT = re.compile(rb"[\s\d.+\-a-zA-Z]+")
 FLOAT = np.dtype("<f4")
 
 
-def _header(file: IO[bytes], name: str) -> tuple[tuple[int, ...], str, np.dtype[Any]]:
-    """Return shape, order and type of an array with its header."""
-    try:
-        version = npy.read_magic(file)
-        read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, is_fortran, dtype = read(file)
-    except Exception:  # NumPy evaluates the text as Python, which fails in many ways
-        raise FileError(f"{name} is not an .npy array: its header cannot be read") from None
-    return shape, "Fortran" if is_fortran else "C", dtype
-
-
-def _volume(request: Request, load: Any, header: Any, **more: Any) -> Volume:
-    """Return an array with a header, in the order of axes that was asked for."""
-    shape, order, dtype = header
-    place: Any = {"direction": axes_direction(request.axes), "axes": request.axes}
-    index, about = request.pick(shape), {"order": order}
-    return Volume(load, shape, dtype, index=index, about=about, **place, **more)
-
-
 def read_npy(request: Request) -> Volume:
     """Read an ``.npy`` file, which is mapped into memory."""
-    with request.path.open("rb") as file:
-        header = _header(file, str(request.path))
-
-    def load(index: Any) -> Any:
-        return np.load(request.path, mmap_mode="r", allow_pickle=False)[index]
-
-    return _volume(request, load, header, is_mapped=True)
+    values = np.load(request.path, mmap_mode="r", allow_pickle=False)
+    place: dict[str, Any] = {"direction": axes_direction(request.axes), "axes": request.axes}
+    about = {"order": "C" if values.flags.c_contiguous else "Fortran"}
+    index = request.pick(values.shape)
+    return Volume(*of_array(values), index=index, **place, about=about, is_mapped=True)
 
 
 def read_npz(request: Request) -> Volume:
@@ -65,31 +43,24 @@ def read_npz(request: Request) -> Volume:
     if not is_zipfile(request.path):  # NumPy would take it for a pickle
         raise FileError(f"{request.path} is not a readable .npz archive: write it by numpy.savez")
     archive = request.files.enter_context(np.load(request.path, allow_pickle=False))
-    keys = archive.files
-    if set(OPEN3D) <= set(keys):
+    keys = set(archive.files)
+    if set(OPEN3D) <= keys:
         return _blocks_of_open3d(archive)
-    if {"voxels", "factor"} <= set(keys):
+    if {"voxels", "factor"} <= keys:
         way_out = "mesh it with extract_mesh(read_field(path))"
         raise FileError(f"{request.path} is a refined field, no grid: {way_out}")
-    headers, zipped = {}, archive.zip
-    for key in set(keys) - set(PLACE):
-        info = zipped.getinfo(f"{key}.npy" if f"{key}.npy" in zipped.namelist() else key)
-        with zipped.open(info) as file:
-            headers[key] = _header(file, f"{request.path}[{key}]")
-    shapes = {key: headers[key][0] for key in keys if key in headers}
+    shapes, dtypes = {}, {}
+    for key in (key for key in archive.files if key not in PLACE):
+        with archive.zip.open(f"{key}.npy") as file:  # without its samples
+            is_first = npy.read_magic(file) == (1, 0)
+            read = npy.read_array_header_1_0 if is_first else npy.read_array_header_2_0
+            shapes[key], _, dtypes[key] = read(file)
     is_plain = "values" in keys and request.member is None
-    if not is_plain and max(map(len, shapes.values()), default=0) < 3:
-        held = ", ".join(keys) or "nothing"
-        raise FileError(f"{request.path} has no key 'values' (it holds {held})")
-    name = "values" if is_plain else request.choose_array(shapes, "array of three axes")
-    place: dict[str, Any] = {}
-    for key in set(PLACE) & set(keys):
-        place[key] = archive[key]
-        most, asked = (9, "nine numbers") if key == "direction" else (3, "one number or three")
-        if place[key].size > most or place[key].dtype.kind not in "fiu":
-            said = f"shape {place[key].shape} and dtype {place[key].dtype}"
-            raise GridError(f"{request.path}[{key}] has {said}: give {asked}")
-    return _volume(request, lambda index: archive[name][index], headers[name], place=place)
+    name = "values" if is_plain else request.choose_array(shapes)
+    place: dict[str, Any] = {"direction": axes_direction(request.axes), "axes": request.axes}
+    place["place"] = stated_place({key: archive[key] for key in keys & set(PLACE)})
+    index = request.pick(shapes[name])
+    return Volume(lambda at: archive[name][at], shapes[name], dtypes[name], index=index, **place)
 
 
 def _blocks_of_open3d(archive: Any) -> Volume:
@@ -119,23 +90,15 @@ def read_sdf(request: Request) -> Volume:
         start, shape = tagged.end(), tuple(map(int, tagged.groups()))
     elif SDF_TEXT.fullmatch(beginning):
         words = path.read_bytes().split()
-        try:
-            shape = tuple(max(int(word), 0) for word in words[:3])
-            x, y, z, spacing = (float(word) for word in words[3:7])
-            values = np.array(words[7:], np.float32).reshape(shape[::-1]).T
-        except (ValueError, OverflowError):
-            said = "three sizes, the origin and the spacing, and a value for each sample follows"
-            said = f"or truncated: SDFGen's text begins with {said}"
-            raise FileError(f"{path} is no .sdf grid, {said}") from None
+        shape = tuple(map(int, words[:3]))
+        x, y, z, spacing = map(float, words[3:7])
+        values = np.array(words[7:], np.float32).reshape(shape[::-1]).T
         return Volume(*of_array(values), (spacing,) * 3, (x, y, z))
     else:
-        fields = SDF_HEADER.unpack(beginning[: SDF_HEADER.size].ljust(SDF_HEADER.size, b"\0"))
-        start, shape, low, high = SDF_HEADER.size, fields[:3], np.array(fields[3:6]), fields[6:]
+        start, fields = SDF_HEADER.size, SDF_HEADER.unpack(beginning[: SDF_HEADER.size])
+        shape, low, high = fields[:3], np.array(fields[3:6]), fields[6:]
         if min(shape) < 1 or not (high > low).all():
-            said = "it is neither SDFGen's text nor a binary grid"
-            raise FileError(f"{path} is no .sdf grid: {said} (#sdf 1, or sizes, box and values)")
+            raise FileError("it is neither SDFGen's text nor a binary grid")
         place = {"spacing": triple((high - low) / shape), "origin": triple(low)}
-    follow, promised = path.stat().st_size - start, prod(shape) * FLOAT.itemsize
-    if promised != follow:
-        raise FileError(f"{path} is damaged: {promised:,} bytes are promised, {follow:,} follow")
-    return Volume(*of_array(np.memmap(path, FLOAT, "r", start, shape)), **place, is_mapped=True)
+    values = np.memmap(path, FLOAT, "r", start)
+    return Volume(*of_array(values.reshape(shape)), **place, is_mapped=True)

@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 from ...errors import GridError
 from ..formats import check_beside
-from . import Index, Request, Volume
+from . import Request, Volume
 from .axes import Axis, placed
 
 
@@ -37,49 +37,28 @@ def read_tiff(request: Request) -> Volume:
     if request.axes != "zyx" or not {*"xyz"} <= {*names}:  # pages are z, whatever they are called
         names = names[:-3] + request.axes
     request.check_fits(shape, series.dtype)
-    sizes, unit = _pixel_sizes(file)
-    stated = _ome_axes(ome) if ome is not None else _imagej_axes(file, sizes, unit)
+    stated = _imagej_axes(file) if ome is None else _ome_axes(ome)
     axes, order = [stated.get(name, Axis(name)) for name in names], [n for n in names if n in "xyz"]
     place = placed(request, axes, {}, shape, "".join(order))
-    if not stated and ome is None and sizes and unit:
-        place["notes"] += (
-            f"its pixels are {sizes[0]:.6g} x {sizes[1]:.6g} {unit}, but it does not state how far "
-            "its pages are apart: no spacing is taken from it (give --spacing X,Y,Z)",
-        )
-
-    def load(index: Index) -> Any:
-        return series.asarray()[index]
-
-    return Volume(load, shape, series.dtype, **place)
+    return Volume(lambda index: series.asarray()[index], shape, series.dtype, **place)
 
 
-def _pixel_sizes(file: Any) -> tuple[tuple[float, float] | None, str]:
-    """Return the sizes of a pixel by the resolution, None if not stated, and their unit."""
-    tags = {tag.name: tag.value for tag in file.pages[0].tags}
-    units = {2: "inch", 3: "cm", 4: "mm", 5: "µm"}
-    unit = units.get(int(tags.get("ResolutionUnit", 2)), "")  # 2 by the standard
-    stated = (tags.get(name, (0, 1)) for name in ("XResolution", "YResolution"))  # pixels, units
-    x, y = (count / pixels if pixels else 0.0 for pixels, count in stated)
-    return ((x, y) if x > 0 and y > 0 else None), unit
-
-
-def _imagej_axes(file: Any, sizes: tuple[float, float] | None, printed: str) -> dict[str, Axis]:
+def _imagej_axes(file: Any) -> dict[str, Axis]:
     """Return the axes of an ImageJ stack by their names, with its defaults; none if not stated."""
     metadata: dict[str, Any] = file.imagej_metadata or (file.shaped_metadata or ({},))[0]
-    if not sizes or not (file.is_imagej or "spacing" in metadata):
-        return {}
-    if "spacing" not in metadata and "unit" not in metadata and printed:
-        return {}  # x and y may be those of a print
-    unit = str(metadata.get("unit") or printed)
+    tags = {tag.name: tag.value for tag in file.pages[0].tags}
+    resolution = [tags.get(name, (0, 1)) for name in ("XResolution", "YResolution")]
     # ImageJ writes letters beyond ASCII by their numbers
-    units = [str(metadata.get(f"{axis}unit") or unit) for axis in "xyz"]
+    units = [str(metadata.get(f"{a}unit") or metadata.get("unit") or "pixel") for a in "xyz"]
     units = [each.encode("ascii", "backslashreplace").decode("unicode_escape") for each in units]
-    steps = [*sizes, abs(float(metadata.get("spacing") or 1))]
-    is_bare = not any(unit and not unit.startswith("pixel") for unit in units)
-    if is_bare and "spacing" not in metadata and sizes == (1, 1):
+    is_stated = "spacing" in metadata or not units[0].startswith("pixel")
+    if not is_stated or not all(pixels for pixels, _ in resolution):
         return {}
+    steps = [count / pixels for pixels, count in resolution]
+    steps.append(abs(float(metadata.get("spacing") or 1)))
     starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]  # in pixels
     places = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
+    units = units if "unit" in metadata else [""] * 3
     return {each[0]: Axis(*each) for each in zip("xyz", units, steps, places)}
 
 

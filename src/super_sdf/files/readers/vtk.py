@@ -15,8 +15,6 @@ from . import XYZ, Request, Volume, of_array, triple
 
 NAME = "the image"  # in memory, in error messages
 MARKS = ("vtkGhostType", "vtkValidPointMask")
-
-
 READERS = {
     ".vti": ("vtkIOXML", "vtkXMLImageDataReader"),
     ".vtk": ("vtkIOLegacy", "vtkDataSetReader"),
@@ -29,9 +27,10 @@ def read_vtk(request: Request) -> Volume:
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
     from vtkmodules.vtkCommonExecutionModel import vtkStreamingDemandDrivenPipeline
 
-    module, name = READERS[request.path.suffix.lower()]
+    suffix = request.path.suffix.lower()
+    module, name = READERS[suffix]
     reader = getattr(import_module(f"vtkmodules.{module}"), name)()
-    if request.path.suffix.lower() == ".vtk":
+    if suffix == ".vtk":
         reader.ReadAllScalarsOn()
         reader.ReadAllFieldsOn()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
@@ -49,12 +48,11 @@ def read_vtk(request: Request) -> Volume:
     if image is None or "error" in said.GetOutput().lower():
         raise FileError("VTK finds it damaged, or truncated")
     arrays = _arrays(image)
-    promised = sum(array.GetNumberOfValues() for array, _ in arrays.values())
-    text = request.path.read_bytes()
+    text = request.path.read_bytes() if suffix == ".vtk" else b""
     if re.match(rb"# vtk.*\n.*\nASCII\s", text):  # VTK makes up what is missing
-        start = re.search(rb"^(?:POINT|CELL)_DATA ", text, re.M)
-        if len(text[start.start() if start else 0 :].split()) < promised:
-            raise FileError(f"it is truncated: fewer values follow than the {promised:,} promised")
+        start = text.find(b"_DATA ")
+        if len(text[start:].split()) < sum(each.GetNumberOfValues() for each, _ in arrays.values()):
+            raise FileError("it is truncated")
     # what has several numbers a sample, and VTK's own marks, is read only if it is named
     plain = [
         name
@@ -71,17 +69,14 @@ def volume_of_image(image: Any, scalars: str | None) -> Volume:
     if not (hasattr(image, "IsA") and image.IsA("vtkImageData")):
         raise OptionTypeError(f"image is {seen(image)}: give VTK image data")
     arrays = _arrays(image)
-    if not arrays:
-        raise GridError(f"{NAME} holds no array of points or cells")
-    listed = ", ".join(arrays)
     active = [data.GetScalars() for data in (image.GetPointData(), image.GetCellData())]
     named = [str(each.GetName()) for each in active if each]
     ours = named or [name for name, (_, of_points) in arrays.items() if of_points] or list(arrays)
-    if scalars is None and not named and len(ours) > 1:
-        raise GridError(f"{NAME} holds several arrays, {listed}: give scalars={ours[0]!r}, say")
-    name = scalars or ours[0]
+    name = scalars or (ours[0] if named or len(ours) == 1 else None)
     if name not in arrays:
-        raise GridError(f"{NAME} has no array {seen(name)}: it holds {listed}")
+        which = f"no array {seen(name)}" if name else "not one array to choose"
+        listed = ", ".join(arrays) or "none"
+        raise GridError(f"{NAME} has {which}: give scalars=, one of its arrays ({listed})")
     return _volume_of(image, *arrays[name], f"the array {name!r} of {NAME}")
 
 

@@ -12,17 +12,19 @@ import os
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ...errors import FileError, GridError, seen
-from ..formats import check_beside, check_regular_file, parse_json
+from ..formats import check_beside, parse_json
 from . import Request, Volume
 from .axes import Axis, measured, placed, stored
 
-METADATA = (".zarray", ".zgroup", ".zattrs", "zarr.json")
+METADATA = (".zarray", ".zmetadata", "zarr.json")
+CODECS_IN = ("compressor", "filters", "codecs", "index_codecs")  # keys of metadata
 # None of these runs what the store names, and all return numbers.
 CODECS = {
     *("bytes", "endian", "transpose", "sharding_indexed", "crc32c"),
@@ -32,105 +34,82 @@ CODECS = {
 }
 TRANSFORMS = "coordinateTransformations"
 
-Document = dict[str, Any]
-
 
 def read_zarr(request: Request) -> Volume:
     """Read ``FOLDER.zarr``, or ``FOLDER.zarr:/ARRAY`` of a group; of OME-Zarr the finest level."""
-    nodes = _nodes_of(request)
+    import zarr
+
+    path = request.path
+    store: Any = str(path)
+    for name, metadata in _metadata_of(request):
+        for codec in _codecs_in(parse_json(metadata, f"{path}/{name}")):
+            if codec not in CODECS:
+                raise FileError(
+                    f"{path} names the codec {seen(codec)}, which is not among those that are "
+                    f"read ({', '.join(sorted(CODECS))}): store it with one of these"
+                )
+    if not path.is_dir():
+        store = request.files.enter_context(zarr.storage.ZipStore(store, mode="r"))
+    root = zarr.open(store, mode="r")
+    nodes = {"": root, **dict(root.members(None) if isinstance(root, zarr.Group) else ())}
     name = _choose(nodes, request)
-    array, axes = _open(nodes, name, request), _image_axes(nodes, name)
-    attributes, version = dict(array.attrs), nodes[name]["zarr_format"]
+    array, axes = nodes.get(name), _image_axes(nodes, name)
+    if not isinstance(array, zarr.Array):
+        raise FileError(f"{path} is damaged: its metadata names no array at {name!r}")
+    attributes, version = array.attrs.asdict(), array.metadata.zarr_format
     if axes is None:
-        axes = _named_axes(nodes, name, array, request)
+        axes = _named_axes(nodes, name)
     elif {*"xyz"} <= {axis.name for axis in axes} and len(axes) == array.ndim:
         attributes = {}
     else:
-        listed = ", ".join(axis.name for axis in axes)
-        said = f"an array of {array.ndim} axes has the axes {listed}"
-        raise GridError(f"{said}: give an image of z, y, x")
-    place = placed(request, axes, attributes, array.shape)
+        raise GridError(f"its {array.ndim} axes are not named z, y, x by its metadata")
     none = array.fill_value if version == 2 else None  # as xarray takes it
-    numbers = stored(array, attributes, none, array.nchunks_initialized, array.fill_value)
     sizes = {name: getattr(array, name, None) for name in ("chunks", "shards")}
     about = {"zarr format": version, **{name: list(size) for name, size in sizes.items() if size}}
-    return Volume(*numbers, **place, about=about)
+    place = placed(request, axes, attributes, array.shape)
+    return Volume(*stored(array, attributes, none), **place, about=about)
 
 
-def _nodes_of(request: Request) -> dict[str, Document]:
-    """Return the metadata of the arrays and groups of a store, with attributes as in version 3.
-
-    It is read without zarr, and no link may lead out of the store.
-    """
-    path, nodes = request.path, dict[str, Document]()
-    if is_zip := not path.is_dir():
-        archive = request.files.enter_context(zipfile.ZipFile(path))
-        keys = archive.namelist()
-    else:
-        listed = [Path(at, n) for at, inner, names in os.walk(path) for n in (*inner, *names)]
-        keys = [each.relative_to(path).as_posix() for each in listed]
-        for key, each in zip(keys, listed):
-            if each.is_symlink():
-                check_beside(path, key)
-            elif not each.is_dir() and not each.is_file():
-                check_regular_file(each)
-    for key in keys:
-        node, _, name = key.rpartition("/")
-        if name in METADATA:
-            data = archive.read(key) if is_zip else (path / key).read_bytes()
-            content = parse_json(data, f"{path}/{key}")
-            if not isinstance(content, dict):
-                raise FileError(f"{path} is damaged: {key} is no JSON object")
-            content = {"attributes": content} if name == ".zattrs" else content
-            nodes[node] = nodes.get(node, {}) | content
-    return nodes
+def _metadata_of(request: Request) -> Iterator[tuple[str, bytes]]:
+    """Yield the files with metadata in a store, out of which no link may lead."""
+    path = request.path
+    if not path.is_dir():
+        with zipfile.ZipFile(path) as archive:
+            keys = [key for key in archive.namelist() if Path(key).name in METADATA]
+            yield from ((key, archive.read(key)) for key in keys)
+        return
+    for at, inner, names in os.walk(path):
+        for each in (Path(at, name) for name in (*inner, *names)):
+            if each.is_symlink() or not (each.is_dir() or each.is_file()):
+                check_beside(path, each.relative_to(path).as_posix())
+            if each.name in METADATA:
+                yield each.relative_to(path).as_posix(), each.read_bytes()
 
 
-def _images(nodes: dict[str, Document], path: str) -> list[Document]:
+def _codecs_in(metadata: Any) -> Iterator[str]:
+    """Yield the names of all codecs in metadata, those within a codec, too."""
+    for key, value in metadata.items() if isinstance(metadata, dict) else ():
+        inner = value if isinstance(value, list) else [value]
+        for codec in inner if key in CODECS_IN else ():
+            named = codec if isinstance(codec, dict) else {"id": codec}
+            if codec is not None:
+                yield str(named.get("id", named.get("name"))).removeprefix("numcodecs.")
+        for each in inner:
+            yield from _codecs_in(each)
+
+
+def _images(nodes: dict[str, Any], path: str) -> list[dict[str, Any]]:
     """Return the images that the metadata of a group describes, as OME-NGFF has it."""
-    attributes: Document = nodes.get(path, {}).get("attributes") or {}
-    images: list[Document] = attributes.get("ome", attributes).get("multiscales") or []
+    attributes = nodes[path].attrs.asdict() if path in nodes else {}
+    images: list[dict[str, Any]] = attributes.get("ome", attributes).get("multiscales") or []
     return images
 
 
-def _open(nodes: dict[str, Document], path: str, request: Request) -> Any:
-    """Return an array, whose codecs must be in the list."""
-    import zarr
-
-    if "shape" not in nodes.get(path, {}):
-        raise FileError(f"{request.path} is damaged: its metadata names no array at {path!r}")
-    for codec in _codecs_of(nodes[path]):
-        if codec not in CODECS:
-            raise FileError(
-                f"{request.path} names the codec {seen(codec)}, which is not among those that are "
-                f"read ({', '.join(sorted(CODECS))}): store it with one of these"
-            )
-    if request.path.is_dir():
-        return zarr.open_array(str(request.path), path=path, mode="r")
-    store = zarr.storage.ZipStore(str(request.path), mode="r")
-    array = zarr.open_array(store, path=path, mode="r")
-    request.files.callback(store.close)  # only now is there something to close
-    return array
-
-
-def _codecs_of(about: Document) -> Iterator[str]:
-    """Yield the names of the codecs in metadata, those within a codec, too."""
-    for key in ("compressor", "filters", "codecs", "index_codecs"):
-        listed: Any = about.get(key) or ()
-        for codec in listed if isinstance(listed, (list, tuple)) else (listed,):
-            named = codec if isinstance(codec, dict) else {"name": codec}
-            yield str(named.get("id", named.get("name"))).removeprefix("numcodecs.")
-            if isinstance(named.get("configuration"), dict):
-                yield from _codecs_of(named["configuration"])
-
-
-def _choose(nodes: dict[str, Document], request: Request) -> str:
+def _choose(nodes: dict[str, Any], request: Request) -> str:
     """Return the array to read: of an image the finest level, unless another is named."""
-    shapes = {f"/{n}": node["shape"] for n, node in sorted(nodes.items()) if "shape" in node}
-    if "/" in shapes:
-        if request.member is not None:
-            raise FileError(f"{request.path} is one array: give no name of another in it")
-        return ""
+    shapes = {
+        f"/{name}": node.shape for name, node in sorted(nodes.items()) if hasattr(node, "shape")
+    }
     named = (request.member or "").strip("/")
     is_group = bool(named) and any(name.startswith(f"/{named}/") for name in shapes)
     before = f"/{named}/" if is_group else "/"
@@ -142,29 +121,29 @@ def _choose(nodes: dict[str, Document], request: Request) -> str:
     return asked.choose_array(inner, "3D array").strip("/")
 
 
-def _named_axes(nodes: dict[str, Document], name: str, array: Any, request: Request) -> list[Axis]:
+def _named_axes(nodes: dict[str, Any], name: str) -> list[Axis]:
     """Return the axes of an array by the names of its dimensions, and by arrays of these names."""
+    array, axes = nodes[name], []
     said = getattr(array.metadata, "dimension_names", None)
     names = [str(each or "") for each in said or array.attrs.get("_ARRAY_DIMENSIONS") or ()]
-    names = names if len(names) == array.ndim else [""] * array.ndim
-    group, axes = name.rpartition("/")[0], []
-    for axis, count in zip(names, array.shape):
-        path = f"{group}/{axis}".lstrip("/")
-        is_there = bool(name and axis) and nodes.get(path, {}).get("shape") == [count]
-        places = _open(nodes, path, request)[:] if is_there else None
-        axes.append(measured(axis, places, nodes.get(path, {}).get("attributes") or {}))
+    for axis, count in zip(names if len(names) == array.ndim else [""] * array.ndim, array.shape):
+        scale: Any = nodes.get(f"{name.rpartition('/')[0]}/{axis}".lstrip("/")) if axis else None
+        if getattr(scale, "shape", None) == (count,):
+            axes.append(measured(axis, scale[:], scale.attrs))
+        else:
+            axes.append(Axis(axis))
     return axes
 
 
-def _image_axes(nodes: dict[str, Document], name: str) -> list[Axis] | None:
+def _image_axes(nodes: dict[str, Any], name: str) -> list[Axis] | None:
     """Return the axes of an array that is a level of an image of OME, None if it is of none."""
-    parts = name.split("/") if name else []
+    groups = ["", *accumulate(name.split("/")[:-1], "{}/{}".format)]
     levels = (
         (image, level)
-        for depth in range(len(parts))
-        for image in _images(nodes, "/".join(parts[:depth]))
+        for group in groups
+        for image in _images(nodes, group)
         for level in image["datasets"]
-        if str(level["path"]).strip("/") == "/".join(parts[depth:])
+        if f"{group}/{str(level['path']).strip('/')}".strip("/") == name
     )
     if not (found := next(levels, None)):
         return None
@@ -174,14 +153,10 @@ def _image_axes(nodes: dict[str, Document], name: str) -> list[Axis] | None:
     scale, shift = np.ones(len(axes)), np.zeros(len(axes))
     for step in steps:
         kind = str(step.get("type"))
-        numbers = np.asarray(step.get(kind, ()), np.float64)
-        if kind == "scale":
-            scale, shift = scale * numbers, shift * numbers
-        elif kind == "translation":
-            shift = shift + numbers
-        elif kind != "identity":
-            said = f"one of its {TRANSFORMS} has the type {kind!r}"
-            raise GridError(f"{said}: give scale or translation")
+        if kind not in ("scale", "translation", "identity"):
+            raise GridError(f"one of its {TRANSFORMS} is a {kind}: give scale or translation")
+        factor = np.asarray(step.get("scale", 1), np.float64)
+        scale, shift = scale * factor, shift * factor + np.asarray(step.get("translation", 0))
     places = zip(scale.tolist(), shift.tolist()) if steps else [(None, None)] * len(axes)
     return [
         Axis(str(axis.get("name", "")).lower(), str(axis.get("unit") or ""), *place)
