@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import click
+from click import argument, option
 
 from ..errors import check_modules
 from ..options import READ, Options
 from . import main
-from .main import SHARED, option, table_option
+from .main import SHARED, table_option
 
 HELP = """Check the mesh file MESH against the signed distance grid GRID that it was made from.
 
@@ -31,8 +31,8 @@ Examples:
 
 # fmt: off
 TAKES = (
-    click.argument("mesh", metavar="MESH", type=main.FILE),
-    click.argument("grid", metavar="GRID", type=main.FILE),
+    argument("mesh", metavar="MESH", type=main.FILE),
+    argument("grid", metavar="GRID", type=main.FILE),
     option("--out", type=main.FILE, metavar="COLOURED.ply",
         help="Write the mesh with a residual (voxels) and a colour at each vertex. White: touches "
         "the balls; red: pierces them; blue: does not reach them, both fully at 0.1 voxel; olive: "
@@ -80,12 +80,11 @@ def command(mesh: Path, grid: Path, out: Path | None, **given: Any) -> None:
         check.write_coloured(found, out, force=given["force"])
     faults = found.faults() if given["no_faults"] else []
     failed = check.exceeded(found, limits) + [f"the mesh has {fault}" for fault in faults]
-    kept = f"{out} is written" if out else "nothing was written"
     if given["as_json"]:
         said = {"mesh": str(mesh), "grid": str(grid), **found.report(), "limits_exceeded": failed}
-        main.print_stdout(said, kept)
+        main.print_stdout(said)
     elif not given["quiet"]:
-        main.print_stdout("\n".join(found.lines()), kept)
+        main.print_stdout("\n".join(found.lines()))
     main.print_stderr(*(f"Note: {note}" for note in found.grid.notes if not given["quiet"]))
     main.print_stderr(*(f"Limit exceeded: {sentence}" for sentence in failed))
     if failed:
