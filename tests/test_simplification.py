@@ -12,7 +12,13 @@ from hypothesis import strategies as st
 from solids import cube, joined, sphere, square, torus
 
 from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh
-from super_sdf.errors import NoSurfaceError, OptionError, OptionTypeError, OutOfMemoryError
+from super_sdf.errors import (
+    MeshError,
+    NoSurfaceError,
+    OptionError,
+    OptionTypeError,
+    OutOfMemoryError,
+)
 from super_sdf.network.network import load_network
 from super_sdf.simplify import collapsing
 from super_sdf.simplify.measuring import Original
@@ -212,6 +218,9 @@ def test_wrong_arguments_are_said(message):
     assert str(error.value) == message
     with pytest.raises(OptionTypeError):
         simplify_mesh("cube", error=1)
+    torn = Mesh(np.where(cube().vertices > 0, np.nan, 1.0), cube().faces)
+    with pytest.raises(MeshError, match=r"^the mesh has vertices that are not finite: repair it"):
+        simplify_mesh(torn, error=1)
 
 
 def test_the_command_simplifies_and_says_how_far_off(here, command):

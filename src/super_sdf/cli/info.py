@@ -18,8 +18,7 @@ from .main import SHARED, table_option
 HELP = """Show versions, devices, networks, and extras with the command that installs those missing.
 
 With --check, each network also refines a ball on the CPU and on CUDA. With GRID, show instead what
-that grid file states: shape, type, spacing, origin, and how it is stored; of an OpenVDB file, all
-its grids.
+that grid file states: shape, type, spacing and origin.
 
 \b
 Examples:
@@ -61,19 +60,17 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
 
 
 def in_words(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield facts as lines: a line each, and one for each note and each grid of an OpenVDB file."""
+    """Yield facts as lines: a line each, and one for each note."""
     for key, value in facts.items():
         values = value if isinstance(value, (list, tuple)) else [value]
-        if key in ("notes", "grids"):
-            yield from (f"{key[:-1]}: {in_word(each)}" for each in values)
+        if key == "notes":
+            yield from (f"note: {note}" for note in values)
         elif values:
             yield f"{key.replace('_', ' ')}: {', '.join(map(in_word, values))}"
 
 
 def in_word(value: Any) -> str:
     """Return a value of a fact as text."""
-    if isinstance(value, dict):
-        return ", ".join(f"{key} {in_word(each)}" for key, each in value.items())
     if isinstance(value, float):
         return f"{value:.10g}"
     return "not stated" if value is None else f"{value:,}" if isinstance(value, int) else str(value)

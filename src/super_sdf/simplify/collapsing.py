@@ -1,11 +1,11 @@
-"""Passes of collapsing edges with pyfqmr: where the result is wrong, they are made anew.
+"""Stages of collapsing edges with pyfqmr: where a result is wrong, its stage is made anew.
 
 pyfqmr is fast quadric mesh simplification (Forstmann): an edge is collapsed if the sum of squared
 distances of the new vertex to the planes of the triangles it replaces is under a threshold, which
 rises in every round. It neither bounds the distance of triangles nor keeps every mesh a manifold
-without intersections. So the result of the last pass is examined. Where it is too far from what it
-was made of, not a manifold, or meets itself, the triangles around the place are kept in the first
-pass that got it wrong, and this pass and those after it are made anew.
+without intersections. So the result of each stage is examined. Where it is too far from the
+original, not a manifold, or meets itself, the stage is made anew with the triangles around the
+place kept.
 
 What is simplified are the walls between labels, each once, so that every label stays closed, and
 neighbours stay neighbours; a mesh is the wall round one label.
@@ -16,27 +16,27 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ..arrays import BoolArray, face_normals
+from ..arrays import BoolArray, face_normals, length
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid, smallest_angles
-from .measuring import Original, mean_side
+from .measuring import Original
 from .walls import Walls, irregular_places, meshes_of
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])  # a triangle apart from all others
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
-# of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
-# the error, those of the second do at some places, and leave a fifth fewer triangles.
-PLANE_DISTANCES = (1.0,), (1.4, 1.4, 1.4), (1.7, 1.7)
+# of the sum of squares), step by step. The first stage leaves hardly any triangle beyond the error,
+# the second does at some places, and leaves a fifth fewer triangles.
+PLANE_DISTANCES = (1.0, 1.3, 1.3, 1.3), (1.7, 1.7)
 ROUNDS = 30, 3.0  # of the threshold, and its rise; from more rounds, meshes get no smaller
 FEW_ROUNDS, LARGE = (8, 5.0), 1 << 12  # nearly as well, from this many triangles on
 FEW_SLIVERS = 0.002  # of the triangles, which stay
 THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
-MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
+MOST_REPEATS, HALVINGS = 16, 3  # of a stage, before smaller distances are tried
 # A number of triangles is sought by the error that leaves as many.
 MOST_ERRORS = 12  # that are tried
 FIRST_ERROR = 0.006  # in sides of a triangle, over the share of the triangles that is wanted
@@ -44,93 +44,116 @@ STRIDE, CLOSE = 4.0, 1.02  # largest ratio of an error to the next, and smallest
 FARTHEST = 0.05  # error over the diagonal: larger ones leave no fewer
 MARGIN = 1.03  # over the triangles that are left: near enough
 
-Pass = Sequence[dict[str, float]]
-"""What ``collapse_edges`` is told, step by step."""
+
+class Unsimplified:
+    """Walls to simplify, and what each of their labels is measured against."""
+
+    def __init__(self, walls: Walls, count_round: Callable[[], None] = lambda: None) -> None:
+        self.walls, self.count_round = walls, count_round
+        self.originals = [Original(mesh) for mesh in meshes_of(walls)]
+        self.irregular = irregular_places(walls)
 
 
-class Unsimplified(NamedTuple):
-    """What is simplified, what each of its labels is measured against, and what counts rounds."""
-
-    walls: Walls
-    originals: list[Original]
-    count_round: Callable[[], None] = lambda: None
-
-
-def collapsed(of: Unsimplified, passes: Sequence[Pass], error: float) -> Walls | None:
-    """Return what the last pass makes once nothing is wrong with it, None if that fails.
-
-    Right are walls of which each label is within the error of its original, with no place that is
-    less of a manifold than it was, without triangles that intersect, with all components and
-    their holes.
-    """
-    is_original = of.originals[0].mesh.faces is of.walls.faces
-    stages, solids = [of.walls], [of.originals[0].solid if is_original else Solid(of.walls)]
-    kept: list[BoolArray] = []  # triangles of each stage but the last
-    places, since = np.zeros((0, 3)), np.zeros(0, np.intp)  # to keep, and from which pass on
-    first, before = 0, irregular_places(of.walls)  # pass that is to be made anew
-    for _ in range(MOST_REPEATS):
-        of.count_round()
-        del stages[first + 1 :], solids[first + 1 :], kept[first:]
-        for number, steps in enumerate(passes[first:], first):
-            result, held = stages[number], np.zeros(len(stages[number].vertices), bool)
-            held[result.faces[solids[number].nearest(places[since <= number])[1]]] = True
-            held[result.faces[held[result.faces].any(1)]] = True
-            kept.append(np.asarray(held[result.faces].all(1)))
-            for step in steps:
-                result, held = collapse_edges(result, held, **step)
-            if number == len(passes) - 1 and error < np.inf:
-                result = turn_edges(result, held, LOW * error)
-            if not len(result.faces):
-                return None
-            stages.append(result)
-            solids.append(Solid(result))
-        wrong, lost, is_same = examine(of, result, solids[-1], before, error)
-        if not len(wrong) and is_same:
+def within(of: Unsimplified, error: float) -> Walls | None:
+    """Return walls within a distance of the originals; None if no triangle can be spared."""
+    for halving in range(HALVINGS):
+        unit, result = error / 2**halving, of.walls
+        for shares in PLANE_DISTANCES:
+            steps = [{"distance": unit * share} for share in shares]
+            result = collapsed(of, result, steps, error) or result
+        if len(result.faces) < len(of.walls.faces):
             return result
-        if not len(wrong) and not len(lost):
-            return None
-        places, since = np.concatenate([places, lost]), np.append(since, np.zeros(len(lost), int))
-        first = len(passes) if len(wrong) else 0
-        while len(wrong) and first:  # back to the first pass that got it wrong
-            first -= 1
-            distance, face, _ = solids[first].nearest(wrong)
-            earlier = kept[first][face] | ((distance > error) & (first > 0))
-            places = np.concatenate([places, wrong[~earlier]])
-            since = np.append(since, np.full(np.count_nonzero(~earlier), first))
-            wrong = wrong[earlier]
-        if len(wrong):  # although it is kept in all
-            return None
     return None
 
 
-def examine(
-    of: Unsimplified, result: Walls, solid: Solid, before: Points, error: float
-) -> tuple[Points, Points, bool]:
-    """Return where a result is wrong; if nowhere, also lost components, and if the topology stays.
+def down_to(of: Unsimplified, triangles: int) -> Walls:
+    """Return walls of at most ``triangles`` triangles, or the fewest that are found.
 
-    ``before`` are the irregular places of what it was made of, (n, 6), ``solid`` is its own.
+    The error is sought that leaves hardly fewer. Each error that is tried is a whole
+    simplification, so that the mesh is as good as that of the error.
     """
-    labels, count = [solid], len(of.originals)
-    if count > 1:
-        labels = [Solid(mesh) for mesh in meshes_of(result, count)]
-    none, pairs = np.zeros((0, 3)), list(zip(of.originals, labels))
-    if not all(len(label.mesh.faces) for label in labels):
-        return none, none, False
-    wrong = [faults_made(result, of.walls, before, solid)]
-    if error < np.inf:
-        wrong += [original.compare(label, error)[0] for original, label in pairs]
+    most, reached, least = len(of.walls.faces), None, of.walls
+    farthest = FARTHEST * float(np.linalg.norm(np.ptp(of.walls.vertices, axis=0)))
+    error = min(FIRST_ERROR * of.originals[0].side * most / triangles, farthest)
+    low, high = 0.0, farthest  # errors that leave too many triangles, and few enough
+    for _ in range(MOST_ERRORS * (most > triangles)):
+        result = within(of, error) or of.walls
+        left = len(result.faces)
+        least = min(least, result, key=lambda one: len(one.faces))
+        if left <= triangles:
+            reached, high = result, error
+        elif left < most or not low:
+            low = error
+        else:  # an error so large that nothing is found within it
+            high = error
+        if triangles < MARGIN * left <= MARGIN * triangles or high < CLOSE * low:
+            break
+        # what is left falls about as the error rises
+        error *= float(np.clip(left / triangles, 1 / STRIDE, STRIDE))
+        if not CLOSE * low < error < high / CLOSE:
+            error = (low * high) ** 0.5 if low else high / STRIDE
+    if reached or most <= triangles:
+        return reached or of.walls
+    steps = [{"triangles": float(triangles)}] * 5  # whatever the distance
+    exact = collapsed(of, least, steps, np.inf)
+    return exact if exact and len(exact.faces) <= triangles else least
+
+
+def collapsed(
+    of: Unsimplified, start: Walls, steps: Sequence[dict[str, float]], error: float
+) -> Walls | None:
+    """Return what steps of ``collapse_edges`` make of walls once nothing is wrong with it.
+
+    None if that fails.
+    """
+    alone = start is of.walls and len(of.originals) == 1
+    solid, places = of.originals[0].solid if alone else Solid(start), np.zeros((0, 3))
+    for _ in range(MOST_REPEATS):
+        of.count_round()
+        result, held = start, np.zeros(len(start.vertices), bool)
+        held[start.faces[solid.nearest_face(places)]] = True
+        held[start.faces[held[start.faces].any(1)]] = True
+        kept = np.asarray(held[start.faces].all(1))
+        for step in steps:
+            result, held = collapse_edges(result, held, **step)
+        if error < np.inf:
+            result = turn_edges(result, held, LOW * error)
+        wrong = examine(of, result, error)
+        if wrong is None or not len(wrong):
+            return result if wrong is not None else None
+        if kept[solid.nearest_face(wrong)].all():
+            return None
+        places = np.concatenate([places, wrong])
+    return None
+
+
+def examine(of: Unsimplified, result: Walls, error: float) -> Points | None:
+    """Return where a result is wrong, (n, 3); None if its topology is, but no place is known.
+
+    Right are walls of which each label is within the error of its original, with no place that is
+    less of a manifold than it was, without new triangles that intersect, with all components and
+    their holes.
+    """
+    labels = [Solid(mesh) for mesh in meshes_of(result)]
+    if len(labels) < len(of.originals) or not all(len(label.mesh.faces) for label in labels):
+        return None
+    wrong = [faults_made(of, result, labels[0] if len(labels) == 1 else Solid(result))]
+    for original, label in zip(of.originals, labels) if error < np.inf else ():
+        wrong.append(original.compare(label, error)[0])
     if len(far := np.concatenate(wrong)):
-        return far, none, False
-    others = [(one, label.mesh) for one, label in pairs if not same_topology(one.mesh, label.mesh)]
-    return far, np.concatenate([none, *(lost_places(*pair) for pair in others)]), not others
+        return far
+    pairs = [(one, label.mesh) for one, label in zip(of.originals, labels)]
+    others = [pair for pair in pairs if not same_topology(pair[0].mesh, pair[1])]
+    lost = np.concatenate([far, *(lost_places(*pair) for pair in others)])
+    return lost if len(lost) or not others else None
 
 
-def faults_made(result: Walls, walls: Walls, before: Points, solid: Solid) -> Points:
+def faults_made(of: Unsimplified, result: Walls, solid: Solid) -> Points:
     """Return where walls are less of a manifold than those they were made of, or meet themselves.
 
-    ``before`` are the irregular places of the latter, ``solid`` is that of the former.
+    ``solid`` is that of the result.
     """
-    found = irregular_places(result)
+    before, found = of.irregular, irregular_places(result)
     made = found[~np.isin(row_keys(found), row_keys(before))]
     lost = before[~np.isin(row_keys(before), row_keys(found))]
     lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
@@ -139,7 +162,7 @@ def faults_made(result: Walls, walls: Walls, before: Points, solid: Solid) -> Po
     if not len(pairs):
         return wrong
     corners = result.vertices[result.faces[pairs]].astype(np.float64)  # (k, 2, 3, 3)
-    old = row_keys(walls.vertices[walls.faces].reshape(-1, 9).astype(np.float64))
+    old = row_keys(of.walls.vertices[of.walls.faces].reshape(-1, 9).astype(np.float64))
     is_old = np.isin(row_keys(corners.reshape(-1, 9)), old).reshape(-1, 2).all(1)
     corners = corners[~is_old].reshape(-1, 3, 3)
     return np.concatenate([wrong, corners.reshape(-1, 3), corners.mean(1)])
@@ -163,60 +186,9 @@ def lost_places(original: Original, mesh: Mesh) -> Points:
     """Return the vertices of those components of a mesh of which nothing is left."""
     component = original.mesh.components()[1][original.mesh.faces[:, 0]]
     roots = np.unique(mesh.components()[1][mesh.faces[:, 0]])
-    found = component[original.solid.nearest(mesh.vertices[roots].astype(np.float64))[1]]
+    found = component[original.solid.nearest_face(mesh.vertices[roots].astype(np.float64))]
     missing = np.unique(original.mesh.faces[~np.isin(component, found)])
     return original.mesh.vertices[missing].astype(np.float64)
-
-
-def within(of: Unsimplified, error: float) -> Walls | None:
-    """Return walls within a distance of the originals; None if no triangle can be spared."""
-    for halving in range(HALVINGS):
-        unit = error / 2**halving
-        passes = [[{"distance": unit * share} for share in steps] for steps in PLANE_DISTANCES]
-        for some in (passes, passes[:1]):
-            result = collapsed(of, some, error)
-            if result and len(result.faces) < len(of.walls.faces):
-                return result
-    return None
-
-
-def down_to(of: Unsimplified, triangles: int) -> Walls:
-    """Return walls of at most ``triangles`` triangles, or the fewest that are found.
-
-    The error is sought that leaves hardly fewer. Each error that is tried is a whole
-    simplification, so that the mesh is as good as that of the error.
-    """
-    walls = of.walls
-    if len(walls.faces) <= triangles:
-        return walls
-    farthest = FARTHEST * float(np.linalg.norm(np.ptp(walls.vertices, axis=0)))
-    error = min(FIRST_ERROR * of.originals[0].side * len(walls.faces) / triangles, farthest)
-    low, more, high, fewer = 0.0, len(walls.faces), np.inf, 0  # errors and what they leave
-    reached, least = None, walls
-    for _ in range(MOST_ERRORS):
-        result = within(of, error) or walls
-        left = len(result.faces)
-        if left <= triangles:
-            reached, high, fewer = result, error, left
-        elif left < len(walls.faces) or not low:
-            low, more, least = error, left, min(least, result, key=lambda one: len(one.faces))
-        else:  # an error so large that nothing is found within it
-            farthest = error
-        if triangles < MARGIN * left <= MARGIN * triangles or min(high, farthest) < CLOSE * low:
-            break
-        # what is left falls about as a power of the error
-        if reached and low:
-            share = np.log(more / triangles) / np.log(more / fewer)
-            error = float(low * (high / low) ** np.clip(share, 0.15, 0.85))
-        elif reached:
-            error = high * max(fewer / triangles, 1 / STRIDE)
-        else:
-            error = min(low * min(more / triangles, STRIDE), (low * farthest) ** 0.5)
-    if reached:
-        return reached
-    steps = [{"triangles": float(triangles)}] * 5  # whatever the distance
-    exact = collapsed(of._replace(walls=least), [steps], np.inf)
-    return exact if exact and len(exact.faces) <= triangles else least
 
 
 def collapse_edges(
@@ -238,7 +210,8 @@ def collapse_edges(
     pair, pins = walls.sides @ np.array([1 << 16, 1]), np.flatnonzero(held)
     order = np.argsort(pair, kind="stable")
     last = np.flatnonzero(np.diff(pair[order], append=-1))
-    unit = distance or mean_side(walls)  # the length that pyfqmr's thresholds have
+    first_sides = np.diff(walls.vertices.astype(np.float64)[walls.faces[:, :2]], axis=1)
+    unit = distance or float(length(first_sides).mean())  # which pyfqmr's thresholds are in
     middle = walls.vertices.mean(0, dtype=np.float64)
     scaled = (walls.vertices - middle) / unit
     tips = scaled[np.tile(pins, 2)] + np.repeat(ALONE[1:], len(pins), axis=0)
@@ -283,29 +256,27 @@ def turn_edges(walls: Walls, held: BoolArray, distance: float) -> Walls:
         thin = np.flatnonzero((smallest_angles(corners) < THIN) & ~kept)
         if len(thin) <= FEW_SLIVERS * len(faces):
             break
-        sides = np.linalg.norm(corners[thin] - np.roll(corners[thin], -1, axis=1), axis=2)
+        sides = length(corners[thin] - np.roll(corners[thin], -1, axis=1))
         normals, flat = face_normals(points, faces), faces.ravel()
-        is_low = np.linalg.norm(normals[thin], axis=1) < distance * sides.max(1, initial=0)
-        if not is_low.any():
-            break
+        is_low = length(normals[thin]) < distance * sides.max(1)
         half, opposite = (3 * thin + sides.argmax(1))[is_low], Mesh(points, faces).pair_edges()[0]
         half = half[(opposite[half] >= 0) & ~kept[opposite[half] // 3]]
         one, other = half // 3, opposite[half] // 3
         a, b, c = (flat[3 * one + (half + turn) % 3] for turn in range(3))
         d = flat[3 * other + (opposite[half] + 2) % 3]
-        new = np.stack([c, a, d, d, b, c], axis=1).reshape(-1, 2, 3)
-        better = smallest_angles(points[new.reshape(-1, 3)]).reshape(-1, 2).min(1) > THIN
-        after = face_normals(points, new.reshape(-1, 3)).reshape(-1, 2, 3)
-        lengths = np.linalg.norm(after, axis=2) * np.linalg.norm(normals[other], axis=1)[:, None]
-        steady = (np.einsum("nij,nj->ni", after, normals[other]) > STEADY * lengths).all(1)
-        edges = flat.astype(np.int64) * count + np.roll(faces, -1, axis=1).ravel()
-        free = ~np.isin(c * np.int64(count) + d, edges) & ~np.isin(d * np.int64(count) + c, edges)
+        new = np.stack([c, a, d, d, b, c], axis=1).reshape(-1, 3)
+        better = smallest_angles(points[new]).reshape(-1, 2).min(1) > THIN
+        after, before = face_normals(points, new), normals[other].repeat(2, 0)
+        steady = (after * before).sum(1) > STEADY * length(after) * length(before)
+        edges = np.sort(np.stack([flat, np.roll(faces, -1, axis=1).ravel()]).astype(np.int64), 0)
+        diagonal = np.sort(np.stack([c, d]).astype(np.int64), 0)
+        free = ~np.isin(diagonal[0] * count + diagonal[1], edges[0] * count + edges[1])
         taken: set[int] = set()
-        for row in np.flatnonzero(better & steady & free):
-            quad = {int(corner) for corner in new[row].ravel()}
-            if not quad & taken:
-                taken |= quad
-                faces[[one[row], other[row]]] = new[row]
+        for row in np.flatnonzero(better & steady.reshape(-1, 2).all(1) & free):
+            quad = new[2 * row : 2 * row + 2]
+            if taken.isdisjoint(quad.ravel().tolist()):
+                taken |= set(quad.ravel().tolist())
+                faces[[one[row], other[row]]] = quad
         if not taken:
             break
     return replace(walls, faces=faces)

@@ -10,7 +10,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from ..errors import check_modules
+import numpy as np
+
+from ..errors import MeshError, check_modules
 from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import check_bound, give_back
@@ -22,10 +24,7 @@ if TYPE_CHECKING:
 # with the libraries that it loads.
 BYTES_PER_TRIANGLE = 1300
 NONE_SPARED = "the mesh was not simplified: none of its triangles can be spared within the error"
-UNREACHED = (
-    "{:,} triangles cannot be reached while the mesh stays a manifold of the same topology: it has "
-    "{:,}"
-)
+UNREACHED = "{:,} triangles cannot be reached while the mesh stays a manifold of the same topology"
 LEFT = 0.85  # share of the work that is left after a round: a guess
 
 
@@ -67,7 +66,7 @@ def simplify_mesh(
         Largest distance, in world units, between the two surfaces, measured both ways at the
         vertices and at points less than an edge of ``mesh`` apart.
     triangles : int, optional
-        Largest number of triangles. If it cannot be reached, a warning says how many are left.
+        Largest number of triangles. If it cannot be reached, a warning says so.
     max_memory : int, optional
         Bytes that the process may hold in all; by default a share of the free memory.
     progress : callable, optional
@@ -80,11 +79,13 @@ def simplify_mesh(
 
     Raises
     ------
-    OptionError, FileError, OutOfMemoryError
-        If not exactly one of ``error`` and ``triangles`` is given, or it is not positive; if the
-        extra ``simplify`` is not installed; if it would not fit in memory.
+    SuperSdfError
+        If not exactly one of ``error`` and ``triangles`` is given, a vertex is not finite, the
+        extra ``simplify`` is not installed, or it would not fit in memory.
     """
     check_mesh(mesh)
+    if not np.isfinite(mesh.vertices).all():
+        raise MeshError("the mesh has vertices that are not finite: repair it first")
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
@@ -93,12 +94,12 @@ def simplify_mesh(
     check_bound(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", most, way_out)
     from ..truth.solid import Solid
     from .collapsing import Unsimplified, down_to, within  # need the extra
-    from .measuring import Deviation, Original
+    from .measuring import Deviation
     from .walls import Walls
 
     if not count:
         return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
-    original, left = Original(mesh), 1.0
+    left = 1.0
 
     def count_round() -> None:  # how many there will be is not known
         nonlocal left
@@ -106,17 +107,16 @@ def simplify_mesh(
             progress(1 - left)
         left *= LEFT
 
-    of, warnings = Unsimplified(Walls.of(mesh), [original], count_round), tuple[str, ...]()
+    of, warnings = Unsimplified(Walls.of(mesh), count_round), tuple[str, ...]()
     if triangles is None:
         found = within(of, error or 0.0)
-        if not found:
-            warnings = (NONE_SPARED,)
+        warnings = () if found else (NONE_SPARED,)
     else:
-        error, found = float("inf"), down_to(of, triangles)
-        if len(found.faces) > triangles:
-            warnings = (UNREACHED.format(triangles, len(found.faces)),)
+        found = down_to(of, triangles)
+        if (few := len(found.faces)) > triangles:
+            warnings = (f"{UNREACHED.format(triangles)}: it has {few:,}",)
     result = Mesh(found.vertices, found.faces) if found else mesh
-    deviation = original.compare(Solid(result), error or 0.0)[1]
+    deviation = of.originals[0].compare(Solid(result), error or np.inf)[1]
     if progress:
         progress(1.0)
     return Simplified(result, count, deviation, warnings)

@@ -43,8 +43,9 @@ class Apart(NamedTuple):
     ends: list[int]  # ... and its triangles
 
 
-def labels_apart(walls: Walls, count: int) -> Apart:
-    """Return the triangles of the labels 1 to ``count``, apart from each other."""
+def labels_apart(walls: Walls) -> Apart:
+    """Return the triangles of the labels from 1 on, apart from each other."""
+    count = int(walls.sides.max(initial=1))
     both, label = np.concatenate([walls.faces, walls.faces[:, ::-1]]), walls.sides.T.ravel()
     order = np.argsort(label, kind="stable")
     ends = np.searchsorted(label[order], np.arange(1, count + 2)).tolist()
@@ -63,9 +64,9 @@ def labels_apart(walls: Walls, count: int) -> Apart:
     return Apart(Mesh(walls.vertices[point], faces), point, first, [end - ends[0] for end in ends])
 
 
-def meshes_of(walls: Walls, count: int) -> list[Mesh]:
-    """Return the closed meshes of labels 1 to ``count``."""
-    mesh, _, first, ends = labels_apart(walls, count)
+def meshes_of(walls: Walls) -> list[Mesh]:
+    """Return the closed meshes of the labels from 1 on."""
+    mesh, _, first, ends = labels_apart(walls)
     return [
         Mesh(mesh.vertices[low:high], mesh.faces[start:stop] - np.int32(low))
         for (low, high), (start, stop) in zip(pairwise(first), pairwise(ends))
@@ -80,7 +81,7 @@ def irregular_places(walls: Walls) -> NDArray[np.float64]:
     triangles meet, or that are at the position of another one, or at which two triangles have the
     same three corners.
     """
-    apart = labels_apart(walls, int(walls.sides.max(initial=1)))
+    apart = labels_apart(walls)
     ends = _irregular(walls, apart, apart.mesh.pair_edges()[0])
     return walls.vertices.astype(np.float64)[ends].reshape(-1, 6)
 
@@ -103,7 +104,7 @@ def faults(walls: Walls, spacing: float) -> Rows:
     These are ``irregular_places``, and the corners of triangles that intersect near an edge with an
     angle near 0. ``spacing`` is that of the lattice.
     """
-    apart = labels_apart(walls, int(walls.sides.max()))
+    apart = labels_apart(walls)
     faces, opposite = apart.mesh.faces, apart.mesh.pair_edges()[0]
     normals = unit(face_normals(apart.mesh.vertices.astype(np.float64), faces))
     sharp = np.flatnonzero(dot(normals.repeat(3, 0), normals[opposite // 3]) < SHARP)
