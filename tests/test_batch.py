@@ -259,8 +259,8 @@ def test_odd_files_names_and_folders_fail_alone(batch, monkeypatch):
     monkeypatch.setattr(os, "scandir", refuse)
     code, facts, err = batch("in", "in/list.jsonl")
     assert code == 1 and (facts["done"], facts["failed"]) == (1, 7), err
-    assert f"Failed: {Path('in/deep')} cannot be read: permission denied" in err
-    assert "Failed: in/pipe.npy is a named pipe: give a file\n" in err
+    assert f"Failed: {Path('in/deep')} cannot be read: Permission denied" in err
+    assert "Failed: in/pipe.npy is no regular file: give a file\n" in err
     assert "Failed: in/loop.npz cannot be read: " in err
     assert "Failed: in/bad\\n\\udcff.npy: every value is 1" in err
     assert f"{Path('out', 'm' + long)}.ply cannot be written: File name too long\n" in err

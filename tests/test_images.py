@@ -12,7 +12,7 @@ from conftest import refusal, trilinear
 from vtkmodules.vtkCommonDataModel import vtkImageData
 
 from super_sdf import grid_from_image, read_grid, reconstruct
-from super_sdf.errors import GridError, OptionError, OptionTypeError
+from super_sdf.errors import FileError, GridError, OptionError, OptionTypeError
 
 ROOT = Path(__file__).parent.parent
 SIZES = 20, 22, 24
@@ -94,9 +94,9 @@ def test_other_mistakes_are_one_line():
     image.point_data["vectors"] = np.zeros((image.n_points, 3))
     for kind, call, said in (
         (OptionTypeError, lambda: grid_from_image([1]), "image is [1]: give VTK image data"),
-        (GridError, lambda: grid_from_image(vtkImageData()), "the image holds no array of points "),
-        (GridError, lambda: contour(scalars="b"), "the image has no array 'b': it holds distance"),
-        (GridError, lambda: contour(scalars="vectors"), "the array 'vectors' of the image has 3 "),
+        (FileError, lambda: grid_from_image(vtkImageData()), "the image holds no array of points "),
+        (FileError, lambda: contour(scalars="b"), "the image has no array of points or cells 'b'"),
+        (GridError, lambda: contour(scalars="vectors"), "its array 'vectors' has 3 "),
         (OptionError, lambda: contour(3), "factor is 3: "),
         (GridError, thin.contour, "values have shape (20, 22, 1): give at least 2 samples on each"),
     ):

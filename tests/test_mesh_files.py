@@ -14,7 +14,7 @@ from solids import cube, sphere
 
 from super_sdf import Mesh, reconstruct, write_mesh
 from super_sdf.convert import convert
-from super_sdf.errors import FileError, GridError, MeshError, OptionError, SuperSdfError
+from super_sdf.errors import FileError, MeshError, OptionError, SuperSdfError
 from super_sdf.files import meshes
 from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
 from super_sdf.options import Options
@@ -32,10 +32,8 @@ def mesh():
 
 def test_a_failed_write_leaves_what_was_there(mesh, monkeypatch):
     Path("out.ply").write_text("before")
-    with pytest.raises(GridError):
-        write_mesh(mesh, "out.ply", force=True, before_rename=Mock(side_effect=GridError("no")))
     full = OSError(28, "No space left on device")
-    monkeypatch.setattr(meshes, "_write_ply", Mock(side_effect=full))
+    monkeypatch.setitem(meshes.WRITERS, ".ply", Mock(side_effect=full))
     said = refusal(FileError, write_mesh, mesh, "out.ply", force=True)
     assert said == "out.ply cannot be written: No space left on device"
     said = refusal(FileError, write_mesh, mesh, "out.ply")
@@ -47,14 +45,11 @@ def test_a_failed_write_leaves_what_was_there(mesh, monkeypatch):
 
 def test_of_several_files_all_appear_or_none(mesh):
     files = {Path("a.ply"): {"": mesh}, Path("b.ply"): {"": mesh}}
-
-    def take_a_name(complete):
-        assert sorted(complete) == [Path("a.ply"), Path("b.ply")]
-        Path("b.ply").write_text("theirs")
-
-    said = refusal(FileError, write_meshes, files, before_rename=take_a_name)
-    assert said == "b.ply exists: remove it or use force=True"
-    assert os.listdir() == ["b.ply"] and Path("b.ply").read_text() == "theirs"
+    Path("b.off").write_text("theirs")
+    for more, beside in ({Path("b.off"): {"": mesh}}, ()), ({}, [Path("b.off")]):
+        said = refusal(FileError, write_meshes, {**files, **more}, beside=beside)
+        assert said == "b.off exists: remove it or use force=True"
+        assert os.listdir() == ["b.off"] and Path("b.off").read_text() == "theirs"
     write_meshes(files, force=True)
     assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
 
@@ -107,7 +102,10 @@ def test_a_format_holds_the_mesh_or_refuses_it(name, suffix):
     run, target = ("in.npz", f"out{suffix}", trilinear, OPTIONS), Path(f"out{suffix}")
     if name in REFUSED.get(suffix, ()):
         said = refusal(FileError, convert, *run)
-        assert said.startswith(f"{target} cannot be written: {suffix} has single precision")
+        assert said == (
+            "the format has single precision, in which vertices of the mesh coincide: write .ply "
+            "or .obj"
+        )
         assert os.listdir() == ["in.npz"]
     else:
         done, back = convert(*run), read(target)
@@ -116,19 +114,12 @@ def test_a_format_holds_the_mesh_or_refuses_it(name, suffix):
         assert len(back.faces) == done.facts["triangles"]
 
 
-def test_a_mesh_that_its_format_would_flatten_is_refused(mesh):
-    far = Mesh(mesh.vertices.astype(np.float64) * 1e-3 + 1e5, mesh.faces)
-    assert refusal(FileError, write_mesh, far, "out.stl") == (
-        "out.stl cannot be written: .stl has single precision, in which vertices of this mesh "
-        "coincide; write .ply or .obj"
-    )
-    write_mesh(far, "out.glb")
-    assert len(read("out.glb").vertices) == len(mesh.vertices)
+def test_vertices_that_are_not_finite_are_refused(mesh):
     bad = Mesh(np.where(mesh.vertices > 5, np.nan, mesh.vertices), mesh.faces)
     for suffix in MESH_SUFFIXES:
         said = refusal(FileError, write_mesh, bad, f"bad{suffix}")
         assert said.endswith("a vertex of the mesh is not finite")
-    assert os.listdir() == ["out.glb"]
+    assert os.listdir() == []
 
 
 NO_MESHES = {  # columns of the vertices, and the face
@@ -210,9 +201,7 @@ def test_damaged_files_are_read_or_named_in_a_line(capfd, kind):
 
 def off(vertices: np.ndarray, faces: np.ndarray) -> bytes:
     """Return a mesh as OFF."""
-    rows = [" ".join(map(str, row)) for row in vertices.tolist()]
-    rows += ["3 " + " ".join(map(str, row)) for row in faces.tolist()]
-    return "\n".join(["OFF", f"{len(vertices)} {len(faces)} 0", *rows, ""]).encode()
+    return trimesh.Trimesh(vertices, faces, process=False).export(file_type="off").encode()
 
 
 def changed_cube(coordinate: float) -> np.ndarray:
@@ -229,7 +218,6 @@ WRONG = {
     "huge.off": (off(changed_cube(1e31), FACES), "reaches to 1e+31: scale it to coordinates"),
     "none.off": (off(BOX, np.zeros((0, 3), int)), "holds no triangle: give a surface mesh"),
     "far.off": (off(BOX, FACES + 3), "cannot be read as a mesh: OFF file has a face"),
-    "short.off": (off(BOX, FACES)[:-20], "is truncated: it states 12 faces and holds "),
     "flat.off": (off(BOX * [1, 1, 0], FACES), "is flat: it encloses no volume"),
     "cloud.ply": (POINTS, "holds no triangle"),
     "text.ply": (b"no mesh", "cannot be read as a mesh: "),

@@ -136,8 +136,8 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
     above = ("../out.raw", "below/../../out.raw", "link.raw", "up/out.raw")
     for data, said in {
         **dict.fromkeys((str(tmp_path / "out.raw"), *above), APART),
-        "pipe.raw": "pipe.raw is a named pipe: give a file",
-        "zero.raw": "zero.raw is a device: give a file",
+        "pipe.raw": "pipe.raw is no regular file: give a file",
+        "zero.raw": APART,
         "none.raw": "none.raw does not exist",
         "below": "below is a folder: give a file",
     }.items():
@@ -157,23 +157,10 @@ def test_a_nrrd_file_names_its_data_once_and_beside_it(entry, tmp_path):
     assert said_of("a.nhdr").endswith(APART)
 
 
-def test_lists_and_patterns_of_metaimage_are_what_itk_reads():
-    for number, plane in enumerate(np.ascontiguousarray(VALUES.T)):
-        write(f"p{number + 3:03d}.raw", plane.tobytes())
-    names = "".join(f"p{number + 3:03d}.raw\n" for number in range(17))
-    for name, text in {
-        "list.mhd": f"ElementDataFile = LIST\n{names}",
-        "pattern.mhd": "ElementDataFile = p%03d.raw 3 19 1\n",
-    }.items():
-        write(name, MHA, text)
-        assert np.array_equal(sitk.GetArrayFromImage(sitk.ReadImage(name)).T, VALUES)
-        assert np.array_equal(read_grid(name).values, VALUES)
-    write("list.mhd", MHA, "ElementDataFile = LIST\n", names.replace("p004", "../p004"))
-    assert "names the file '../p004.raw', which is not in its folder" in said_of("list.mhd")
-    write("list.mhd", MHA, "ElementDataFile = LIST\n", names[:50])
-    assert said_of("list.mhd").startswith("list.mhd")
-    write("pattern.mhd", MHA, "ElementDataFile = p%099999d.raw 3 19 1\n")
-    assert "its data file is 'p%099999d.raw 3 19 1': give " in said_of("pattern.mhd")
+@pytest.mark.parametrize("entry", ["LIST\np003.raw\n", "p%03d.raw 3 19 1\n"])
+def test_metaimages_of_several_data_files_are_refused(entry):
+    write("list.mhd", MHA, f"ElementDataFile = {entry}")
+    assert "names no single file: save it as one .mha" in said_of("list.mhd")
 
 
 def test_numbers_of_hdf5_in_other_files_are_refused():
@@ -214,7 +201,7 @@ def test_files_of_an_ome_set_are_read_beside_the_file(tmp_path):
         assert said_of("a.ome.tif").endswith(f"names the file {name!r}, {APART}")
     os.mkfifo("pipe.tif")
     ome_set("pipe.tif")
-    assert said_of("a.ome.tif").endswith("pipe.tif is a named pipe: give a file")
+    assert said_of("a.ome.tif").endswith("pipe.tif is no regular file: give a file")
 
 
 # What is no regular file
@@ -222,16 +209,13 @@ def test_files_of_an_ome_set_are_read_beside_the_file(tmp_path):
 
 WHAT_IS_WRONG = {
     "folder.npy": "is a folder: give a file",
-    "pipe.npy": "is a named pipe: give a file",
-    "socket.npy": "is a socket: give a file",
-    "zero.npy": "is a device: give a file",
+    **dict.fromkeys(("pipe.npy", "socket.npy", "zero.npy"), "is no regular file: give a file"),
     "loop.npy": "cannot be read: Too many levels of symbolic links",
     "dangling.npy": "does not exist",
     "missing.npy": "does not exist",
-    "file/in.npy": "does not exist: the path before its last / is not a folder",
+    "file.npy/in.npy": "does not exist",
     "n" * 300 + ".npy": "cannot be read: File name too long",
-    "a\0.npy": "is not a valid file name",
-    "a\ud800.npy": "is not a valid file name",
+    "a\0.npy": "cannot be read: embedded null byte",
 }
 
 
@@ -243,20 +227,13 @@ def test_what_is_no_regular_file_is_named_as_grid_and_as_mesh(name):
         server.bind("socket.npy")
     for link, end in {"zero": "/dev/zero", "loop": "loop.npy", "dangling": "nothing.npy"}.items():
         Path(f"{link}.npy").symlink_to(end)
-    write("file")
-    shown = name if name.isprintable() else repr(name)
-    assert refusal(FileError, read_grid, name) == f"{shown} {WHAT_IS_WRONG[name]}"
-    if name in ("folder.npy", "pipe.npy", "zero.npy", "loop.npy", "dangling.npy"):
-        Path("a.ply").symlink_to(name)
-        assert refusal(FileError, read_mesh, "a.ply") == f"a.ply {WHAT_IS_WRONG[name]}"
-
-
-def test_links_to_files_are_read_unless_they_may_not_be(monkeypatch):
     np.save("file", VALUES)
     Path("link.npy").symlink_to("file.npy")
     assert np.array_equal(read_grid("link.npy", spacing=0.5).values, VALUES)
-    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may read everything
-    assert said_of("link.npy") == "link.npy cannot be read: permission denied"
+    assert refusal(FileError, read_grid, name) == f"{name} {WHAT_IS_WRONG[name]}"
+    if name in ("folder.npy", "pipe.npy", "zero.npy", "loop.npy", "dangling.npy"):
+        Path("a.ply").symlink_to(name)
+        assert refusal(FileError, read_mesh, "a.ply") == f"a.ply {WHAT_IS_WRONG[name]}"
 
 
 def test_a_mesh_that_names_a_pipe_is_read_without_it():

@@ -179,4 +179,4 @@ def test_one_of_several_grids_is_named(command):
     said = refusal(FileError, read_grid, path)
     assert said.endswith(f"holds several arrays, density, surface: give {path}:density, say")
     code, out, _ = command("info", f"{path}:surface")
-    assert code == 0 and out.splitlines()[-2:] == ["class: level set", "active voxels: 619"]
+    assert code == 0 and "shape: 15, 15, 15" in out

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from .files.formats import files_of
 from .files.grids import read_grid
-from .files.meshes import check_target, write_mesh
-from .files.output import check_apart, check_free
+from .files.meshes import World, check_target, write_meshes
+from .files.output import check_apart
 from .grid.sdf_grid import SdfGrid, describe_place, mean_spacing, volume_of_samples
 from .pipeline import Result, mesh_grid
 from .threads import TOTAL, Progress, Stopwatch, part_of
@@ -62,18 +62,17 @@ def convert(
 
     SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
     """
-    watch, files = Stopwatch(), files_of(source)
+    watch, files, saved = Stopwatch(), files_of(source), dict[str, Any]()
     check_target(target, force=force, unit=options.unit)
     check_apart(target, files)
-    with _saving(save_field, files, force=force) as file:
+    with _saving(save_field, files, force=force) as write:
         grid = read_grid(source, **options.reading())
         if options.keep_volume:
             from .labels.volumes import check_has_volume  # imported here, as few need it
 
             check_has_volume(grid, options.offset, cap=options.cap)
-        if file:
-            file.check_fits(grid.shape, options.factor_for(mask=grid.field.sides_only))
-            how["save_field"] = file.write
+        if write:
+            how["save_field"] = lambda field: saved.update(write(field))
         watch.lap("read")
         if progress:
             progress(round(READ * TOTAL), TOTAL)
@@ -82,18 +81,13 @@ def convert(
         watch.take(made.seconds)
         mesh, simplified, off = _reworked(made.mesh, grid, options, part_of(progress, MESHED, 1))
         watch.lap("simplify" if simplified else "isosurface")
-
-        def both_appear(part: Path) -> None:
-            if file:
-                check_free(file.path, force=force)
-
-        stated: Any = {"unit": options.unit, "space": grid.space}
-        write_mesh(mesh, target, force=force, before_rename=both_appear, **stated)
+        world, beside = World(options.unit, grid.space), [Path(save_field)] if save_field else []
+        write_meshes({Path(target): {"": mesh}}, force=force, world=world, beside=beside)
         watch.lap("write")
     facts = _facts(grid, mesh, made, options, simplified)
     facts["inferred"] += off
-    if file:
-        facts["saved_field"] = file.report
+    if saved:
+        facts["saved_field"] = saved
     return Conversion(grid, mesh, facts, watch.seconds)
 
 

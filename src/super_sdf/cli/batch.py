@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..errors import SuperSdfError, WriteError, check_modules
-from ..files.formats import NAMED, list_formats
+from ..files.formats import LISTED, NAMED
 from ..options import MESH_FORMATS, OPTIONS, WORK
 from . import main
 from .main import SHARED, option, table_option
@@ -28,7 +28,7 @@ Each IN is a grid file, a folder (searched with its subfolders), a pattern such 
 list of inputs: .txt with one path per line, or .jsonl with one object per line such as
 {{"in": "a.npy", "out": "a.ply", "spacing": 0.5}}. Paths are relative to the list.
 
-Grid files are {list_formats()}. FILE:NAME names one of several arrays in a {NAMED} file.
+Grid files are {LISTED}. FILE:NAME names one of several arrays in a {NAMED} file.
 
 A file that fails is reported and does not stop the others. Run the command again to resume
 after an interruption, or with more inputs or other options: only what is missing is done.

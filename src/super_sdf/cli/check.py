@@ -26,25 +26,17 @@ upsample takes. The exit code is 1 if a limit is exceeded.
 \b
 Examples:
   super-sdf check part.ply part.npz
-  super-sdf check part.ply part.npz --out coloured.ply --max-mean 0.01 --no-faults
+  super-sdf check part.ply part.npz --max-mean 0.01 --no-faults
 """
 
 # fmt: off
 TAKES = (
     click.argument("mesh", metavar="MESH", type=main.FILE),
     click.argument("grid", metavar="GRID", type=main.FILE),
-    option("--out", type=main.FILE, metavar="COLOURED.ply",
-        help="Write the mesh with a residual (voxels) and a colour at each vertex. White: touches "
-        "the balls; red: pierces them; blue: does not reach them, both fully at 0.1 voxel; olive: "
-        "no sample is near."),
-    option("--max-residual", type=float, metavar="VOXELS",
-        help="Fail if the largest residual of a sample is above this."),
-    option("--tolerance", type=float, metavar="D",
-        help="The same in world units: fail if the largest residual is above D."),
-    option("--max-mean", type=float, metavar="VOXELS",
+    option("--tolerance", type=click.FloatRange(0), metavar="D",
+        help="Fail if the largest residual of a sample is above D, in world units."),
+    option("--max-mean", type=click.FloatRange(0), metavar="VOXELS",
         help="Fail if the mean residual is above this."),
-    option("--max-share", type=float, metavar="SHARE",
-        help="Fail if more than this share of the samples, from 0 to 1, is off by over 0.1 voxel."),
     option("--no-faults", is_flag=True,
         help="Fail if the mesh is open, not manifold, not oriented outward, intersects itself, has "
         "samples on the wrong side, or vertices where the grid has no surface."),
@@ -55,37 +47,28 @@ TAKES = (
     table_option("unit", "The unit of the mesh: of a .glb, and for volumes in ml."),
     table_option("max_memory", "Memory limit of the process, such as 1500M or 4G. Default: 60 % of "
         "the free memory. Larger meshes are refused."),
-    *(SHARED[name] for name in ("force", "json", "quiet")),
+    *(SHARED[name] for name in ("json", "quiet")),
 )
 # fmt: on
 
 
 @main.make_command("Check a mesh against the grid that it was made from.", HELP, *TAKES)
-def command(mesh: Path, grid: Path, out: Path | None, **given: Any) -> None:
+def command(mesh: Path, grid: Path, **given: Any) -> None:
     """Check the mesh, print the certificate, and fail where it exceeds a limit."""
     check_modules("check", "report", ("igl",))
-    from .. import check
-    from ..files.formats import files_of
-    from ..files.output import check_apart
+    from ..check import check_mesh, read_for_check
 
-    limits = {name: given[name] for name in check.LIMITS}
-    check.check_limits(limits)
-    if out:
-        check.check_coloured(out, force=given["force"])
-        check_apart(out, [mesh, *files_of(grid)])
     options = Options(**{name: given[name] for name in (*READ, "offset", "max_memory", "unit")})
-    both, crossing = check.read_for_check(mesh, grid, options), not given["skip_intersections"]
-    found = check.check_mesh(*both, options, intersections=crossing)
-    if out:
-        check.write_coloured(found, out, force=given["force"])
+    both, crossing = read_for_check(mesh, grid, options), not given["skip_intersections"]
+    found = check_mesh(*both, options, intersections=crossing)
     faults = found.faults() if given["no_faults"] else []
-    failed = check.exceeded(found, limits) + [f"the mesh has {fault}" for fault in faults]
-    kept = f"{out} is written" if out else "nothing was written"
+    failed = found.exceeded(given["tolerance"], given["max_mean"])
+    failed += [f"the mesh has {fault}" for fault in faults]
     if given["as_json"]:
         said = {"mesh": str(mesh), "grid": str(grid), **found.report(), "limits_exceeded": failed}
-        main.print_stdout(said, kept)
+        main.print_stdout(said, "nothing was written")
     elif not given["quiet"]:
-        main.print_stdout("\n".join(found.lines()), kept)
+        main.print_stdout("\n".join(found.lines()), "nothing was written")
     main.print_stderr(*(f"Note: {note}" for note in found.grid.notes if not given["quiet"]))
     main.print_stderr(*(f"Limit exceeded: {sentence}" for sentence in failed))
     if failed:

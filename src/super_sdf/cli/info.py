@@ -17,9 +17,9 @@ from .main import SHARED, option, table_option
 
 HELP = """Show versions, devices and the shipped networks.
 
-With GRID, show instead what that grid file states: shape, type, spacing, origin, and how it is
-stored. With --check, test the installation: each network refines
-a ball on the CPU and on CUDA, and what is missing is listed with the command that installs it.
+With GRID, show instead what that grid file states: shape, type, spacing and origin. With
+--check, test the installation: each network refines a ball on the CPU and on CUDA, and what is
+missing is listed with the command that installs it.
 
 \b
 Examples:

@@ -27,15 +27,15 @@ Examples:
 TAKES = (
     click.argument("source", metavar="MESH", type=main.FILE),
     click.argument("target", metavar="OUT", type=main.FILE),
-    option("-n", "samples", type=int, help="Samples along the longest axis."),
-    option("--spacing", type=float, metavar="H",
+    option("-n", "samples", type=click.IntRange(2), help="Samples along the longest axis."),
+    option("--spacing", type=click.FloatRange(0, min_open=True), metavar="H",
         help="World distance between samples, instead of -n."),
-    option("--padding", type=float, metavar="VOXELS",
+    option("--padding", type=click.FloatRange(0), metavar="VOXELS",
         help="Voxels between the bounding box of the mesh and the last samples. Default: 2.37."),
     option("--frame", type=click.Choice(["world", "unit"]), default="world", show_default=True,
         help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and "
         "centres it in a unit cube, sampled at n^3 voxel centres."),
-    option("--band", type=float, metavar="VOXELS",
+    option("--band", type=click.FloatRange(1.5), metavar="VOXELS",
         help="Exact distances up to this many voxels from the surface, clamped beyond. Default: "
         "exact everywhere up to 256^3 samples, within 4 voxels in larger grids."),
     option("--allow-open", is_flag=True, help="Accept a mesh with holes; its inside is a guess."),
@@ -51,7 +51,7 @@ def command(source: Path, target: Path, **given: Any) -> None:
     check_modules("sample", "eval")
     from ..files.grids import check_grid_target, write_grid
     from ..files.output import check_apart
-    from ..truth.sampling import PADDING, check_numbers, fitted_layout, sample_solid, unit_layout
+    from ..truth.sampling import PADDING, fitted_layout, sample_solid, unit_layout
     from ..truth.solid import Solid, load_solid, normalise
 
     start, in_unit = time.perf_counter(), given["frame"] == "unit"
@@ -63,7 +63,6 @@ def command(source: Path, target: Path, **given: Any) -> None:
     if (count is None) == (spacing is None):
         raise OptionError("give either -n (samples along the longest axis) or --spacing")
     padding = given["padding"] if given["padding"] is not None else PADDING * (not in_unit)
-    check_numbers(count, spacing, padding, given["band"])
     solid, notes = load_solid(source, allow_open=given["allow_open"])
     if in_unit:
         solid, layout = Solid(normalise(solid.mesh)), unit_layout(count)

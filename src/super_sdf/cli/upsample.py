@@ -9,7 +9,7 @@ import click
 
 from .. import __version__
 from ..errors import SuperSdfError
-from ..files.formats import NAMED, list_formats
+from ..files.formats import LISTED, NAMED
 from ..options import MESH_FORMATS, OPTIONS, Options
 from ..threads import Stopwatch
 from . import main
@@ -17,7 +17,7 @@ from .main import SHARED, option, table_option
 
 HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
 
-IN is a grid file: {list_formats()}. FILE:NAME names one of several arrays in a {NAMED}
+IN is a grid file: {LISTED}. FILE:NAME names one of several arrays in a {NAMED}
 file. An .npz file has the keys values, spacing, origin and direction.
 
 OUT is a mesh file: {", ".join(f".{name}" for name in MESH_FORMATS[:-1])} or .{MESH_FORMATS[-1]}.

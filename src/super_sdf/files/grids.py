@@ -23,14 +23,13 @@ from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import OPTIONS, AxisOrder, Options, Space, Values, check_path
 from ..threads import held_memory, memory_bound
-from .formats import check_grid_file, find_format, split_member
+from .formats import DICOM, check_regular_file, find_format, is_store, split_member
 from .output import check_free, replacing
 from .readers import Names, Request, Volume, axes_direction, find_placement
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-ROOM_SHARE = 0.25  # of the memory that is left: a larger .npy stays mapped in any order of axes
 NAMING = ("nrrd", "dicom")  # formats of which a file may name its labels
 
 
@@ -45,7 +44,7 @@ def read_grid(
     max_memory: int | None = None,
     **values: Unpack[Values],
 ) -> SdfGrid:
-    """Read a grid from a file of any format in ``formats.FORMATS``: see docs/guides/formats.md.
+    """Read a grid from a file of any format in docs/guides/formats.md.
 
     An ``.npy`` file is mapped into memory, other files are loaded.
 
@@ -69,12 +68,9 @@ def read_grid(
 
     Raises
     ------
-    FileError, OutOfMemoryError
-        If the file cannot be read, as its library is missing, say; if there is no room for it.
-    GridError
-        If its values are no usable grid, or its axes are not at right angles.
-    OptionError
-        If an option is unknown, or the file states what is given (axes, direction), or no space.
+    FileError, OutOfMemoryError, GridError, OptionError
+        If the file cannot be read, as its library is missing, say; if there is no room for it; if
+        its values are no usable grid; if an option is wrong, or the file states what is given.
     """
     Options(space=space, **values)  # checks them
     given = {"spacing": spacing, "origin": origin, "direction": direction}
@@ -122,7 +118,8 @@ def open_volume(
     meanwhile is dropped. ``left`` is how many bytes of memory it may take, None if unknown.
     """
     format_, (file, named) = find_format(path), split_member(path)
-    check_grid_file(path)
+    if format_ is not DICOM and not is_store(file):
+        check_regular_file(file)
     if format_.extra:
         check_modules(f"{format_.name} ({format_.suffixes[0]})", format_.extra)
     member, brackets = re.fullmatch(r"(.*?)((?:\[\d+\])*)", named or "", re.S).groups()  # type: ignore[union-attr]
@@ -163,15 +160,13 @@ def memory_left(max_memory: int | None = None) -> int | None:
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
     """Return values (nx, ny, nz), place and hint of a volume, for ``make_grid``."""
     check_kind(volume.dtype, volume.shape)
-    placement = find_placement(volume, given)
-    place = {**placement.place, "hint": volume.hint}
-    size = prod(volume.shape) * volume.dtype.itemsize
-    is_large = request.left is not None and size > ROOM_SHARE * request.left
-    is_ordered = placement.order == (0, 1, 2) and all(step.step > 0 for step in placement.steps)
-    if volume.is_mapped and (is_ordered or is_large):
-        return {"values": placement.ordered(volume.read()), **place}
+    order, steps, place = find_placement(volume, given)
+    place["hint"] = volume.hint
+    is_ordered = order == (0, 1, 2) and all(step.step > 0 for step in steps)
+    if volume.is_mapped and is_ordered:
+        return {"values": volume.read(), **place}
     request.check_fits(volume.shape, volume.dtype)
-    values = placement.ordered(volume.read())
+    values = volume.read()[steps].transpose(order)
     return {"values": np.ascontiguousarray(values, values.dtype.newbyteorder("=")), **place}
 
 
@@ -197,43 +192,43 @@ def grid_from_image(
 
     Raises
     ------
-    GridError, OptionError
-        If there is no such array, or several and none is named; if it is no usable grid; if
-        ``image`` is no image data.
+    FileError, GridError, OptionError
+        If there is no such array, or no usable grid; if ``image`` is no image data.
     """
     Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image
 
-    volume = volume_of_image(image, scalars)
-    request = Request(Path(NAME), None, (), "zyx", ExitStack(), memory_left(max_memory))
+    request = Request(Path(NAME), scalars, (), "zyx", ExitStack(), memory_left(max_memory))
+    volume = volume_of_image(image, request)
     return make_grid(**_taken(volume, request, {}), **values)
 
 
 def describe_grid_file(path: str | Path) -> dict[str, Any]:
-    """Return format, shape (x, y, z), type, place and storage of the array in a grid file.
+    """Return format, shape (x, y, z), type and place of the array in a grid file.
 
     No sample is read where the format allows it. What the file does not state is None or missing.
-    Chunks and shards are in the order of the array's own axes. Raises as ``read_grid``.
+    Raises as ``read_grid``.
     """
     path = check_path(path, "path")
     with open_volume(path) as (volume, _):
         order, _, place = find_placement(volume, {})
     shape = [volume.shape[axis] for axis in order]
-    facts: dict[str, Any] = {
+    facts = {
+        k: at if at is None else np.ravel(at).astype(float).tolist() for k, at in place.items()
+    }
+    if facts["direction"] in (None, np.eye(3).ravel().tolist()):
+        del facts["direction"]
+    return {
         "file": str(path),
         "format": find_format(path).name,
         "shape": shape,
         "dtype": str(volume.dtype),
         "bytes": prod(shape) * volume.dtype.itemsize,
         "axes in the file": "".join("xyz"[order.index(axis)] for axis in range(3)),
-        **{k: at if at is None else np.ravel(at).astype(float).tolist() for k, at in place.items()},
+        **facts,
         **({"space": volume.space} if volume.space else {}),
-        **volume.about,
         "notes": list(volume.notes),
     }
-    if facts["direction"] in (None, np.eye(3).ravel().tolist()):
-        del facts["direction"]
-    return facts
 
 
 def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
@@ -246,9 +241,8 @@ def check_grid_target(path: str | Path, *, force: bool = False) -> Path:
 
 def write_grid(grid: SdfGrid, path: str | Path, *, force: bool = False) -> None:
     """Write a grid as ``.npz``: values, spacing, origin and, if it is turned, direction."""
-    path = check_grid_target(path, force=force)
     arrays: dict[str, Any] = {"spacing": grid.spacing, "origin": grid.origin}
     if not grid.is_straight:
         arrays["direction"] = grid.direction
-    with replacing(path, force=force) as part, part.open("wb") as file:
+    with replacing(Path(path), force=force) as part, part.open("wb") as file:
         np.savez(file, values=grid.values, **arrays)

@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import html
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, TypeAlias
 from zipfile import ZIP_DEFLATED, ZipFile
@@ -22,7 +22,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, Triple, cross
+from ..arrays import BoolArray, FloatArray, cross
 from ..arrays import unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
@@ -30,14 +30,13 @@ from ..surface.mesh import Mesh, check_mesh
 from .output import check_free, replacing
 
 MESH_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
-SINGLE = (".stl", ".glb")  # have float32 coordinates, those of .glb relative to a point
 SCENES = (".glb", ".3mf")  # have parts with names and colours, and a unit
 STL_CHUNK = 1 << 18  # triangles at a time
 STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+PLY_TYPES = {"<f4": "float", "<f8": "double"}
 PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
-PLY_HEADER_BYTES = 320  # padded, so that arrays of numbers can be mapped
 TEXT_CHUNK = 1 << 14  # rows of text at a time: Python numbers take ten times the memory
-GLB_MOST_BYTES = 2**32 - 1  # the length in the header has 32 bits
+GLB_MOST_BYTES = 2**32 - 2**22  # the length in the header has 32 bits; there are headers, too
 
 Colour: TypeAlias = tuple[int, int, int]
 """Red, green and blue, from 0 to 255."""
@@ -52,7 +51,6 @@ class World:
     unit: str | None = None
     space: str | None = None  # anatomical: RAS or LPS
     colours: Mapping[str, Colour] = field(default_factory=dict)  # of some parts, by name
-    origin: Triple = (0.0, 0.0, 0.0)  # of the coordinates in the file
 
     @property
     def note(self) -> str:
@@ -87,7 +85,6 @@ def write_mesh(
     force: bool = False,
     unit: Unit | None = None,
     space: str | None = None,
-    before_rename: Callable[[Path], None] | None = None,
 ) -> None:
     """Write a mesh to a file, in the format of its suffix.
 
@@ -108,27 +105,18 @@ def write_mesh(
     space : str, optional
         The anatomical space of the coordinates, "RAS" or "LPS", such as that of the grid. A .ply,
         .stl or .obj names it in its header, where 3D Slicer looks for it.
-    before_rename : callable, optional
-        Called with the temporary path of the complete file, just before it gets its name. If it
-        raises an error, no file is written.
 
     Raises
     ------
-    OptionError
-        If the suffix is unknown, or that of a format that states no unit.
-    MeshError
-        If the arrays are no mesh: a face names a vertex that there is not, say.
-    FileError
-        If the file exists and ``force`` is not set, or cannot be written; or if the format cannot
-        hold the mesh: a coordinate is not finite, or corners of a triangle would coincide.
+    OptionError, MeshError, FileError
+        If the suffix is unknown, or that of a format that states no unit; if the arrays are no
+        mesh; if the file cannot be written, or its format cannot hold the mesh: a coordinate is not
+        finite, or corners of a triangle would coincide.
     """
-    check_mesh(mesh)
     path = check_path(path, "path")
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     check_target(path, force=force, unit=world.unit)
-
-    then = (lambda complete: before_rename(complete[path])) if before_rename else None
-    write_meshes({path: {"": mesh}}, force=force, world=world, before_rename=then)
+    write_meshes({path: {"": mesh}}, force=force, world=world)
 
 
 def write_meshes(
@@ -136,110 +124,63 @@ def write_meshes(
     *,
     force: bool = False,
     world: World | None = None,
-    before_rename: Callable[[Mapping[Path, Path]], None] | None = None,
+    beside: Iterable[Path] = (),
 ) -> None:
     """Write files of meshes, by path and name: all of them, or none.
 
-    ``before_rename`` is called with all complete files, by the paths that they will have. A format
-    of one mesh takes the only one of its file.
+    A format of one mesh takes the only one of its file. None is written if a file ``beside`` them,
+    which is to appear next, cannot be.
     """
-    complete, world = dict[Path, Path](), world or World()
     with ExitStack() as stack:
         for path, parts in files.items():
-            suffix, meshes, origin = path.suffix.lower(), list(parts.values()), world.origin
-            for mesh in meshes:
+            for mesh in parts.values():
                 check_mesh(mesh)
-            boxes = [(m.vertices.min(0), m.vertices.max(0)) for m in meshes if len(m.vertices)]
-            if suffix == ".glb" and boxes and meshes[0].vertices.dtype != np.float32:
-                x, y, z = np.min(boxes, axis=(0, 1)) / 2 + np.max(boxes, axis=(0, 1)) / 2
-                origin = float(x), float(y), float(z)
-            for mesh in meshes:
-                _check_holds(path, mesh, origin)
-            complete[path] = stack.enter_context(replacing(path, force=force))
-            with complete[path].open("wb") as file:
-                WRITERS[suffix](file, parts, replace(world, origin=origin))
-        if before_rename:
-            before_rename(complete)
-        for path in files:
+                if not np.isfinite(mesh.vertices).all():
+                    raise FileError(f"{path} cannot be written: a vertex of the mesh is not finite")
+            part = stack.enter_context(replacing(path, force=force))
+            with part.open("wb") as file:
+                WRITERS[path.suffix.lower()](file, parts, world or World())
+        for path in (*files, *beside):
             check_free(path, force=force)  # before the first of them appears
 
 
-def _check_holds(path: Path, mesh: Mesh, origin: Triple) -> None:
-    """Raise FileError if a format cannot hold the vertices of a mesh."""
-    vertices, faces = mesh.vertices, mesh.faces
-    if not np.isfinite(vertices).all():
-        raise FileError(f"{path} cannot be written: a vertex of the mesh is not finite")
-    if path.suffix.lower() not in SINGLE or vertices.dtype == np.float32:
-        return
+def _as_single(mesh: Mesh, origin: Any = 0.0) -> FloatArray:
+    """Return vertices, relative to an origin, as float32; FileError if it cannot hold the mesh."""
 
-    def flat(points: NDArray[Any]) -> BoolArray:  # triangles with two corners at one place
-        a, b, c = (points[faces[:, corner]] for corner in range(3))
-        same: BoolArray = (a == b).all(1) | (b == c).all(1) | (c == a).all(1)
-        return same
+    def is_flat(points: NDArray[Any]) -> BoolArray:  # triangles with two corners at one place
+        corners = points[mesh.faces]
+        return np.asarray((corners == np.roll(corners, 1, axis=1)).all(2).any(1))
 
+    if mesh.vertices.dtype == np.float32 and not np.any(origin):
+        return np.asarray(mesh.vertices)
     with np.errstate(over="ignore"):
-        rounded = (vertices - origin).astype(np.float32)
-    if not np.isfinite(rounded).all() or (flat(rounded) & ~flat(vertices)).any():
-        said = f"{path} cannot be written: {path.suffix} has single precision, in which vertices"
-        raise FileError(f"{said} of this mesh coincide; write .ply or .obj")
+        rounded = (mesh.vertices - origin).astype(np.float32)
+    if not np.isfinite(rounded).all() or (is_flat(rounded) & ~is_flat(mesh.vertices)).any():
+        said = "the format has single precision, in which vertices of the mesh coincide"
+        raise FileError(f"{said}: write .ply or .obj")
+    return np.asarray(rounded)
 
 
 def write_ply(file: IO[bytes], parts: Parts, world: World) -> None:
     """Write binary little-endian PLY."""
     (mesh,) = parts.values()
-    kind = "double" if mesh.vertices.dtype == np.float64 else "float"
-    properties = [f"{kind} {axis}" for axis in "xyz"]
-    _write_ply(file, mesh.vertices, mesh.faces, properties, world.note, PLY_HEADER_BYTES)
-
-
-def write_coloured_ply(
-    mesh: Mesh,
-    residuals: FloatArray,
-    colours: NDArray[np.uint8],
-    path: Path,
-    *,
-    force: bool = False,
-) -> None:
-    """Write binary PLY whose vertices also have ``residuals`` (n,) and ``colours`` (n, 3).
-
-    Positions are double; ``force`` replaces a file that exists.
-    """
-    kind = [("position", "<f8", 3), ("residual", "<f4"), ("colour", "u1", 3)]
-    rows = np.empty(len(residuals), kind)
-    rows["position"], rows["residual"], rows["colour"] = mesh.vertices, residuals, colours
-    properties = [*(f"double {axis}" for axis in "xyz"), "float residual"]
-    properties += [f"uchar {colour}" for colour in ("red", "green", "blue")]
-    note = "residual: distance of samples to the mesh minus their value, in voxels"
-    with replacing(path, force=force) as part, part.open("wb") as file:
-        _write_ply(file, rows, mesh.faces, properties, note)
-
-
-def _write_ply(
-    file: IO[bytes],
-    vertices: NDArray[Any],
-    faces: NDArray[Any],
-    properties: list[str],
-    note: str,
-    header_bytes: int = 0,
-) -> None:
-    """Write rows of vertices, triangles, and before them a header whose comment is padded."""
-    first = "ply\nformat binary_little_endian 1.0\ncomment made by super-sdf"
-    first += f"\ncomment {note}" * bool(note)
-    of_vertices = "".join(f"property {each}\n" for each in properties)
-    rest = f"\nelement vertex {len(vertices)}\n{of_vertices}element face {len(faces)}\n"
-    rest += "property list uchar int vertex_indices\nend_header\n"
-    file.write((first.ljust(header_bytes - len(rest)) + rest).encode("ascii"))
-    little = vertices.astype(vertices.dtype.newbyteorder("<"), copy=False)
-    file.write(np.ascontiguousarray(little).data)
-    rows = np.empty(len(faces), PLY_FACE)
-    rows["count"], rows["corners"] = 3, faces
+    kind, faces = mesh.vertices.dtype.newbyteorder("<"), mesh.faces
+    rows = np.ascontiguousarray(mesh.vertices.astype(kind, copy=False))
+    triangles = np.empty(len(faces), PLY_FACE)
+    triangles["count"], triangles["corners"] = 3, faces
+    header = ["ply", "format binary_little_endian 1.0", "comment made by super-sdf"]
+    header += [f"comment {world.note}"] * bool(world.note) + [f"element vertex {len(rows)}"]
+    header += [f"property {PLY_TYPES[kind.str]} {axis}" for axis in "xyz"]
+    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header"]
+    file.write("\n".join([*header, ""]).encode("ascii"))
     file.write(rows.data)
+    file.write(triangles.data)
 
 
 def write_stl(file: IO[bytes], parts: Parts, world: World) -> None:
     """Write binary STL: each triangle stores its normal and the positions of its corners."""
     (mesh,) = parts.values()
-    vertices, least = mesh.vertices.astype(np.float32, copy=False), np.finfo(np.float64).tiny
+    vertices, least = _as_single(mesh), np.finfo(np.float64).tiny
     file.write(f"made by super-sdf {world.note}".ljust(80).encode("ascii"))
     file.write(struct.pack("<I", len(mesh.faces)))
     for first in range(0, len(mesh.faces), STL_CHUNK):
@@ -280,32 +221,33 @@ def _lines(line: str, rows: NDArray[Any], first: int = 0) -> Iterator[bytes]:
 def write_glb(file: IO[bytes], parts: Parts, world: World) -> None:
     """Write binary glTF, a node for each part.
 
-    Vertices are float32, relative to ``world.origin``; the nodes move them there, and scale them
-    from the unit to metres, those of glTF. FileError if a mesh has no triangle, which glTF does not
-    allow, or the file exceeds 4.29 GB.
+    Vertices are float32, of float64 meshes relative to the middle of their box; the nodes move them
+    there, and scale them from the unit to metres, those of glTF.
     """
     import trimesh
 
     library: Any = trimesh  # parts of it have no types
-    visual = library.visual
-    metres = LENGTHS[world.unit or "m"]
+    meshes, metres, middle = list(parts.values()), LENGTHS[world.unit or "m"], np.zeros(3)
+    if not all(len(mesh.faces) for mesh in meshes):
+        raise FileError("a mesh without triangles cannot be .glb: give .ply")
+    if sum(12 * (len(mesh.vertices) + len(mesh.faces)) for mesh in meshes) > GLB_MOST_BYTES:
+        raise FileError("the mesh has more than the 4.29 GB that .glb holds: give .ply")
+    if meshes[0].vertices.dtype != np.float32:
+        ends = np.array([(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in meshes])
+        middle = ends[:, 0].min(0) / 2 + ends[:, 1].max(0) / 2
     place = np.diag([metres, metres, metres, 1.0])
-    place[:3, 3] = metres * np.array(world.origin)
-    total = sum(12 * (len(mesh.vertices) + len(mesh.faces)) for mesh in parts.values())
-    if total > 0.999 * GLB_MOST_BYTES:  # there is a header, too
-        raise FileError(f"the mesh takes {total:,} bytes, .glb holds 4,294,967,295: give .ply")
+    place[:3, 3] = metres * middle
     scene = library.Scene()
     for name, mesh in parts.items():
-        if not len(mesh.faces):
-            raise FileError("a mesh without triangles cannot be .glb: give .ply")
         shown = None
         if colour := world.colours.get(name):
             rgb = np.array(colour) / 255  # of sRGB; a factor of glTF is linear
             rgb = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
             factor = np.rint(255 * np.array([*rgb, 1])).astype(np.uint8)
-            look = visual.material.PBRMaterial(name, baseColorFactor=factor, metallicFactor=0)
-            shown = visual.TextureVisuals(material=look)
-        vertices = mesh.vertices - np.array(world.origin) if any(world.origin) else mesh.vertices
+            look = {"baseColorFactor": factor, "metallicFactor": 0}
+            material = library.visual.material.PBRMaterial(name, **look)
+            shown = library.visual.TextureVisuals(material=material)
+        vertices = _as_single(mesh, middle)
         part = library.Trimesh(vertices, mesh.faces, process=False, visual=shown)
         scene.add_geometry(part, name or "mesh", name or "mesh", transform=place)
     file.write(scene.export(file_type="glb", include_normals=False))
@@ -314,11 +256,12 @@ def write_glb(file: IO[bytes], parts: Parts, world: World) -> None:
 HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
 SCHEMAS = "http://schemas.openxmlformats.org/package/2006"
 MICROSOFT = "http://schemas.microsoft.com/3dmanufacturing"
-MIME = 'ContentType="application/vnd.'
+KIND = '<Default Extension="{}" ContentType="application/vnd.{}+xml"/>'.format
 MEMBERS = {
     "[Content_Types].xml": f'<Types xmlns="{SCHEMAS}/content-types">'
-    f'<Default Extension="rels" {MIME}openxmlformats-package.relationships+xml"/>'
-    f'<Default Extension="model" {MIME}ms-package.3dmanufacturing-3dmodel+xml"/></Types>\n',
+    + KIND("rels", "openxmlformats-package.relationships")
+    + KIND("model", "ms-package.3dmanufacturing-3dmodel")
+    + "</Types>\n",
     "_rels/.rels": f'<Relationships xmlns="{SCHEMAS}/relationships"><Relationship '
     f'Target="/3D/3dmodel.model" Id="rel0" Type="{MICROSOFT}/2013/01/3dmodel"/></Relationships>\n',
 }

@@ -105,7 +105,7 @@ class SdfGrid:
         look = _checked(samples)
         if look.low == look.high:
             raise GridError(f"every value is {look.low:.6g}: a constant field has no surface")
-        if len(look.few) == 2:
+        if len(look.few) == 2 and min(look.shape) > 2:
             low, high = sorted(look.few)
             raise GridError(f"the only values are {low:.6g} and {high:.6g}: {MASK_HINT}")
         below = border_share(look, lambda x: x < 0)

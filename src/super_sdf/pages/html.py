@@ -57,12 +57,8 @@ def make_page(
     style = (HOME / "page.css").read_text("utf-8")
     scripts = [(HOME / name).read_text("utf-8") for name in SCRIPTS]
     own = " ".join(map(hash_of, scripts)) + (" 'self' file:" if beside else "")
-    colours: dict[str, Any] = {
-        "touching": check.TOUCHING,
-        "pierced": check.PIERCED,
-        "unknown": check.UNKNOWN,
-    }
-    colours |= {"apart": check.NOT_TOUCHING, "full": check.FULL}
+    colours: dict[str, Any] = {"touching": (240, 240, 240), "pierced": (190, 20, 30)}
+    colours |= {"unknown": (120, 120, 60), "apart": (20, 70, 190), "full": check.FULL}
     made = datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     known = {"version": __version__, "made": made, "colours": colours}
     blocks = [  # their names are ours, never a file's

@@ -12,7 +12,7 @@ import warnings
 import zipfile
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +64,10 @@ def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
         raise FileError(f"{path} cannot be read as a mesh: {reason}") from error
     if not len(faces):
         raise MeshError(f"{path} holds no triangle: give a surface mesh")
-    if path.suffix.lower() == ".off" and len(faces) < (stated := _faces_of_off(path)):
-        raise FileError(f"{path} is truncated: it states {stated:,} faces and holds {len(faces):,}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError(f"{path} has a face of a vertex that it does not hold: repair it")
-    mesh = without_unused(vertices, faces)
+    used, corners = np.unique(faces, return_inverse=True)
+    mesh = Mesh(vertices[used], corners.astype(np.int32).reshape(-1, 3))
     if not np.isfinite(mesh.vertices).all():
         raise MeshError(f"{path} holds coordinates that are not finite: repair it first")
     if (largest := np.abs(mesh.vertices).max()) > LARGEST_COORDINATE:
@@ -76,29 +75,14 @@ def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
     return merged(mesh)
 
 
-def _faces_of_off(path: Path) -> int:
-    """Return how many faces the header of an OFF file states: trimesh takes fewer for all."""
-    words = path.read_bytes()[:4096].split()
-    counts = words[words[0].endswith(b"OFF") :]
-    return int(counts[1]) if len(counts) > 1 and counts[1].isdigit() else 0
-
-
-def without_unused(vertices: NDArray[Any], faces: NDArray[Any]) -> Mesh:
-    """Return a mesh of these faces, and of the vertices that are corners of them, in order."""
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    return Mesh(vertices[used], (np.cumsum(used, dtype=np.int32) - 1)[faces])
-
-
 def merged(mesh: Mesh) -> Mesh:
     """Merge vertices within ``MERGE_DISTANCE``, for meshes under 1 that share of their size.
 
     Unlike in trimesh, normals and textures do not keep vertices separate: a mesh is not open along
-    its seams. Unused vertices are dropped.
+    its seams.
     """
     from trimesh.grouping import unique_rows
 
-    mesh = without_unused(mesh.vertices, mesh.faces)
     step = MERGE_DISTANCE * min(1.0, float(np.ptp(mesh.vertices, axis=0).max()))
     step = max(step, float(np.abs(mesh.vertices).max()) * SMALLEST_STEP) or 1.0
     places = np.round(mesh.vertices / step).astype(np.int64)
@@ -147,10 +131,8 @@ class Solid:
 
         An edge of four faces counts as closed: the winding number is an integer on all its sides.
         """
-        start, end = (
-            self.mesh.faces.ravel().astype(np.int64),
-            np.roll(self.mesh.faces, -1, 1).ravel(),
-        )
+        faces = self.mesh.faces.astype(np.int64)
+        start, end = faces.ravel(), np.roll(faces, -1, 1).ravel()
         key = np.minimum(start, end) * (start.max(initial=0) + 1) + np.maximum(start, end)
         _, edge = np.unique(key, return_inverse=True)
         return int(np.count_nonzero(np.bincount(edge, np.sign(end - start))))
@@ -164,8 +146,8 @@ class Solid:
         """Return the distance to the nearest triangle, that triangle, and its nearest point."""
         if not len(points):
             return np.zeros(0), np.zeros(0, np.int64), np.zeros((0, 3))
-        mesh = self.mesh
-        squared, face, feet = self._triangles.squared_distance(mesh.vertices, mesh.faces, points)
+        both = self.mesh.vertices, self.mesh.faces
+        squared, face, feet = self._triangles.squared_distance(*both, points)
         return np.sqrt(squared), np.ravel(face), feet
 
     def distance(self, points: Points) -> Distances:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from itertools import permutations
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,27 +63,19 @@ class Request:
         if not names:
             raise FileError(f"{self.path} holds no {what}")
         listed = ", ".join(names[:MOST_NAMED]) + ", ..." * (len(names) > MOST_NAMED)
-        if self.member is not None:
-            same = [name for name in names if name.strip("/") == self.member.strip("/")]
-            if not same:
-                raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
-            return same[0]
-        if len(names) > 1:
+        if self.member is None and len(names) > 1:
             example = f"{self.path}:{names[0]}"
             raise FileError(f"{self.path} holds several arrays, {listed}: give {example}, say")
-        return names[0]
+        wanted = (self.member or names[0]).strip("/")
+        if same := [name for name in names if name.strip("/") == wanted]:
+            return same[0]
+        raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
 
     def choose_array(
         self, shapes: Mapping[str, Sequence[int]], what: str = "array of three axes"
     ) -> str:
-        """Return the name of the array to read, of three axes or more, by the shapes of all.
-
-        Without a name, those with more than three axes longer than 1 count only beside a number,
-        or if there are no others.
-        """
-        arrays = {name: sum(n > 1 for n in s) > 3 for name, s in shapes.items() if len(s) >= 3}
-        wanted = [name for name, is_more in arrays.items() if is_more == bool(self.numbers)]
-        return self.choose(list(arrays) if self.member or not wanted else wanted, what)
+        """Return the name of the array to read, of three axes or more, by the shapes of all."""
+        return self.choose([name for name, shape in shapes.items() if len(shape) >= 3], what)
 
     def pick(
         self, shape: Sequence[int], kept: Sequence[int] | None = None, names: Sequence[str] = ()
@@ -133,7 +125,6 @@ class Volume:
     axes: str | None = None  # order of x, y and z along the array, if the file or user names it
     space: str | None = None  # "RAS" or "LPS", if the file states one of them
     notes: tuple[str, ...] = ()  # sentences on what the file says, for the user
-    about: dict[str, Any] = field(default_factory=dict)  # how it is stored, for ``info``
     # spacing, origin, direction of x, y, z: see ``stated_place``; they replace those above
     place: dict[str, Any] = field(default_factory=dict)
     is_mapped: bool = False  # the samples stay in the file
@@ -165,8 +156,12 @@ class Volume:
         return replace(self, origin=origin, direction=turned, space=space)
 
 
-def of_array(values: Any) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
-    """Return how a ``Volume`` loads an array that is at hand, its shape and its type."""
+Loading: TypeAlias = tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]
+"""How a ``Volume`` loads an array, the shape, and the type of the values."""
+
+
+def of_array(values: Any) -> Loading:
+    """Return how a ``Volume`` loads an array that is at hand."""
     return lambda index: values[index], tuple(values.shape), np.dtype(values.dtype)
 
 
@@ -200,22 +195,14 @@ def axes_direction(axes: str) -> NDArray[np.float64]:
     return XYZ[:, ["xyz".index(name) for name in axes]]
 
 
-class Placement(NamedTuple):
-    """How the axes of an array come to lie along x, y and z, or nearest to them, and its place."""
+def find_placement(
+    volume: Volume, given: dict[str, Any]
+) -> tuple[tuple[int, ...], tuple[slice, ...], dict[str, Any]]:
+    """Return which axes of an array lie along x, y and z, or nearest to them, and its place.
 
-    order: tuple[int, ...]  # the axes of the array along x, y and z
-    steps: tuple[slice, ...]  # along each axis of the array, forwards or backwards
-    place: dict[str, Any]  # spacing, origin and direction then, None if not known
-
-    def ordered(self, samples: NDArray[Any]) -> NDArray[Any]:
-        """Return a view of samples with their axes along x, y and z."""
-        return samples[self.steps].transpose(self.order)
-
-
-def find_placement(volume: Volume, given: dict[str, Any]) -> Placement:
-    """Return how an array lies; what is ``given`` replaces what the file says of its place.
-
-    GridError if its axes are not at right angles.
+    Between the two are the steps along each axis of the array, forwards or backwards. Spacing,
+    origin and direction are those that are ``given``, else the file's, None if not known. GridError
+    if the axes are not at right angles.
     """
     direction = XYZ if volume.direction is None else np.asarray(volume.direction, np.float64)
     check_direction(direction)
@@ -238,6 +225,5 @@ def find_placement(volume: Volume, given: dict[str, Any]) -> Placement:
         origin = np.asarray(origin, np.float64) - (XYZ if is_straight else turned) @ (ends * steps)
     if place["direction"] is None:
         place["direction"] = None if is_straight else as_direction(turned)
-    backwards = {order[world] for world in range(3) if is_back[world]}
-    flips = tuple(slice(None, None, -1 if axis in backwards else 1) for axis in range(3))
-    return Placement(order, flips, {**place, "spacing": spacing, "origin": origin})
+    forwards = tuple(slice(None, None, -1 if is_back[order.index(n)] else 1) for n in range(3))
+    return order, forwards, {**place, "spacing": spacing, "origin": origin}

@@ -5,13 +5,13 @@ Arrays in HDF5, Zarr, NetCDF, MATLAB and TIFF share this.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...grid.samples import UNNAMED, as_triple, even_steps
-from . import Index, Request, axes_direction, kept_of, stated_place, triple
+from . import Index, Loading, Request, axes_direction, kept_of, of_array, stated_place, triple
 
 SPACE = ("x", "y", "z")
 
@@ -91,10 +91,8 @@ def placed(
     return {**place, **stated, "index": index, "axes": order}
 
 
-def stored(
-    values: Any, attributes: Mapping[str, Any], none: Any = None
-) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
-    """Return how a ``Volume`` loads an array, its shape, and the type of the values.
+def stored(values: Any, attributes: Mapping[str, Any], none: Any = None) -> Loading:
+    """Return how a ``Volume`` loads an array of a file.
 
     By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
     plus ``add_offset``; ``none``, or ``_FillValue``, is no value.
@@ -103,7 +101,7 @@ def stored(
     is_packed = "scale_factor" in attributes or "add_offset" in attributes
     is_packed |= dtype.kind == "f" and "_FillValue" in attributes
     if not is_packed:
-        return lambda index: np.asarray(values[index]), tuple(values.shape), dtype
+        return of_array(values)
     factor = float(np.ravel(attributes.get("scale_factor", 1))[0])
     offset = float(np.ravel(attributes.get("add_offset", 0))[0])
     missing = np.ravel(attributes.get("_FillValue", none))

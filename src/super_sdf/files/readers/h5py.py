@@ -74,8 +74,7 @@ def _check_own(values: Any) -> Any:
 
 def _volume_of(values: Any, place: dict[str, Any]) -> Volume:
     """Return a dataset at its place."""
-    about = {"chunks": list(values.chunks)} if values.chunks else {}
-    return Volume(*stored(_check_own(values), values.attrs), **place, about=about)
+    return Volume(*stored(_check_own(values), values.attrs), **place)
 
 
 def read_netcdf(request: Request) -> Volume:

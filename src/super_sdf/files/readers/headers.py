@@ -109,14 +109,15 @@ def _place(header: dict[str, Any], space: list[int]) -> dict[str, Any]:
 
 
 def read_metaimage(request: Request) -> Volume:
-    """Read a ``.mha`` file, or a ``.mhd`` file and the data files that it names."""
+    """Read a ``.mha`` file, or a ``.mhd`` file and the data file that it names."""
     import SimpleITK
 
-    path, stated = request.path, split_header(request.path)
-    if not stated.start:  # ITK might find another one
-        raise FileError("its header is damaged: it has no ElementDataFile")
-    is_local = stated.entry.lower() == "local"
-    files = [check_beside(path, name) for name in stated.names() if not is_local]
+    path, (text, entry, start) = request.path, split_header(request.path)
+    if not start or entry.upper().startswith("LIST") or "%" in entry:  # ITK would open others
+        raise FileError("its ElementDataFile names no single file: save it as one .mha file")
+    data = path
+    if entry.upper() != "LOCAL":
+        data, start = check_beside(path, entry), 0
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
@@ -131,12 +132,9 @@ def read_metaimage(request: Request) -> Volume:
     one = SimpleITK.Image([1] * len(size), reader.GetPixelID())
     dtype = SimpleITK.GetArrayViewFromImage(one).dtype
     promised = prod(size) * dtype.itemsize
-    true = set(TRUE.findall(stated.before))
-    data, start = (files[0], 0) if files else (path, stated.start)
+    true = set(TRUE.findall(text))
 
     def load(index: Index) -> Any:
-        if len(files) > 1:
-            return SimpleITK.GetArrayFromImage(reader.Execute()).T[index]
         if b"CompressedData" in true:
             unpacker = zlib.decompressobj()
             numbers = unpacker.decompress(data.read_bytes()[start:], promised + 1)

@@ -33,9 +33,7 @@ def read_npy(request: Request) -> Volume:
     """Read an ``.npy`` file, which is mapped into memory."""
     values = np.load(request.path, mmap_mode="r", allow_pickle=False)
     place: dict[str, Any] = {"direction": axes_direction(request.axes), "axes": request.axes}
-    about = {"order": "C" if values.flags.c_contiguous else "Fortran"}
-    index = request.pick(values.shape)
-    return Volume(*of_array(values), index=index, **place, about=about, is_mapped=True)
+    return Volume(*of_array(values), index=request.pick(values.shape), **place, is_mapped=True)
 
 
 def read_npz(request: Request) -> Volume:

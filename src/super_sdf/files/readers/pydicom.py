@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...errors import FileError, GridError
 from ...options import LPS
 from ..formats import check_beside
-from . import DENSITY, LABELS, Index, Names, Request, Volume, triple
+from . import LABELS, Index, Names, Request, Volume, triple
 
 EVEN, EVEN_FRAMES = (
     0.01,
@@ -201,7 +201,10 @@ def _of_images(frames: list[_Frame]) -> Volume:
 def _of_segments(
     frames: list[_Frame], header: Any, labels: dict[int, str], chosen: list[int]
 ) -> Volume:
-    """Return the numbers of the segments, or 1 (or the fractions) in those ``chosen``; else 0."""
+    """Return the numbers of the segments, or 1 in those ``chosen``; else 0.
+
+    Of fractions, what is over a half is inside.
+    """
     heights = _heights(frames)
     groups = [*_items(header.SharedFunctionalGroupsSequence), header]
     between, thick = (_stated(groups, n) for n in ("SpacingBetweenSlices", "SliceThickness"))
@@ -210,17 +213,13 @@ def _of_segments(
     if not step > 0:
         raise GridError("it states neither the spacing between slices nor their thickness")
     planes = np.rint((heights - heights.min()) / step).astype(int) + BEYOND
-    is_map, most = header.SOPClassUID == LABEL_MAP, header.get("MaximumFractionalValue")
-    is_fraction = bool(chosen) and header.get("SegmentationType") == "FRACTIONAL" and most
-    kind = np.float32 if is_fraction else np.uint8 if chosen or max(labels) < 256 else np.uint16
+    is_map, most = header.SOPClassUID == LABEL_MAP, header.get("MaximumFractionalValue") or 1
 
     def use(plane: NDArray[Any], frame: _Frame, values: NDArray[Any]) -> None:
         if is_map:
             plane[:] = np.isin(values, chosen) if chosen else values
-        elif is_fraction and frame.segment in chosen:
-            plane[:] = values / most
         elif not chosen or frame.segment in chosen:
-            inside = values > (most or 1) / 2
+            inside = values > most / 2
             if plane[inside].any():
                 said = f"{frame.path}:{labels[frame.segment]}"
                 raise GridError(f"its segments overlap: give one of them, {said}")
@@ -228,9 +227,8 @@ def _of_segments(
 
     names: Names = {number: (label, None) for number, label in labels.items()}
     about = {
-        "dtype": np.dtype(kind),
-        "hint": DENSITY if is_fraction else "" if chosen else LABELS,
+        "dtype": np.dtype(np.uint8 if chosen or max(labels) < 256 else np.uint16),
+        "hint": "" if chosen else LABELS,
         "names": {1: names[chosen[0]]} if chosen else names,
-        "about": {"segments": list(labels.values())},
     }
     return _volume(frames, planes, step, EVEN_FRAMES, use, **about)

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import BoolArray, FloatArray
-from ...errors import FileError, GridError, NoSurfaceError, OptionError
+from ...errors import FileError, GridError, NoSurfaceError
 from ...grid.sdf_grid import SdfGrid
 from ...refine.field import FineField, FineLattice, fine_grid
 from . import DISTANCE, Request, Volume, from_affine
@@ -57,7 +57,6 @@ PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in mi
 MARGIN = 2  # voxels of background around the others, so that the border is outside
 OUTSIDE, INSIDE, MIXED = 0, 1, 2  # a cube of voxels: all background, all minus that, or neither
 HALF_WIDTH = 3  # voxels of the narrow band to either side of the surface; OpenVDB's tools want 3
-SIZES = 2e-5, 1e30  # of a voxel: OpenVDB refuses transforms with a determinant below 3e-15
 
 # Reading
 
@@ -80,7 +79,6 @@ def read_vdb(request: Request) -> Volume:
     margin = 0 if np.isnan(tree.empty) else MARGIN
     low, high = np.min(tree.ends, 0) - margin, np.max(tree.ends, 0) + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
-    kind = metadata.get("class", "unknown")
 
     def load(index: Any) -> NDArray[Any]:
         voxels = tree.voxels(low, high)
@@ -90,9 +88,8 @@ def read_vdb(request: Request) -> Volume:
     return Volume(
         *(load, tuple((high - low).tolist()), tree.dtype),
         **from_affine(matrix),
-        hint=DISTANCE if kind == "level set" else "",
+        hint=DISTANCE if metadata.get("class") == "level set" else "",
         notes=("lengths are in millimetres, as PicoGK states",) * (size != 1),
-        about={"class": kind, "active voxels": tree.active_count},
     )
 
 
@@ -267,14 +264,9 @@ class _Tree:
 def write_level_set(field: FineField, path: Path) -> None:
     """Write a refined field as a file with one level set, ``surface``.
 
-    OptionError if OpenVDB does not take voxels of this size; NoSurfaceError.
+    NoSurfaceError if there is none.
     """
     grid = fine_grid(field)
-    if not SIZES[0] <= grid.voxel_size <= SIZES[1]:
-        raise OptionError(
-            f"the voxels of the field are {grid.voxel_size:.3g}, and OpenVDB takes {SIZES[0]:g} to "
-            f"{SIZES[1]:g}: multiply distances, spacing and origin of the grid, or write .npz"
-        )
     background = np.float32(HALF_WIDTH * grid.voxel_size)
     sides: list[NDArray[np.uint8]] = []  # of the cubes of 8^3 voxels, from that before voxel 0 on
     leaves: dict[tuple[int, ...], bytes] = {}  # by the place of their cube in ``sides``

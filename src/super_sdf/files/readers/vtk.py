@@ -64,20 +64,15 @@ def read_vtk(request: Request) -> Volume:
     return _volume_of(image, *arrays[name], f"its array {name!r}", *request.numbers)
 
 
-def volume_of_image(image: Any, scalars: str | None) -> Volume:
+def volume_of_image(image: Any, request: Request) -> Volume:
     """Return an array of image data in memory: see ``files.grids.grid_from_image``."""
     if not (hasattr(image, "IsA") and image.IsA("vtkImageData")):
         raise OptionTypeError(f"image is {seen(image)}: give VTK image data")
     arrays = _arrays(image)
     active = [data.GetScalars() for data in (image.GetPointData(), image.GetCellData())]
-    named = [str(each.GetName()) for each in active if each]
-    ours = named or [name for name, (_, of_points) in arrays.items() if of_points] or list(arrays)
-    name = scalars or (ours[0] if named or len(ours) == 1 else None)
-    if name not in arrays:
-        which = f"no array {seen(name)}" if name else "not one array to choose"
-        listed = ", ".join(arrays) or "none"
-        raise GridError(f"{NAME} has {which}: give scalars=, one of its arrays ({listed})")
-    return _volume_of(image, *arrays[name], f"the array {name!r} of {NAME}")
+    named = [str(each.GetName()) for each in active if each and request.member is None]
+    name = request.choose(named[:1] or list(arrays), "array of points or cells")
+    return _volume_of(image, *arrays[name], f"its array {name!r}")
 
 
 def _arrays(image: Any) -> dict[str, tuple[Any, bool]]:

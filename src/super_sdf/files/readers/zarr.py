@@ -8,6 +8,7 @@ metadata names when it opens an array: they are checked before.
 
 from __future__ import annotations
 
+import json
 import os
 import zipfile
 from collections.abc import Iterator
@@ -19,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError, GridError, seen
-from ..formats import check_beside, parse_json
+from ..formats import check_beside
 from . import Request, Volume
 from .axes import Axis, measured, placed, stored
 
@@ -41,8 +42,8 @@ def read_zarr(request: Request) -> Volume:
 
     path = request.path
     store: Any = str(path)
-    for name, metadata in _metadata_of(request):
-        for codec in _codecs_in(parse_json(metadata, f"{path}/{name}")):
+    for _, metadata in _metadata_of(request):
+        for codec in _codecs_in(json.loads(metadata)):
             if codec not in CODECS:
                 raise FileError(
                     f"{path} names the codec {seen(codec)}, which is not among those that are "
@@ -56,18 +57,16 @@ def read_zarr(request: Request) -> Volume:
     array, axes = nodes.get(name), _image_axes(nodes, name)
     if not isinstance(array, zarr.Array):
         raise FileError(f"{path} is damaged: its metadata names no array at {name!r}")
-    attributes, version = array.attrs.asdict(), array.metadata.zarr_format
+    attributes = array.attrs.asdict()
     if axes is None:
         axes = _named_axes(nodes, name)
     elif {*"xyz"} <= {axis.name for axis in axes} and len(axes) == array.ndim:
         attributes = {}
     else:
         raise GridError(f"its {array.ndim} axes are not named z, y, x by its metadata")
-    none = array.fill_value if version == 2 else None  # as xarray takes it
-    sizes = {name: getattr(array, name, None) for name in ("chunks", "shards")}
-    about = {"zarr format": version, **{name: list(size) for name, size in sizes.items() if size}}
+    none = array.fill_value if array.metadata.zarr_format == 2 else None  # as xarray takes it
     place = placed(request, axes, attributes, array.shape)
-    return Volume(*stored(array, attributes, none), **place, about=about)
+    return Volume(*stored(array, attributes, none), **place)
 
 
 def _metadata_of(request: Request) -> Iterator[tuple[str, bytes]]:
