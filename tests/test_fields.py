@@ -152,10 +152,8 @@ def test_the_command_writes_the_mesh_and_the_field(command):
     np.savez("grid.npz", values=cut_ball().values, spacing=0.3, origin=[1, 2, 3])
     run = "upsample", "grid.npz", "--quality=fast"
     code, _, said = command(*run, "a.ply", "--save-field", "a.npz")
-    assert code == 0 and said.splitlines()[-1] == (
-        "a.npz: the refined field, lattice 57 x 61 x 65, spacing 0.075, 0.075, 0.075, "
-        "origin 0.85, 1.85, 2.85"
-    )
+    assert code == 0
+    assert said.splitlines()[-1] == "a.npz: the refined field, lattice 57 x 61 x 65"
     write_mesh(extract_mesh(read_field("a.npz")), "b.ply")
     assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
     code, out, _ = command(*run, "c.ply", "--save-field", "c.npy", "--open", "--json")

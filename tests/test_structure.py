@@ -46,9 +46,9 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     "functions": 700,  # 600
     "labels": 1060,  # 900
     "simplify check truth": 1323,  # 1,100: with the walls between labels
-    "batch": 938,  # 900
+    "batch": 930,  # 900
     "pages": 414,  # 400
-    "cli": 1055,  # 800
+    "cli": 920,  # 800
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 48, 112  # 95, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 18_288, 37_300  # 17,800 and 36,000
