@@ -106,14 +106,12 @@ def test_what_a_killed_process_left_goes_with_the_next_run(target):
     assert sorted(os.listdir()) == sorted([target, lives, *others])
 
 
-@pytest.mark.parametrize(
-    "want, error",
-    [
-        ("no surface", GridError("no surface")),
-        ("out.ply cannot be written: No space left", OSError(errno.ENOSPC, "No space left")),
-    ],
-)
-def test_errors_keep_their_words(want, error):
-    with pytest.raises(SuperSdfError) as caught, replacing(Path("out.ply")):
-        raise error
-    assert str(caught.value) == want and os.listdir() == []
+def test_errors_keep_their_words():
+    full = OSError(errno.ENOSPC, "No space left")
+    for want, error in {
+        "a": GridError("a"),
+        "a.ply cannot be written: No space left": full,
+    }.items():
+        with pytest.raises(SuperSdfError) as caught, replacing(Path("a.ply")):
+            raise error
+        assert str(caught.value) == want and os.listdir() == []
