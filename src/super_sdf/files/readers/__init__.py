@@ -202,11 +202,8 @@ def find_placement(
     """
     direction = XYZ if volume.direction is None else np.asarray(volume.direction, np.float64)
     check_direction(direction)
-
-    def nearness(order: tuple[int, ...]) -> float:
-        return float(np.abs(direction[(0, 1, 2), order]).sum())
-
-    order = max(permutations(range(3)), key=nearness)
+    orders = permutations(range(3))  # of which the axes are taken in the nearest
+    order = max(orders, key=lambda axes: float(np.abs(direction[(0, 1, 2), axes]).sum()))
     is_back = direction[(0, 1, 2), order] < 0
     turned = direction[:, order] * np.where(is_back, -1, 1)
     is_straight = np.abs(turned - XYZ).max() <= STRAIGHT
