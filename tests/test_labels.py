@@ -216,7 +216,8 @@ TABLES = {
     "FreeSurferColorLUT.txt": "#No. Label Name:       R   G   B   A\n\n1   liver   221 130 101 0\n"
     "5   left_kidney   185 102 83 0\n",
     "map.csv": "index,name,r,g,b\n1,liver,221,130,101\n5,left_kidney,185,102,83\n",
-    "map.tsv": "1\tliver\t221\t130\t101\n5\tleft_kidney\t185\t102\t83\n",
+    "map.tsv": "1\tliver\t221\t130\t101\n5\tleft_kidney\t185\t102\t83\tmore\n",
+    "quoted.csv": '"label","name"\n1;"liver";221;130;101\n5;left_kidney;185;102;83;of two\n',
 }
 LIVER, KIDNEY = LabelName("liver", (221, 130, 101)), LabelName("left_kidney", (185, 102, 83))
 
@@ -228,19 +229,22 @@ def test_tables_with_colours(name, folder):
     assert (names[1], names[5]) == (LIVER, KIDNEY)
 
 
-def test_names_in_json(folder):
+def test_names_without_colours(folder):
     one, other = {"1": "liver", "5": "left kidney"}, {"liver": 1, "left kidney": 5}
-    for content in (one, other, {"labels": {"background": 0, **other}}):
-        Path("names.json").write_text(json.dumps(content))
-        names = read_names("names.json")
+    lines = "1,liver\n5,left kidney,abdomen\n", "1 liver\n5 left kidney\n"
+    contents = *lines, *map(json.dumps, (one, other, {"labels": {"background": 0, **other}}))
+    for content in contents:
+        name = "names.txt" if content in lines else "names.json"
+        Path(name).write_text(content)
+        names = read_names(name)
         assert names[1] == LabelName("liver") and names[5] == LabelName("left kidney")
 
 
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.json", "[1]", "a.json cannot be read as a table of labels: it is no object of names"),
-        ("a.txt", "liver\n", "a.txt names no label: give lines such as '1 liver'"),
+        ("a.json", "[1]", "a.json cannot be read as a table of labels: 'list' object"),
+        ("a.txt", "liver\n", "a.txt cannot be read as a table of labels: it names none;"),
         ("a.csv", b"\xff\xfe\x00", "a.csv cannot be read as a table of labels: 'utf-8' codec"),
     ],
 )  # fmt: skip
@@ -310,7 +314,6 @@ def test_labels_are_chosen_by_name(command, boxes):
     for words, said in (
         (("--labels", "lung"), f"--labels has 'lung': give numbers, or {known}"),
         (("--label", "lung"), "--label is 'lung': give a whole number, -2^63 to 2^64 - 1"),
-        ((), "--names names.ctbl is for --labels: give that, too"),
     ):
         run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words
         assert command(*run) == (2, "", f"Error: {said}\n")
@@ -362,12 +365,9 @@ def test_what_has_no_volume_to_keep_is_refused(tmp_path, command):
     exact = 6 - np.linalg.norm(np.indices((18, 18, 18)) - 8.6, axis=0)
     np.save(tmp_path / "distance.npy", -exact)
     np.save(tmp_path / "mask.npy", MASK)
-    for name, option, message in (
-        ("distance", (), " is for masks and labels, the values are distance: leave it out"),
-        ("mask", ("--offset", "0.1"), " is for the surface of the samples, --offset is 0.1: "),
-        ("mask", ("--open",), " needs a closed mesh: leave out --open"),
-    ):  # fmt: skip
+    said = "Error: --keep-volume is for closed meshes of masks and labels, the values are "
+    for name, option in (("distance", ()), ("mask", ("--offset", "0.1")), ("mask", ("--open",))):
         run = "upsample", tmp_path / f"{name}.npy", tmp_path / "out.ply", "--keep-volume"
         code, _, err = command(*run, "--spacing", 1, *option)
-        assert code == 2 and f"Error: --keep-volume{message}" in err
+        assert code == 2 and f"{said}{name}: leave it out, or --offset and --open" in err
         assert not (tmp_path / "out.ply").exists()

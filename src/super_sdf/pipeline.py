@@ -36,7 +36,7 @@ from .refine.band import (
     survey_within,
 )
 from .refine.bounds import SampleSpheres, keep_within_bounds
-from .refine.field import COUNTS, FineField, border_is_crossed
+from .refine.field import COUNTS, FineField
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres
 from .surface.cap import check_can_close, seen_octants
@@ -94,7 +94,7 @@ def refine_band(
         SampleSpheres(grid.shape, number, patches[exact, CENTRE]),
         band.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
-        found=(len(patches), band.count_noisy()),
+        found=(len(patches), int(np.count_nonzero(band.sampled & ~band.lipschitz))),
     )
 
 
@@ -137,7 +137,7 @@ def upsample(
         raise no_surface(grid, asked.offset)
     steps.finish("band")
     field = refine_band(band, decoder, asked.factor_for(mask=grid.field.sides_only), threads, steps)
-    if not field.has_surface:
+    if not field.blocks.min(initial=1) <= 0 < field.blocks.max(initial=0):
         raise no_surface(grid, asked.offset)
     return field
 
@@ -336,14 +336,14 @@ def mesh_grid(
             steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
     count = len(parts)
-    leaves, is_cut = any(part.leaves for part in parts), any(part.is_cut for part in parts)
+    leaves = any(part.leaves for part in parts)
     counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
     counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, chosen.offset)
     ends = lattice.field.unseen is not None
-    edges = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
+    edges = check_closed(mesh, lattice, names, cap=chosen.cap, ends=ends)
     steps.finish("isosurface")
     return Result(mesh, lattice, edges, counts, leaves, steps.seconds, count)
 
@@ -364,11 +364,9 @@ def make_tile(
     del band
     if save_field:
         save_field(field)
-    border = np.array([(0, 0, 0), task.shape]) - np.array(tile.low)
-    is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
     how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
     counts = field.count(tile.owns(field.voxel_ijk + np.array(tile.low)))
-    more = {"counts": counts, "leaves": field.leaves, "is_cut": is_cut}
+    leaves = field.leaves
     del field
-    return own_part(mesh, keys, tile, task.shape, factor, **more)
+    return own_part(mesh, keys, tile, task.shape, factor, counts=counts, leaves=leaves)

@@ -10,12 +10,11 @@ CSV, TSV                1,liver
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +33,9 @@ from .reconstruct import find_image, in_order, label_meshes
 from .volumes import volume_notes
 
 LONGEST = 80  # characters of a name
+ITK_SNAP = re.compile(r'^\s*(\d+)\s+(\d+)\s+(\d+)\s+(\d+)\s.*"(.*)"', re.MULTILINE)
+RGB = r"(?:[ \t,;]+(\d{1,3})[ \t,;]+(\d{1,3})[ \t,;]+(\d{1,3})(?:[ \t,;].*)?|[\t,;].*)?"
+LINE = re.compile(rf'^[ \t]*([-+]?\d+)[ \t,;]+"?([^",;\t\n]*?)"?{RGB}[ \t]*$', re.MULTILINE)
 
 
 class LabelName(NamedTuple):
@@ -56,9 +58,9 @@ class LabelConversion:
     grid: SdfGrid
     labels: list[dict[str, Any]]
     missing: list[dict[str, Any]]  # labels that were asked for, and that no sample has
-    notes: tuple[str, ...] = ()
-    seconds: dict[str, float] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...]
+    seconds: dict[str, float]
+    warnings: tuple[str, ...]
     closed: bool = True
 
     def report(self) -> dict[str, Any]:
@@ -82,10 +84,9 @@ def convert_labels(
     A target ``.glb`` or ``.3mf`` gets all labels as its parts; of another, ``part.ply`` say, each
     label has its own file, ``part-1.ply``. ``names`` of ``read_names``, by default those that the
     source states, take the place of numbers in ``options.labels``, in files and as parts, and parts
-    have their colours. Listed labels that the image lacks are left out. The other parameters are
-    those of ``convert``; options besides
-    ``options.LABELS`` must have their defaults. Errors are those of ``reconstruct_labels`` and
-    ``write_mesh``, OptionError if an option does not go with labels; nothing is written then.
+    have their colours. Listed labels that the image lacks are left out. The other parameters and
+    the errors are those of ``convert``; options besides ``options.LABELS`` must have their
+    defaults.
     """
     watch, options = Stopwatch(), options or Options()
     known = names or {n: LabelName(*each) for n, each in names_in(source).items()}
@@ -93,39 +94,36 @@ def convert_labels(
     check_mesh_suffix(Path(target), options.unit)
     wanted, place = in_order(options.labels), {name: getattr(options, name) for name in PLACE}
     image = find_image(source, wanted, place, options.axes, options.max_memory, options.space)
-    grid, called = image.grid, names_of(image.labels, known)
+    called, lacking = names_of(image.labels, known), names_of(image.missing, known)
     paths = paths_of(Path(target), called, known)
     for path in dict.fromkeys(paths):
         check_target(path, force=force)
         check_apart(path, files_of(source))
     watch.lap("read")
     meshes, notes, warnings = label_meshes(image, network, options, progress)
-    for label, mesh in zip(called, meshes):
-        if mesh.open_edges():
-            raise MeshError(f"the mesh of label {label} is torn: run it again, and report it")
-    volumes = image.volumes
-    if options.keep_volume:
-        made = zip(called.values(), meshes, volumes)
-        notes += volume_notes({entry.name: (mesh.volume(), volume) for entry, mesh, volume in made})
     watch.lap("mesh")
     files: dict[Path, dict[str, Mesh]] = {path: {} for path in paths}
-    rows = []
-    for path, (label, entry), mesh, volume in zip(paths, called.items(), meshes, volumes):
+    rows, colours = list[dict[str, Any]](), dict[str, tuple[int, int, int]]()
+    for path, (n, entry), mesh, volume in zip(paths, called.items(), meshes, image.volumes):
+        if mesh.open_edges():
+            raise MeshError(f"the mesh of label {n} is torn: run it again, and report it")
         files[path][entry.name] = mesh
-        row = {"label": label, "name": entry.name, "output": str(path)}
+        if entry.colour:
+            colours[entry.name] = entry.colour
+        row: dict[str, Any] = {"label": n, "name": entry.name, "output": str(path)}
         row |= {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
         row |= {"volume": mesh.volume(), "components": mesh.components()[0], "closed": True}
         rows.append({**row, "sample_volume": volume})
-    colours = {entry.name: entry.colour for entry in called.values() if entry.colour}
-    write_meshes(files, force=force, world=World(options.unit, grid.space, colours))
+    write_meshes(files, force=force, world=World(options.unit, image.grid.space, colours))
     watch.lap("write")
-    lacking = names_of(image.missing, known)
-    missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
-    if missing:
+    if options.keep_volume:
+        notes += volume_notes({row["name"]: (row["volume"], row["sample_volume"]) for row in rows})
+    if lacking:
         listed = ", ".join(entry.name for entry in lacking.values())
         notes.append(f"no sample has a label that was asked for: {listed}")
-    said = (*grid.notes, *notes)
-    return LabelConversion(grid, rows, missing, said, watch.seconds, tuple(warnings))
+    missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
+    said = (*image.grid.notes, *notes)
+    return LabelConversion(image.grid, rows, missing, said, watch.seconds, tuple(warnings))
 
 
 def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
@@ -134,7 +132,6 @@ def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
         return [target] * len(called)
     ends = {n: called[n].name if n in known else str(n) for n in called}
     ends = {n: re.sub(r"[^\w.-]+", "_", end).strip("._") or "label" for n, end in ends.items()}
-    ends = {n: end.encode()[:LONGEST].decode(errors="ignore") for n, end in ends.items()}
     named = told_apart(ends, "-").values()
     return [target.with_name(f"{target.stem}-{end}{target.suffix}") for end in named]
 
@@ -160,14 +157,12 @@ def with_numbers(options: Options, names: Names | None) -> Options:
     if isinstance(options.labels, str):
         return options
     numbers: dict[Any, int] = {entry.name: number for number, entry in (names or {}).items()}
-    for label in options.labels:
-        if isinstance(label, str) and label not in numbers:
-            some = ", ".join(list(numbers)[:10]) or "none without --names"
-            raise OptionError(
-                f"--labels has {label!r}: give numbers, or names of the table ({some})"
-            )
-    chosen = in_order([numbers.get(label, label) for label in options.labels])
-    return replace(options, labels=tuple(chosen or ()))
+    chosen = [numbers.get(label, label) for label in options.labels]
+    if unknown := [label for label in chosen if isinstance(label, str)]:
+        some = ", ".join(list(numbers)[:10]) or "none without --names"
+        said = f"--labels has {unknown[0]!r}: give numbers, or names of the table ({some})"
+        raise OptionError(said)
+    return replace(options, labels=tuple(in_order(chosen) or ()))
 
 
 def names_of(labels: list[int], known: Names) -> Names:
@@ -186,51 +181,24 @@ def told_apart(names: dict[int, str], mark: str) -> dict[int, str]:
 
 def read_names(path: str | Path) -> Names:
     """Return the names of labels in a table; FileError if it is none."""
-    path, names = check_regular_file(Path(path)), {}
-    rows = _of_json if path.suffix.lower() == ".json" else _of_lines
+    path, names, rows = check_regular_file(Path(path)), {}, list[Any]()
     try:
-        for label, name, parts in rows(path.read_text(encoding="utf-8-sig")):
-            plain = "".join(letter if letter.isprintable() else " " for letter in name)
-            rgb: Any = tuple(int(part) for part in parts if re.fullmatch(r"\d{1,3}", part))
-            colour = rgb if len(rgb) == 3 and max(rgb) <= 255 else None
-            if plain := plain[:LONGEST].strip():
-                names[int(label)] = LabelName(plain, colour)
-    except (OSError, ValueError, RecursionError, csv.Error) as error:
-        raise FileError(f"{path} cannot be read as a table of labels: {error}") from error
-    if not names:
-        raise FileError(f"{path} names no label: give lines such as '1 liver'")
-    return names
-
-
-def _of_json(text: str) -> Iterator[tuple[Any, str, list[str]]]:
-    """Yield the labels and names of an object that maps numbers to names, or names to numbers."""
-    found = json.loads(text)
-    found = found.get("labels", found) if isinstance(found, dict) else found
-    if not isinstance(found, dict):
-        raise ValueError("it is no object of names")
-    for key, value in found.items():
-        label, name = (key, value) if _is_whole(key) else (value, key)
-        if not _is_whole(label) or not isinstance(name, str):
-            raise ValueError(f"{seen(key)}: {seen(value)} is no label and name")
-        yield label, name, []
-
-
-def _of_lines(text: str) -> Iterator[tuple[Any, str, list[str]]]:
-    """Yield labels, names and colours of lines that begin with a number; others are comments."""
-    for line in text.splitlines():
-        mark = next((mark for mark in "\t,;" if mark in line), " ")
-        (fields,) = csv.reader([line.strip()], delimiter=mark, skipinitialspace=True) or [[]]
-        fields = [field.strip() for field in fields]
-        if mark == " ":
-            fields = [*filter(None, fields[:-1]), *fields[-1:]]
-        if len(fields) < 2 or not _is_whole(fields[0]):
-            continue
-        if len(fields) >= 5 and all(map(_is_whole, fields[1:4])) and not _is_whole(fields[-1]):
-            yield fields[0], fields[-1], fields[1:4]  # ITK-SNAP
+        text = path.read_text(encoding="utf-8-sig")
+        if path.suffix.lower() == ".json":
+            found = json.loads(text)
+            pairs = found.get("labels", found).items()
+            rows = [(x, y, ()) if isinstance(y, str) else (y, x, ()) for x, y in pairs]
         else:
-            yield fields[0], fields[1], fields[2:5]
-
-
-def _is_whole(value: Any) -> bool:
-    is_number = isinstance(value, int) and not isinstance(value, bool)
-    return is_number or (isinstance(value, str) and bool(re.fullmatch(r"[-+]?\d{1,20}", value)))
+            rows = [(row[0], row[4], row[1:4]) for row in ITK_SNAP.findall(text)]
+            rows = rows or [(row[0], row[1], row[2:]) for row in LINE.findall(text)]
+        for label, name, rgb in rows:
+            plain = "".join(letter if letter.isprintable() else " " for letter in name)
+            if plain := plain[:LONGEST].strip():
+                colour: Any = tuple(map(int, rgb)) if any(rgb) else None
+                names[int(label)] = LabelName(plain, colour)
+        if not names:
+            raise ValueError("it names none")
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+        said = f"{path} cannot be read as a table of labels: {error}"
+        raise FileError(f"{said}; give lines such as '1 liver'") from error
+    return names

@@ -82,12 +82,9 @@ def reconstruct_labels(
 
     Raises
     ------
-    GridError
-        If a value is no whole number, a label is missing, or there is no surface.
-    OptionError
-        If an argument is invalid, or there are too many labels.
-    OutOfMemoryError
-        If the image does not fit in memory.
+    SuperSdfError
+        If a value is no whole number, a label is missing, there is no surface, an argument is
+        invalid, or the image does not fit in memory.
     """
     place = {"spacing": spacing, "origin": origin, "direction": direction}
     wanted = in_order(labels)
@@ -129,11 +126,11 @@ def find_image(
         values, notes = place["values"], list(place["notes"])
     elif axes is not None:
         raise OptionError(f"--axes is {seen(axes)}: that is for files; transpose the array")
-    given = placed(values, place["spacing"], place["origin"])
-    samples, origin = as_samples(given.values), given.origin
+    values, spacing, origin = placed(values, place["spacing"], place["origin"])
+    samples = as_samples(values)
     check_kind(samples.dtype, samples.shape)
     labels, numbers, counts = find_labels(samples, wanted)
-    if given.spacing is None:
+    if spacing is None:
         notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
@@ -141,7 +138,7 @@ def find_image(
     if cut := [labels[n - 1] for n in np.unique(np.concatenate(ends)).tolist() if n]:
         said = "solids of labels run out of the grid: closed along the border"
         notes.append(f"{said} ({named(cut)})")
-    steps = check_spacing(1.0 if given.spacing is None else given.spacing)
+    steps = check_spacing(1.0 if spacing is None else spacing)
     where = (samples, steps, 0.0 if origin is None else origin, tuple(notes))
     more = {"direction": place["direction"], "extremes": extremes_of_masks(min(steps))}
     grid = with_fields(
@@ -167,33 +164,31 @@ def find_labels(
     samples: Any, wanted: Sequence[int] | None
 ) -> tuple[list[int], NDArray[np.int16], NDArray[np.int64]]:
     """Return the labels and numbers of a ``LabelImage``, and how many samples each label has."""
-    listed = {as_sample(label, samples.dtype) for label in wanted or ()}
-    found, others = set[Any](), False
-    for nth in range(len(samples)):  # plane by plane, to save memory
-        plane = np.asarray(samples[nth]).ravel()
-        values = np.unique(plane[np.append(True, plane[1:] != plane[:-1])])  # one of each run
-        whole = np.isfinite(values) & (np.rint(values) == values)
-        if values.dtype.kind == "f" and not whole.all():
+    kinds = np.zeros(0, samples.dtype)
+    for plane in samples:  # to save memory
+        flat = np.asarray(plane).ravel()
+        each = flat[np.append(True, flat[1:] != flat[:-1])]  # one of each run
+        kinds = np.unique(np.concatenate([kinds, each]))
+        whole = np.isfinite(kinds) & (np.rint(kinds) == kinds)
+        if kinds.dtype.kind == "f" and not whole.all():
             raise GridError(
-                f"a value is {values[~whole][0]:g}: labels are whole numbers; choose what is above "
+                f"a value is {kinds[~whole][0]:g}: labels are whole numbers; choose what is above "
                 "a value with --level if they are densities"
             )
-        some = {value for value in values if (value != 0 if wanted is None else value in listed)}
-        found, others = found | some, others or len(some) < len(values)
-        if len(found) > MOST_LABELS:
+        if wanted is None and len(kinds) > MOST_LABELS + 1:
             raise GridError(
                 f"the values are more than {MOST_LABELS:,} different whole numbers: choose some of "
                 "them (--labels 1,2,3) if they are labels, or a --level if they are densities"
             )
-    if wanted and not found:
+    listed = {as_sample(label, samples.dtype) for label in wanted or ()}
+    chosen = [kind for kind in kinds if (kind != 0 if wanted is None else kind in listed)]
+    if wanted and not chosen:
         labelled(samples, wanted[0])  # raises
-    if not found or (len(found) == 1 and not others):
-        only = int(next(iter(found), 0))
-        raise GridError(f"every sample has the label {only}: there is no surface")
-    kinds, numbers = np.array(sorted(found), samples.dtype), np.zeros(samples.shape, np.int16)
+    if not chosen or len(kinds) == 1:
+        raise GridError(f"every sample has the label {int(kinds[0])}: there is no surface")
+    kinds, numbers = np.array(chosen, samples.dtype), np.zeros(samples.shape, np.int16)
     counts = np.zeros(len(kinds) + 1, np.int64)
-    for nth, out in enumerate(numbers):
-        plane = np.asarray(samples[nth])
+    for plane, out in zip(samples, numbers):
         at = np.searchsorted(kinds, plane).clip(max=len(kinds) - 1)
         out[...] = np.where(kinds[at] == plane, at + 1, 0)
         counts += np.bincount(out.ravel(), minlength=len(counts))
@@ -237,21 +232,20 @@ def label_meshes(
 def spared(walls: Walls, distance: float, spacing: float) -> Walls:
     """Return walls after collapses within a distance of planes, without ``faults``.
 
-    Round a fault, the vertices up to about a ``spacing`` of the lattice away are held, and all is
-    done anew. If that does not help, the walls are returned as they were.
+    Round a fault, the vertices up to about a ``spacing`` of the lattice away are held, and farther
+    ones each time that all is done anew. If that does not help, the walls stay as they were.
     """
-    held, reach, vertices = np.zeros(len(walls.vertices), bool), spacing, walls.vertices
-    for _ in range(MOST_REPEATS):
+    held, vertices = np.zeros(len(walls.vertices), bool), walls.vertices
+    for turn in range(MOST_REPEATS):
         made = collapse_edges(walls, held, distance=distance)[0]
         places = made.vertices[faults(made, spacing)]
         if not len(places):
             return made
-        low, before = vertices.min(0) - 8 * reach, np.count_nonzero(held)
-        while np.count_nonzero(held) == before < len(held):
-            cells, near = (np.floor((some - low) / reach) for some in (vertices, places))
-            size = cells.max(0) + 8
-            near = np.unique(near, axis=0)[:, None] + NEIGHBOURHOOD
-            along = np.array([size[1] * size[2], size[2], 1])
-            held |= np.isin(cells @ along, near @ along)
-            reach *= 1 if np.count_nonzero(held) > before else 2
+        reach = spacing * 1.5**turn
+        low = vertices.min(0) - 8 * reach
+        cells, near = (np.floor((some - low) / reach) for some in (vertices, places))
+        _, ny, nz = cells.max(0) + 8
+        near = np.unique(near, axis=0)[:, None] + NEIGHBOURHOOD
+        along = np.array([ny * nz, nz, 1])
+        held |= np.isin(cells @ along, near @ along)
     return walls

@@ -12,34 +12,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..arrays import CORNERS, Numbers, Vectors, dot, face_normals, length, sums_at
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
-from ..simplify.walls import Rows, Walls, faults, labels_apart
+from ..simplify.walls import Walls, faults, labels_apart
 from ..surface.mesh import Mesh
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
-ROUNDS, TURNS = 12, 6
+ROUNDS, TURNS = 30, 6
 GOOD, NOTED = 1e-6, 1e-3  # of a volume
 
 
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
-    if offset:
-        said = f"is for the surface of the samples, --offset is {offset:g}: give one only"
-    elif not grid.field.sides_only:
-        said = f"is for masks and labels, the values are {grid.field.kind}: leave it out"
-    elif cap:
-        return
-    else:
-        said = "needs a closed mesh: leave out --open"
-    raise OptionError(f"--keep-volume {said}")
+    if offset or not cap or not grid.field.sides_only:
+        raise OptionError(
+            f"--keep-volume is for closed meshes of masks and labels, the values are "
+            f"{grid.field.kind}: leave it out, or --offset and --open"
+        )
 
 
 def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -51,8 +45,7 @@ def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
 
 def keep_volume(mesh: Mesh, volume: float, spacing: float) -> Mesh:
     """Return a closed mesh moved along its normals until it has the given volume."""
-    moved = keep_volumes(Walls.of(mesh), [volume], spacing)
-    return Mesh(moved.vertices, mesh.faces)
+    return Mesh(keep_volumes(Walls.of(mesh), [volume], spacing).vertices, mesh.faces)
 
 
 def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Walls:
@@ -61,94 +54,73 @@ def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Wall
     No wall moves by more than an eighth of the ``spacing``, so the volume of a speck may stay
     another one.
     """
-    middle, most = walls.vertices.mean(0, dtype=np.float64), MOST * spacing
-    start = walls.vertices - middle
-    lattice = _mean_normals(replace(walls, vertices=start), len(volumes), CELL * spacing)
+    middle = walls.vertices.mean(0, dtype=np.float64)
+    movement = _Movement(walls, walls.vertices - middle, spacing)
     for _ in range(TURNS):
-        vertices = middle + _solved(walls, start, lattice, volumes, most)
-        moved = replace(walls, vertices=vertices.astype(walls.vertices.dtype))
+        vertices = (middle + movement.solved(volumes)).astype(walls.vertices.dtype)
+        moved = replace(walls, vertices=vertices)
         wrong = faults(moved, CELL * spacing)
         if not len(wrong):
             return moved
-        lattice.normals[np.isin(lattice.node, lattice.nodes[wrong])] = 0
+        movement.normals[np.isin(movement.node, movement.nodes[wrong])] = 0
     return walls
 
 
-def _solved(
-    walls: Walls, start: Vectors, lattice: _Lattice, volumes: Sequence[float], most: float
-) -> Vectors:
-    """Return the points, moved so that the labels have their volumes."""
-    effects, distances, points = lattice.effects(len(volumes)), np.zeros(len(volumes)), start
-    for _ in range(ROUNDS):
-        off = np.asarray(volumes) - _volumes(points, walls, len(volumes))
-        if (np.abs(off) <= GOOD * np.abs(volumes)).all():
-            break
-        free = np.abs(distances) < most  # the others have moved as far as they may
-        step = np.linalg.lstsq(effects[np.ix_(free, free)], off[free], rcond=None)[0]
-        distances[free] = np.clip(distances[free] + step, -most, most)
-        points = start + lattice.moves(distances, most)
-    return points
+class _Movement:
+    """Labels that move along their mean normals at the nodes of a lattice that are near walls."""
 
+    def __init__(self, walls: Walls, points: Vectors, spacing: float) -> None:
+        self.walls, self.points, self.most = walls, points, MOST * spacing
+        places = points / (CELL * spacing)
+        corners = np.floor(places)[:, None] + CORNERS
+        # the nodes round each point, (n, 8), and their shares in it
+        self.weights = np.prod(1 - np.abs(places[:, None] - corners), axis=2)
+        corners -= corners.min((0, 1))
+        _, ny, nz = (corners.max((0, 1)) + 1).tolist()
+        keys, nodes = np.unique(corners @ [ny * nz, nz, 1], return_inverse=True)
+        self.count, self.nodes = len(keys), nodes.reshape(-1, 8)
+        mesh, point, first, _ = labels_apart(walls)
+        labels = len(first) - 1
+        label = np.repeat(np.arange(labels), np.diff(first))
+        slopes = face_normals(points[point], mesh.faces).repeat(3, 0) / 6
+        slopes = sums_at(mesh.faces.ravel().astype(np.int64), slopes, len(point))
+        pairs = self.nodes[point] * labels + label[:, None]
+        pairs, at = np.unique(pairs, return_inverse=True)
+        at, shares = at.ravel(), self.weights[point]
+        sums = sums_at(at, (shares[..., None] * slopes[:, None]).reshape(-1, 3), len(pairs))
+        areas = np.bincount(at, (shares * length(slopes)[:, None]).ravel(), len(pairs))
+        # of pairs of a node and a label that is near it, (p,), and the mean normals, (p, 3)
+        self.node, self.label = np.divmod(pairs, labels)
+        self.normals = sums / np.maximum(areas, np.finfo(float).tiny)[:, None]
 
-def _volumes(points: Vectors, walls: Walls, count: int) -> Numbers:
-    """Return the volumes of the labels 1 to ``count``."""
-    a, b, c = (points[corner] for corner in walls.faces.T)
-    each = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
-    one, other = (np.bincount(side, each, count + 1) for side in walls.sides.T)
-    return np.asarray((one - other)[1:], np.float64)
-
-
-class _Lattice(NamedTuple):
-    """Mean normals of labels near the nodes of a lattice that are near walls."""
-
-    nodes: Rows  # (n, 8), round each point ...
-    weights: Numbers  # (n, 8), ... and their shares in it
-    # for pairs of a node and a label that is near it, in the order of nodes
-    node: Rows  # (p,)
-    label: Rows  # (p,), from 0 on
-    slopes: Vectors  # (p, 3), by which the volume grows as the node moves
-    normals: Vectors  # (p, 3)
-
-    def moves(self, distances: Numbers, most: float) -> Vectors:
-        """Return the moves of points, (n, 3), if labels move by distances, and nodes by no more."""
-        moves = self.normals * distances[self.label, None]
-        moves = sums_at(self.node, moves, int(self.node[-1]) + 1)
-        moves *= np.minimum(1, most / np.maximum(length(moves), 1e-300))[:, None]
-        total = np.zeros((len(self.nodes), 3))
+    def moved(self, distances: Numbers) -> Vectors:
+        """Return the points, (n, 3), if labels move by distances, but no node beyond the limit."""
+        moves = sums_at(self.node, self.normals * distances[self.label, None], self.count)
+        moves *= np.minimum(1, self.most / np.maximum(length(moves), 1e-300))[:, None]
+        points = self.points.copy()
         for near, shares in zip(self.nodes.T, self.weights.T):
-            total += shares[:, None] * moves[near]
-        return total
+            points += shares[:, None] * moves[near]
+        return points
 
-    def effects(self, count: int) -> NDArray[np.float64]:
-        """Return by how much each label's volume grows as each other one's surface moves."""
-        effects = np.zeros((count, count))
-        for step in range(count):
-            first = np.arange(len(self.node) - step)
-            first = first[self.node[first] == self.node[first + step]]
-            if not len(first):
+    def solved(self, volumes: Sequence[float]) -> Vectors:
+        """Return the points, (n, 3), moved so that the labels have their volumes."""
+        count, faces, sides = len(volumes), self.walls.faces, self.walls.sides.T
+        areas = length(face_normals(self.points, faces)) / 2
+        effects = np.zeros((count + 1, count + 1))  # of moves of labels on the volumes of others
+        for one, other in ((0, 1), (1, 0)):
+            np.add.at(effects, (sides[one], sides[one]), areas)
+            np.add.at(effects, (sides[one], sides[other]), -areas)
+        distances, points = np.zeros(count), self.points
+        for _ in range(ROUNDS):
+            a, b, c = (points[corner] for corner in faces.T)
+            each = dot(a, np.cross(b, c)) / 6
+            inside, outside = (np.bincount(side, each, count + 1) for side in sides)
+            off = np.asarray(volumes) - (inside - outside)[1:]
+            if (np.abs(off) <= GOOD * np.abs(volumes)).all():
                 break
-            for one, other in ((first, first + step), (first + step, first))[: 1 + (step > 0)]:
-                both = self.label[one], self.label[other]
-                np.add.at(effects, both, dot(self.slopes[one], self.normals[other]))
-        return effects
-
-
-def _mean_normals(walls: Walls, count: int, cell: float) -> _Lattice:
-    """Return the mean normals of the labels 1 to ``count`` near walls, whose middle is at 0."""
-    places = walls.vertices / cell
-    corners = np.floor(places)[:, None] + CORNERS
-    weights = np.prod(1 - np.abs(places[:, None] - corners), axis=2)
-    corners -= corners.min((0, 1))
-    _, ny, nz = (corners.max((0, 1)) + 1).tolist()
-    _, nodes = np.unique(corners @ [ny * nz, nz, 1], return_inverse=True)
-    nodes = nodes.reshape(-1, 8)
-    mesh, point, first, _ = labels_apart(walls)
-    label = np.repeat(np.arange(count), np.diff(first))
-    slopes = face_normals(mesh.vertices, mesh.faces).repeat(3, 0) / 6
-    slopes = sums_at(mesh.faces.ravel().astype(np.int64), slopes, len(point))
-    keys, at = np.unique(nodes[point] * count + label[:, None], return_inverse=True)
-    at, shares = at.ravel(), weights[point]
-    sums = sums_at(at, (shares[..., None] * slopes[:, None]).reshape(-1, 3), len(keys))
-    areas = np.bincount(at, (shares * length(slopes)[:, None]).ravel(), len(keys))
-    normals = sums / np.maximum(areas, np.finfo(float).tiny)[:, None]
-    return _Lattice(nodes, weights, keys // count, keys % count, sums, normals)
+            free = np.abs(distances) < self.most  # the others have moved as far as they may
+            rows = np.ix_(*[np.flatnonzero(free) + 1] * 2)
+            step = np.linalg.lstsq(effects[rows], off[free], rcond=None)[0]
+            distances[free] = np.clip(distances[free] + step, -self.most, self.most)
+            points = self.moved(distances)
+        return points

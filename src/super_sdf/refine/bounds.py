@@ -99,12 +99,10 @@ def keep_within_bounds(
     kept = thin.copy()  # and the blocks that share a face with a thin wall
     for place in (CENTRE - STRIDES, CENTRE + STRIDES):
         kept[:-1] |= thin[parts.table[place]].any(0)
-    touched = np.zeros(blocks.shape[1], bool)
     for rows, moved in (move for moves in every for move in moves):
         free = ~kept[rows]
         blocks[:, rows[free]] = moved[free].T
-        touched[parts.table[:, rows[free]]] = True
-    average_shared(blocks, parts, factor, threads, touched[:-1])
+    average_shared(blocks, parts, factor, threads)
 
 
 def _bounded(
