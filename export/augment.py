@@ -55,7 +55,8 @@ class Prepared:
 
 def prepare(sample: Sample) -> Prepared:
     """Gather a sample with the functions of the runtime; targets outside the band are dropped."""
-    ijk, shape = band.find_band(sample.window), sample.window.shape
+    ijk = np.argwhere(band.is_active(sample.window)).astype(np.int32)
+    shape = sample.window.shape
     rows = np.full(shape, -1)
     rows[tuple(ijk.T)] = np.arange(len(ijk))
     voxels = rows[tuple(sample.voxel_ijk.T)]

@@ -64,7 +64,7 @@ def noisy_ball(seed: int = 0) -> tuple[np.ndarray, ...]:
     ijk = np.indices((24, 20, 22))
     radius = np.linalg.norm(ijk - np.array([11, 9, 10])[:, None, None, None], axis=0)
     rescaled = (2 * (radius - 7) + rng.normal(0, 0.3, radius.shape)).astype(np.float32)
-    ijk = band.find_band(rescaled)
+    ijk = np.argwhere(band.is_active(rescaled)).astype(np.int32)
     patches, table = band.gather_patches(rescaled, ijk), band.neighbour_table(ijk, rescaled.shape)
     voxels = np.flatnonzero(rng.random(len(ijk)) < 0.7).astype(np.int32)
     return patches, table, voxels, nodes.block_offsets(4)

@@ -21,7 +21,7 @@ from super_sdf.errors import FileError, OptionError, seen
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.options import OPTIONS
-from super_sdf.refine.band import find_band, rescale
+from super_sdf.refine.band import is_active, rescale
 from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import sample_grid, unit_layout
 from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
@@ -134,7 +134,8 @@ class Case:
     @cached_property
     def voxels(self) -> IntArray:
         """Voxels of the band of the exact distances (Eq. 2), (V, 3)."""
-        return find_band(rescale(SdfGrid.trusted(self.coarse, self.spacing)))
+        rescaled = rescale(SdfGrid.trusted(self.coarse, self.spacing))
+        return np.argwhere(is_active(rescaled)).astype(np.int32)
 
     @cached_property
     def band(self) -> BoolArray:

@@ -125,10 +125,7 @@ def test_mesh_and_field_say_what_they_are_in_a_line():
         "SdfGrid(12 x 12 x 12 float32, spacing 1, 1, 1, origin 0, 0, 0, "
         f"values {GRID.low:.6g} to {GRID.high:.6g})"
     )
-    assert repr(field) == (
-        f"FineField(factor 2, {len(field.values):,} nodes of {len(field.voxel_ijk):,} voxels "
-        "of 12 x 12 x 12)"
-    )
+    assert repr(field) == f"FineField(factor 2, {len(field.voxel_ijk):,} voxels of 12 x 12 x 12)"
     assert repr(mesh).startswith(
         f"Mesh({len(mesh.vertices):,} vertices float32, {len(mesh.faces):,}"
     )

@@ -18,13 +18,13 @@ from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
 from super_sdf.network.contract import decode
 from super_sdf.network.network import KIND_MODELS, shipped_models
 from super_sdf.options import QUALITIES
-from super_sdf.refine.band import find_band, gather_patches, neighbour_table, rescale
+from super_sdf.refine.band import gather_patches, is_active, neighbour_table, rescale
 from super_sdf.refine.nodes import block_offsets
 
 
 def network_inputs(grid):
     field = rescale(grid)
-    voxels = find_band(field)
+    voxels = np.argwhere(is_active(field)).astype(np.int32)
     rows = np.arange(len(voxels), dtype=np.int32)
     return gather_patches(field, voxels), neighbour_table(voxels, grid.shape), rows
 
@@ -44,7 +44,7 @@ def test_a_prediction_depends_neither_on_threads_nor_on_other_voxels(name, preci
     """Bit for bit, so that a mesh does not depend on its slabs or on the number of threads."""
     grid = ball(30, 11.0)
     patches, table, rows = network_inputs(grid)
-    voxels, offsets = find_band(rescale(grid)), block_offsets(factor)
+    voxels, offsets = np.argwhere(is_active(rescale(grid))), block_offsets(factor)
     one, two = (load_network(name, threads=n, precision=precision) for n in (1, 2))
     whole = one(patches, table, rows, offsets)
     for some in (rows, rows[40:], rows[7:8]):
@@ -220,7 +220,7 @@ def test_a_mean_maps_a_field_after_a_half_turn_to_the_turned_surface(flipped):
 
     def dense_values(network, field):
         """Return the values at the nodes of every voxel of the band, NaN elsewhere."""
-        voxels = find_band(field)
+        voxels = np.argwhere(is_active(field)).astype(np.int32)
         rows = np.arange(len(voxels), dtype=np.int32)
         table = neighbour_table(voxels, field.shape)
         values = network(gather_patches(field, voxels), table, rows, block_offsets(2))

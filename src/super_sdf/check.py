@@ -294,7 +294,7 @@ def touch(solid: Solid, band: Band, grid: SdfGrid) -> dict[str, Any]:
     rows = np.flatnonzero(trusted & band.sampled)  # what is interpolated promises nothing
     sampled = int(np.count_nonzero(band.sampled))
     # if none is exact, too many are no distances for any to be taken for one
-    noisy = band.count_noisy() if len(rows) else sampled
+    noisy = int(np.count_nonzero(band.sampled & ~band.lipschitz)) if len(rows) else sampled
     points, values = grid.to_world(band.voxel_ijk[rows]), values[rows] * np.float32(0.5)
     found, _, feet = solid.nearest(points)
     distances, size = found / grid.voxel_size, np.abs(values)

@@ -33,10 +33,9 @@ from .refine.band import (
     neighbour_table,
     no_surface,
     survey,
-    survey_within,
 )
 from .refine.bounds import SampleSpheres, keep_within_bounds
-from .refine.field import COUNTS, FineField, border_is_crossed
+from .refine.field import COUNTS, FineField
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres
 from .surface.cap import check_can_close, seen_octants
@@ -92,9 +91,9 @@ def refine_band(
         grid,
         band.offset,
         SampleSpheres(grid.shape, number, patches[exact, CENTRE]),
-        band.leaves,
+        band.whole.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
-        found=(len(patches), band.count_noisy()),
+        found=(len(patches), int(np.count_nonzero(band.sampled & ~band.lipschitz))),
     )
 
 
@@ -137,7 +136,7 @@ def upsample(
         raise no_surface(grid, asked.offset)
     steps.finish("band")
     field = refine_band(band, decoder, asked.factor_for(mask=grid.field.sides_only), threads, steps)
-    if not field.has_surface:
+    if not field.blocks.min(initial=1) <= 0 < field.blocks.max(initial=0):
         raise no_surface(grid, asked.offset)
     return field
 
@@ -157,7 +156,7 @@ def extract_mesh(
         From ``upsample`` or ``read_field``.
     grid : SdfGrid, optional
         A coarse grid for spacing, origin and direction. Default: the one that the field was made
-        from. A field that was made without its grid stays open.
+        from.
     mesher, cap
         As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
 
@@ -168,14 +167,8 @@ def extract_mesh(
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
-    grid, samples, asked = (
-        field.placed if grid is None else grid,
-        field.spheres,
-        Options(mesher=mesher),
-    )
-    check_grid(grid)
-    chosen = asked.mesher_for(exact=samples is not None and len(samples.distance) > 0)
-    cap = Options(cap=cap).cap and field.grid is not None
+    grid, asked = check_grid(field.grid if grid is None else grid), Options(mesher=mesher, cap=cap)
+    chosen = asked.mesher_for(exact=len(field.spheres.distance) > 0)
     check_can_close(grid, cap=cap)
     return extract(field, cubic_grid(grid), mesher=chosen, cap=cap)[0]
 
@@ -315,9 +308,10 @@ def mesh_grid(
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
     most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
-    bands, whole = survey_within(lattice, chosen.offset, most, threads=threads)
+    bands = [survey(lattice, chosen.offset, threads=threads, most=most)]
     steps.finish("band")
-    if bands:
+    whole = bands[0].whole
+    if whole.count() <= most:
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:
         raise OutOfMemoryError(
@@ -336,14 +330,14 @@ def mesh_grid(
             steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
     count = len(parts)
-    leaves, is_cut = any(part.leaves for part in parts), any(part.is_cut for part in parts)
+    leaves = any(part.leaves for part in parts)
     counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
-    counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
+    counts.update(band_voxels=whole.count(), noisy_voxels=whole.noisy)
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, chosen.offset)
     ends = lattice.field.unseen is not None
-    edges = check_closed(mesh, lattice, names, cap=chosen.cap or not is_cut, ends=ends)
+    edges = check_closed(mesh, lattice, names, cap=chosen.cap, ends=ends)
     steps.finish("isosurface")
     return Result(mesh, lattice, edges, counts, leaves, steps.seconds, count)
 
@@ -364,11 +358,9 @@ def make_tile(
     del band
     if save_field:
         save_field(field)
-    border = np.array([(0, 0, 0), task.shape]) - np.array(tile.low)
-    is_cut = field.octants is not None or (field.leaves and border_is_crossed(field, border))
     how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
     counts = field.count(tile.owns(field.voxel_ijk + np.array(tile.low)))
-    more = {"counts": counts, "leaves": field.leaves, "is_cut": is_cut}
+    leaves = field.leaves
     del field
-    return own_part(mesh, keys, tile, task.shape, factor, **more)
+    return own_part(mesh, keys, tile, task.shape, factor, counts=counts, leaves=leaves)

@@ -64,14 +64,13 @@ class Part:
     mine: NDArray[np.bool_]  # (n,), which of these it owns
     counts: dict[str, int]  # see ``FineField``
     leaves: bool  # whether the solid leaves the whole grid
-    is_cut: bool  # whether the surface leaves the grid there, or may end at unknown samples
     worker: str = ""  # the process that made it, if that was another one
 
     @classmethod
     def without_surface(cls, tile: Tile) -> Part:
         """Return the part of a tile in which no surface is."""
         mesh = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
-        return cls(tile, mesh, np.empty(0, np.int64), np.empty(0, bool), {}, False, False)
+        return cls(tile, mesh, np.empty(0, np.int64), np.empty(0, bool), {}, False)
 
     def __str__(self) -> str:
         return str(self.tile) + f" ({self.worker})" * bool(self.worker)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from math import prod
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ ROUNDING = 1e-3  # so that the offset that an error suggests works
 class BandSummary:
     """What the band of a whole grid says, whichever part of the grid is worked on."""
 
-    side: int  # samples along the edge of each of the cubes into which the grid is cut
+    side: int  # samples along the edge of each cube, of those into which the grid is cut
     cells: NDArray[np.int64]  # (a, b, c), voxels of the band in each cube
     told: int = 0  # voxels whose samples tell whether the field is noisy
     noisy: int = 0  # those of them round which samples differ by more than distances can
@@ -58,15 +58,19 @@ class BandSummary:
     high: float = -np.inf
     leaves: bool = False  # whether a sample on the border is inside: the solid leaves the grid
 
-    def add(self, found: _Found) -> None:
-        """Count what was found in some planes."""
-        sample = found.patches[:, CENTRE]
-        np.add.at(self.cells, tuple((found.voxel_ijk // self.side).T), 1)
-        self.told += int(np.count_nonzero(found.sampled))
-        self.noisy += int(np.count_nonzero(found.sampled & ~found.lipschitz))
-        self.low = min(self.low, float(sample.min(initial=np.inf)))
-        self.high = max(self.high, float(sample.max(initial=-np.inf)))
-        self.leaves |= bool(found.leaves.any())
+    def count(self) -> int:
+        """Return the number of voxels of the band."""
+        return int(self.cells.sum())
+
+    def add(self, found: tuple[NDArray[Any], ...]) -> None:
+        """Count what ``_find`` found in some planes."""
+        voxel_ijk, patches, lipschitz, sampled, *_, leaves = found
+        np.add.at(self.cells, tuple((voxel_ijk // self.side).T), 1)
+        self.told += int(np.count_nonzero(sampled))
+        self.noisy += int(np.count_nonzero(sampled & ~lipschitz))
+        self.low = min(self.low, float(patches[:, CENTRE].min(initial=np.inf)))
+        self.high = max(self.high, float(patches[:, CENTRE].max(initial=-np.inf)))
+        self.leaves |= bool(leaves.any())
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,52 +88,25 @@ class Band:
     # samples beyond the band may be exact distances if they lie between these, in half voxels
     limits: tuple[float, float]
     trusted: SampleSpheres  # of the samples that are exact, and of some beyond the band
-    leaves: bool  # see ``BandSummary``
-
-    def count_noisy(self) -> int:
-        """Count the voxels whose own samples differ from others by more than distances can."""
-        return int(np.count_nonzero(~self.lipschitz & self.sampled))
-
-
-class _Found(NamedTuple):
-    """What is found in some planes of a grid."""
-
-    voxel_ijk: IntArray  # this and the next four: as in ``Band``
-    patches: FloatArray
-    lipschitz: BoolArray
-    sampled: BoolArray
-    decoded: BoolArray
-    number: NDArray[np.int64]  # (n,), of samples beyond the band that may be exact, in C order
-    value: FloatArray  # (n,), of these
-    leaves: BoolArray  # (1,), whether a sample on the border of the grid is inside
+    whole: BandSummary
 
 
 def survey(
-    grid: SdfGrid, offset: float = 0.0, *, threads: int = 1, whole: BandSummary | None = None
-) -> Band:
-    """Return the band of a cubic grid, which is read once.
-
-    With ``whole`` the grid is a part of another one, of which that is the summary.
-    """
-    (band,), _ = survey_within(grid, offset, threads=threads, whole=whole)
-    return band
-
-
-def survey_within(
     grid: SdfGrid,
     offset: float = 0.0,
-    most: float = np.inf,
     *,
     threads: int = 1,
     whole: BandSummary | None = None,
-) -> tuple[list[Band], BandSummary]:
-    """Return the band, in a list that is empty if there are over ``most`` voxels; and its summary.
+    most: float = np.inf,
+) -> Band:
+    """Return the band of a cubic grid, which is read once.
 
-    See ``survey``.
+    With ``whole`` the grid is a part of another one, of which that is the summary. Of a band of
+    over ``most`` voxels only the summary is returned.
     """
     side = -(-max(grid.shape) // CELLS)
     summary = BandSummary(side, np.zeros([-(-n // side) for n in grid.shape], np.int64))
-    parts, count, limits = list[_Found](), 0, (0.0, 0.0)
+    parts, count, limits = list[tuple[NDArray[Any], ...]](), 0, (0.0, 0.0)
     low, high = ((limit - offset) * 2 / grid.voxel_size for limit in grid.field.exact)
     if grid.on_sample is None:  # what is interpolated beyond the band promises little
         ends = [(end - offset) * 2 / grid.voxel_size for end in (grid.low, grid.high)]
@@ -139,26 +116,25 @@ def survey_within(
     blocks = [(at, min(at + step, grid.shape[0])) for at in range(0, grid.shape[0], step)]
     for found in over_threads(partial(_find, grid, offset, limits), blocks, threads):
         if offset and not whole:  # distances must not be cut off near it; at 0 none is better
-            _check_offset(grid, offset, found.patches)
+            _check_offset(grid, offset, found[1])
         summary.add(found)
-        count += len(found.voxel_ijk)
+        count += len(found[0])
         parts.append(found)
         if count > most:
-            parts.clear()
-    if not parts:
-        return [], summary
+            parts = [tuple(each[:0] for each in found)]
     whole = whole or summary
-    every = _Found(*map(np.concatenate, zip(*parts)))
+    ijk, patches, lipschitz, sampled, decoded, number, value, _ = map(np.concatenate, zip(*parts))
     del parts, found
-    exact, sample = _exact(every, whole), every.patches[:, CENTRE]
+    exact, sample = _exact(patches, lipschitz, whole), patches[:, CENTRE]
     exact &= (sample > low) & (sample < high)
-    own = np.ravel_multi_index(tuple(every.voxel_ijk[exact].T), grid.shape)
-    number, value = np.append(own, every.number), np.append(sample[exact], every.value)
+    own = np.ravel_multi_index(tuple(ijk[exact].T), grid.shape)
+    number, value = np.append(own, number), np.append(sample[exact], value)
     # whether limits are beyond the band is the same for all parts of a grid
     is_trusted = exact.any() and (limits[0] < -HALF_BAND or limits[1] > HALF_BAND)
     order = np.argsort(number, kind="stable") if is_trusted else slice(0)
     trusted = SampleSpheres(grid.shape, number[order], value[order])
-    return [Band(grid, offset, *every[:5], exact, limits, trusted, whole.leaves)], summary
+    known = ijk, patches, lipschitz, sampled, decoded, exact
+    return Band(grid, offset, *known, limits, trusted, whole)
 
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
@@ -170,8 +146,12 @@ def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
 
 def _find(
     grid: SdfGrid, offset: float, limits: tuple[float, float], planes: tuple[int, int]
-) -> _Found:
-    """Return what is found from one plane of a grid to before another."""
+) -> tuple[NDArray[Any], ...]:
+    """Return arrays of the voxels from one plane of a grid to before another: see ``Band``.
+
+    The last three are numbers and values of samples beyond the band that may be exact, in C order,
+    and whether a sample on the border of the grid is inside.
+    """
     (first, last), count = planes, grid.shape[0]
     low, is_spline = max(first - 1, 0), grid.field.network is None
     rescaled = rescale(grid, offset, low, min(last + 1, count))
@@ -202,19 +182,19 @@ def _find(
     lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
     beyond = known & (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
     number, value = np.flatnonzero(beyond) + first * inner[0].size, inner[beyond]
-    return _Found(ijk, patches, lipschitz, sampled, decoded, number, value, leaves)
+    return ijk, patches, lipschitz, sampled, decoded, number, value, leaves
 
 
-def _exact(found: _Found, whole: BandSummary) -> BoolArray:
+def _exact(patches: FloatArray, lipschitz: BoolArray, whole: BandSummary) -> BoolArray:
     """Return which samples of a band can be taken as exact distances, (V,): see the module.
 
     A truncated sample is the lowest or the highest of the ``whole`` band, and has no neighbour
     towards which the field is as steep as a distance.
     """
-    patches, sample = found.patches, found.patches[:, CENTRE]
+    sample = patches[:, CENTRE]
     if not whole.told or whole.noisy / whole.told > MAX_NOISY_SHARE:
         return np.zeros(len(sample), bool)
-    exact: BoolArray = found.lipschitz & (np.abs(sample) < MAX_DISTANCE)
+    exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE)
     ends = np.where(sample > 0, np.float32(whole.high), np.float32(whole.low))
     at_limit = np.flatnonzero(exact & (sample == ends))
     slope = np.abs(patches[at_limit] - sample[at_limit, None]) / np.maximum(MAX_DIFFERENCE, 1)
@@ -243,11 +223,10 @@ def _check_offset(grid: SdfGrid, offset: float, patches: FloatArray) -> None:
 def rescale(
     grid: SdfGrid, offset: float = 0.0, first: int = 0, last: int | None = None
 ) -> FloatArray:
-    """Return the samples in half voxels, ``(values - offset) * 2 / h`` (Eq. 4), as float32.
+    """Return planes ``first`` to before ``last``, all by default, in half voxels, as float32.
 
-    Values in the band then lie in [-3, 3], whatever the unit of the grid. ``offset`` is the
-    distance in world units, positive outwards, of the surface that becomes the zero level (Sec.
-    5.3). Read are planes ``first`` to before ``last``, all by default.
+    They are ``(values - offset) * 2 / h`` (Eq. 4). The surface at the distance ``offset``, in world
+    units, positive outwards, becomes the zero level (Sec. 5.3).
     """
     planes = grid.planes(first, grid.shape[0] if last is None else last)
     rescaled = np.empty(planes.shape, np.float32)
@@ -257,11 +236,6 @@ def rescale(
         shifted = np.clip(plane.astype(np.float64) - offset, -limit, limit)
         np.multiply(shifted, scale, out=out, casting="same_kind")
     return rescaled
-
-
-def find_band(rescaled: FloatArray) -> IntArray:
-    """Return the active voxels as (V, 3) int32 in C order: see ``is_active``."""
-    return np.ascontiguousarray(np.argwhere(is_active(rescaled)), np.int32)
 
 
 def is_active(rescaled: FloatArray) -> BoolArray:

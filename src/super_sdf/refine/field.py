@@ -5,22 +5,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..errors import OptionError
 from ..grid.interpret import NONE_EXACT, Field
 from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..threads import chunks_of
 from .band import rescale
-from .bounds import SampleSpheres
+from .bounds import NO_SPHERES, SampleSpheres
 from .nodes import (
     BARELY_INSIDE,
     BARELY_OUTSIDE,
@@ -37,8 +34,8 @@ COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes")
 class FineField:
     """Values at the nodes of the decoded voxels' blocks.
 
-    ``positions`` and ``distances`` are the nodes in world units, each once; ``block_distances`` are
-    block by block. The arrays below are in index space.
+    ``positions`` and ``distances`` are the nodes in world units, each once. The arrays below are in
+    index space.
 
     Attributes
     ----------
@@ -51,47 +48,39 @@ class FineField:
     blocks : (Q, D) float32
         Signed distances at the nodes of each voxel's block, in half voxels, negative inside. The
         Q = (K+1)^3 nodes are in C order; blocks that share a node have equal values there.
-    parts : SharedParts
-        Which voxels share which nodes.
-    grid : SdfGrid, optional
+    grid : SdfGrid
         The coarse grid, for positions and units. That of a field from a file has no samples.
     offset : float
         The distance from the solid, in world units, of the surface at which the values are 0.
-    spheres : SampleSpheres, optional
-        The exact samples near the surface, by which the mesher "sharp" places vertices.
-    leaves : bool
-        Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
-        that crosses the border all the same is closed there.
-    border_inside : (n, 3) int32, optional
-        Voxels on the border that are inside and have no block. None: they are found in the grid.
-    octants : (D,) uint8, optional
-        A bit for each octant of each voxel: whether all eight samples round it are known. Where
-        one is not, the surface ends. None if all are known.
-    found : two ints
-        Voxels of the band, and those of them whose samples differ from others by more than
-        distances can.
     """
 
     shape: tuple[int, int, int]
     factor: int
     voxel_ijk: IntArray
     blocks: FloatArray
-    parts: SharedParts
-    grid: SdfGrid | None = None
+    parts: SharedParts  # which voxels share which nodes
+    grid: SdfGrid
     offset: float = 0.0
-    spheres: SampleSpheres | None = None
+    spheres: SampleSpheres = NO_SPHERES  # by which the mesher "sharp" places vertices
+    # Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
+    # that crosses the border all the same is closed there
     leaves: bool = True
+    # (n, 3), voxels on the border that are inside and have no block; None: found in the grid
     border_inside: IntArray | None = None
+    # (D,), a bit for each octant of each voxel: whether all eight samples round it are known. Where
+    # one is not, the surface ends. None if all are known
     octants: NDArray[np.uint8] | None = None
-    found: tuple[int, int] = (0, 0)
+    found: tuple[int, int] = (0, 0)  # ``band_voxels`` and ``noisy_voxels`` of ``count``
 
     def __repr__(self) -> str:
-        shape, nodes = " x ".join(map(str, self.shape)), self.parts.count_nodes(self.factor)
-        voxels = f"{len(self.voxel_ijk):,} voxels of {shape}"
-        return f"FineField(factor {self.factor}, {nodes:,} nodes of {voxels})"
+        shape = " x ".join(map(str, self.shape))
+        return f"FineField(factor {self.factor}, {len(self.voxel_ijk):,} voxels of {shape})"
 
     def count(self, own: slice | BoolArray = slice(None)) -> dict[str, int]:
-        """Return how many voxels and nodes there are, by name; of those decoded, only some."""
+        """Return how many voxels and nodes there are, by name; of decoded ones, those of ``own``.
+
+        ``noisy_voxels`` are those of the band whose samples differ by more than distances can.
+        """
         nodes = self.parts.count_nodes(self.factor, own)
         return dict(zip(COUNTS, (*self.found, len(self.voxel_ijk[own]), nodes)))
 
@@ -122,59 +111,16 @@ class FineField:
         return ijk
 
     def positions(self) -> NDArray[np.float64]:
-        """Return the world positions of all nodes, each once, (n, 3).
-
-        OptionError if the field was made without its ``grid``.
-        """
-        return self.placed.to_world(self.node_ijk / self.factor - 0.5)
+        """Return the world positions of all nodes, each once, (n, 3)."""
+        return self.grid.to_world(self.node_ijk / self.factor - 0.5)
 
     def distances(self) -> NDArray[np.float64]:
         """Return the signed distances at ``positions``, (n,), in world units, negative inside."""
         return self.in_world_units(self.values)
 
-    def block_distances(self) -> NDArray[np.float64]:
-        """Return the distances at the nodes of each voxel's block, (D, Q), in world units."""
-        return self.in_world_units(self.blocks.T)
-
     def in_world_units(self, values: FloatArray) -> NDArray[np.float64]:
         """Return values in half voxels as distances in world units, float64: without rounding."""
-        return np.multiply(values, self.placed.voxel_size / 2, dtype=np.float64)
-
-    @property
-    def placed(self) -> SdfGrid:
-        """The coarse grid; OptionError if the field was made without it."""
-        if self.grid is None:
-            raise OptionError("the field has no grid: make it with upsample(grid, network)")
-        return self.grid
-
-    @property
-    def has_surface(self) -> bool:
-        """Whether nodes have both signs; 0 counts as inside."""
-        return bool(self.blocks.size and self.blocks.min() <= 0 < self.blocks.max())
-
-
-def border_faces(
-    field: FineField, border: NDArray[Any] | None = None
-) -> Iterator[tuple[NDArray[np.intp], BoolArray]]:
-    """Yield voxels (n,) at each face of the fine lattice, and which nodes on it are inside, (m, n).
-
-    Faces are half a voxel beyond the outermost samples, which may all be outside. Of a part of a
-    grid, ``border`` (2, 3) are the first voxels of the whole grid and those after its last ones,
-    counted from the first of the part.
-    """
-    node_ijk = block_ijk(field.factor)
-    first, after = np.array([(0, 0, 0), field.shape]) if border is None else border
-    for axis in range(3):
-        for voxel, end in ((first[axis], 0), (after[axis] - 1, field.factor)):
-            rows = np.flatnonzero(field.voxel_ijk[:, axis] == voxel)
-            nodes = np.flatnonzero(node_ijk[:, axis] == end)
-            yield rows, field.blocks[nodes[:, None], rows] <= 0
-
-
-def border_is_crossed(field: FineField, border: NDArray[Any] | None = None) -> bool:
-    """Return whether the surface crosses the border of the fine lattice: see ``border_faces``."""
-    faces = (inside for _, inside in border_faces(field, border))
-    return any((inside.any(0) & ~inside.all(0)).any() for inside in faces)
+        return np.multiply(values, self.grid.voxel_size / 2, dtype=np.float64)
 
 
 class FineLattice(SamplePlanes):
@@ -194,7 +140,7 @@ class FineLattice(SamplePlanes):
 
     def read(self, first: int, last: int) -> FloatArray:
         """Return planes ``first`` to before ``last`` of nodes, (last - first, ny, nz) float32."""
-        field, factor, grid = self.field, self.field.factor, self.field.placed
+        field, factor, grid = self.field, self.field.factor, self.field.grid
         if first == last:
             return np.empty((0, *self.shape[1:]), np.float32)
         start = max((first - 1) // factor - 1, 0)  # coarse planes on which those of nodes depend
@@ -238,7 +184,7 @@ def fine_grid(field: FineField) -> SdfGrid:
     from the coarse grid away from the surface, when they are needed. They are relative to the
     surface at the field's offset.
     """
-    grid, blocks = field.placed, field.blocks
+    grid, blocks = field.grid, field.blocks
     ends = np.array([blocks.min(initial=np.inf), blocks.max(initial=-np.inf)], np.float32)
     lowest, highest = field.in_world_units(ends).tolist()
     kind = Field() if grid.field.exact == (-np.inf, np.inf) else Field("noisy", True, NONE_EXACT)

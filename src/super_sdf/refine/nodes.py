@@ -73,21 +73,15 @@ class VoxelIndex:
     """The rows of voxels (n, 3), in C order, by their place in a grid of a shape."""
 
     def __init__(self, voxel_ijk: IntArray, shape: tuple[int, int, int]) -> None:
-        self.shape = shape
-        self.keys = self._key_of(voxel_ijk)
-
-    def _key_of(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
-        """Return the number of each voxel, (...,), in C order of the whole grid."""
-        i, j, k = (voxel_ijk[..., axis].astype(np.int64) for axis in range(3))
-        return (i * self.shape[1] + j) * self.shape[2] + k
+        self.shape, self.strides = shape, np.array([shape[1] * shape[2], shape[2], 1])
+        self.keys = voxel_ijk @ self.strides  # numbers in C order of the whole grid
 
     def find(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
         """Return the row of each voxel (..., 3), -1 if it is not in the list, (...,)."""
-        if not len(self.keys):
-            return np.full(voxel_ijk.shape[:-1], -1, np.int64)
-        wanted = self._key_of(voxel_ijk)
-        at = np.minimum(np.searchsorted(self.keys, wanted), len(self.keys) - 1)
-        return np.where(within(voxel_ijk, self.shape) & (self.keys[at] == wanted), at, -1)
+        wanted = voxel_ijk @ self.strides
+        at = np.searchsorted(self.keys, wanted)
+        found = (self.keys.take(at, mode="clip") == wanted) if len(self.keys) else False
+        return np.where(found & within(voxel_ijk, self.shape), at, -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,24 +125,17 @@ def number_parts(parts: SharedParts, factor: int) -> tuple[IntArray, int]:
     return starts, count
 
 
-def average_shared(
-    blocks: FloatArray,
-    parts: SharedParts,
-    factor: int,
-    threads: int = 1,
-    which: BoolArray | slice = slice(None),
-) -> None:
+def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads: int = 1) -> None:
     """Set each copy of a shared node to the mean of the copies (Eq. 7), in ``blocks`` (Q, D + 1).
 
-    Only nodes owned by the voxels ``which`` (D,). Sums are taken in the order of the voxels and in
-    double precision (of two numbers in single), so that all copies are equal.
+    Sums are taken in the order of the voxels and in double precision (of two numbers in single), so
+    that all copies are equal.
     """
-    nodes, chosen = nodes_of_part(factor), np.zeros(parts.table.shape[1], bool)
-    chosen[which] = True
+    nodes = nodes_of_part(factor)
 
     def average(part: int) -> None:
         """Average the nodes of one part in the blocks of the voxels that own it."""
-        own = np.flatnonzero((parts.owner[part] == CENTRE) & chosen)
+        own = np.flatnonzero(parts.owner[part] == CENTRE)
         later = SHARING[part][SHARING[part] > CENTRE]  # those that also have it
         voxels = parts.table[later].take(own, 1)
         kind = np.float32 if len(SHARING[part]) == 2 else np.float64
@@ -197,10 +184,10 @@ def pin_to_skipped(
     isosurface has no hole there. ``patches`` (D, 27) are the samples round these.
     """
     skipped = np.zeros((27, len(voxel_ijk)), np.int8)  # the sign of neighbours, 0 of decoded ones
-    for place, step in enumerate(NEIGHBOURHOOD):
-        at = np.flatnonzero(parts.table[place] < 0)
+    for signs, row, samples, step in zip(skipped, parts.table, patches.T, NEIGHBOURHOOD):
+        at = np.flatnonzero(row < 0)
         at = at[within(voxel_ijk[at] + step, shape)]
-        skipped[place, at] = np.where(patches[at, place] > 0, 1, -1)
+        signs[at] = np.where(samples[at] > 0, 1, -1)
     for sharing, nodes in zip(SHARING, nodes_of_part(factor)):
         sign = np.zeros(len(voxel_ijk), np.int8)
         for signs in skipped[sharing]:

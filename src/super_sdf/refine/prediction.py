@@ -129,11 +129,8 @@ def roughness(values: FloatArray) -> FloatArray:
     """Return the sum of the absolute fourth differences, the largest in each neighbourhood."""
     total = np.zeros_like(values)
     for axis in range(3):
-        a, b, c, d, e = (
-            _continued(np.moveaxis(values, axis, 0), 2)[step : step + values.shape[axis]]
-            for step in range(5)
-        )
-        total += np.moveaxis(np.abs(e - 4 * d + 6 * c - 4 * b + a), 0, axis)
+        lines = _continued(np.moveaxis(values, axis, 0), 2)
+        total += np.moveaxis(np.abs(np.diff(lines, 4, axis=0)), 0, axis)
     return over_three(total, np.maximum)
 
 

@@ -18,7 +18,8 @@ not depend on how many are worked on together.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,16 +55,8 @@ SAMPLE_TO_FOOT = 2  # (MAX_DISTANCE + BEYOND) / 2, rounded
 REACH_IN_VOXELS = len(CELLS) + 2 * SAMPLE_TO_FOOT + 1
 
 
-class Spheres(NamedTuple):
-    """The spheres of n exact samples."""
-
-    centre: IntArray  # (3, n), the samples
-    distance: FloatArray  # (n,), signed
-    direction: FloatArray  # (3, n), about the gradient of the field there, of length 1
-
-    def some(self, which: NDArray[Any] | slice) -> Spheres:
-        """Return some of them."""
-        return Spheres(self.centre[:, which], self.distance[which], self.direction[:, which])
+Spheres: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
+"""Samples (3, n), their signed distances (n,), and directions, about the gradients there (3, n)."""
 
 
 class Look(NamedTuple):
@@ -74,7 +67,6 @@ class Look(NamedTuple):
     place: FloatArray  # (3, n), the position in it, 0 to 1 along each axis
     value: FloatArray  # (n,), the field
     normal: FloatArray  # (3, n), its gradient, of length 1
-    clearance: FloatArray  # (n,), from the sphere to the surface: below 0 where it pierces it
 
 
 def fit_to_spheres(
@@ -93,12 +85,13 @@ def fit_to_spheres(
     """
     if not band.exact.any():  # in a noisy field, for example
         return
-    spheres = spheres_of_band(band, threads)
+    centre, distance, direction = spheres_of_band(band, threads)
 
-    def touch(rows: slice) -> tuple[NDArray[Any], ...]:
-        return find_foot_points(blocks, factor, spheres.some(rows), index)
+    def touch(some: slice) -> tuple[NDArray[Any], ...]:
+        spheres = centre[:, some], distance[some], direction[:, some]
+        return find_foot_points(blocks, factor, spheres, index)
 
-    feet = map_chunks(touch, len(spheres.distance), TEMPORARIES, threads)
+    feet = map_chunks(touch, len(distance), TEMPORARIES, threads)
     correction = find_correction(parts, *(np.concatenate(each, -1) for each in zip(*feet)))
 
     def subtract(rows: slice) -> None:
@@ -138,7 +131,7 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
     row, place = row[steepest], place[steepest]
     beside = band.patches[exact[:, None], CENTRE + STRIDES * np.array([[[1]], [[-1]]])]
     direction = _unit((beside[0] - beside[1]).T)
-    return Spheres(
+    return (
         np.concatenate([centre, centre[row] + NEIGHBOURHOOD[place]]).T,
         np.concatenate([own, band.patches[exact[row], place]]),
         np.concatenate([direction, direction[:, row]], 1),
@@ -156,9 +149,21 @@ def find_foot_points(
     direction matters more. Spheres from beyond the band mostly touch edges, which linear cells cut
     off: that they are clear of them is no error.
     """
-    found, size = _touch(blocks, factor, spheres, index), np.abs(spheres.distance)
-    clear = (size >= MAX_DISTANCE) & (found.clearance > 0)
-    unusual = found.value / np.where(clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
+    centre, distance, direction = spheres
+
+    def look(which: NDArray[Any] | slice, direction: FloatArray) -> Look:
+        """Return what the field is where directions (3, n) meet some spheres."""
+        half = distance[which] * direction * np.float32(-0.5)
+        aside = np.rint(half)  # whole voxels from the sample
+        rows = index.find((centre[:, which] + aside.astype(np.int32)).T).astype(np.int32)
+        place = np.clip(half - aside + np.float32(0.5), 0, 1)
+        value, gradient = sample_trilinear(blocks, rows, place, factor)
+        return Look(direction, rows, place, value, _unit(gradient))
+
+    found = _turned(look, distance, direction)
+    size = np.abs(distance)
+    is_clear = (size >= MAX_DISTANCE) & (distance * found.value > 0)
+    unusual = found.value / np.where(is_clear, np.float32(CLEAR_ERROR), np.float32(TYPICAL_ERROR))
     aligned = np.clip(inner(found.direction, found.normal), 0, 1)
     for _ in range(SQUARINGS):  # np.power's last bit depends on the position in the array
         aligned *= aligned
@@ -170,7 +175,7 @@ def find_foot_points(
     return found.rows[kept], found.place[:, kept], values[kept], weights[kept]
 
 
-def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Look:
+def _turned(look: Callable[..., Look], distance: FloatArray, direction: FloatArray) -> Look:
     """Return the places where spheres touch the surface.
 
     A sphere that touches the surface lies on the sample's side of it everywhere else. So the place
@@ -178,31 +183,16 @@ def _touch(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex)
     direction is the normal there. Each look turns the direction some way to the normal; a turn
     that gains nothing is taken back, and the next one is smaller.
     """
-
-    def look(which: NDArray[Any] | slice, direction: FloatArray) -> Look:
-        """Return what the field is where directions (3, n) meet some spheres."""
-        distance = spheres.distance[which]
-        half = distance * direction * np.float32(-0.5)
-        aside = np.rint(half)  # whole voxels from the sample
-        voxel = spheres.centre[:, which] + aside.astype(np.int32)
-        rows = index.find(voxel.T).astype(np.int32)
-        place = np.clip(half - aside + np.float32(0.5), 0, 1)
-        value, gradient = sample_trilinear(blocks, rows, place, factor)
-        outwards = np.copysign(np.float32(1), distance) * value
-        clearance = np.where(rows >= 0, outwards, np.float32(np.inf))
-        return Look(direction, rows, place, value, _unit(gradient), clearance)
-
-    found = look(slice(None), spheres.direction.copy())
-    turn = np.full(len(spheres.distance), FIRST_TURN, np.float32)
+    found, turn = look(slice(None), direction.copy()), np.full(len(distance), FIRST_TURN, "f4")
     for _ in range(LOOKS - 1):
         cosine = inner(found.direction, found.normal)
         rest = np.flatnonzero((found.rows >= 0) & (cosine < SETTLED))
         if not len(rest):
             break
-        direction, share = found.direction[:, rest], turn[rest]
-        direction = _unit(direction + share * (found.normal[:, rest] - direction))
-        new = look(rest, direction)
-        better = new.clearance < found.clearance[rest]
+        start, share = found.direction[:, rest], turn[rest]
+        new = look(rest, _unit(start + share * (found.normal[:, rest] - start)))
+        gain = np.copysign(1, distance[rest]) * (found.value[rest] - new.value)
+        better = (new.rows >= 0) & (gain > 0)
         nearer, farther = np.minimum(share * np.float32(NEARER), 1), share * np.float32(FARTHER)
         turn[rest] = np.where(better, nearer, farther)
         at, gained = rest[better], np.flatnonzero(better)

@@ -11,6 +11,7 @@ part of the grid. A part is closed only where its border is that of the grid.
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,13 @@ from ..arrays import CORNERS, NEIGHBOURHOOD, FloatArray, IntArray
 from ..errors import GridError
 from ..grid.sdf_grid import SdfGrid
 from ..refine.band import neighbour_table, rescale
-from ..refine.field import FineField, border_faces
+from ..refine.field import FineField
 from ..refine.nodes import (
     BARELY_INSIDE,
     BARELY_OUTSIDE,
     SHARING,
     SharedParts,
+    block_ijk,
     nodes_of_part,
     seen_from,
     share_parts,
@@ -53,9 +55,11 @@ def close(field: FineField, *, cap: bool, border: IntArray | None = None) -> Fin
     border = np.array([(0, 0, 0), field.shape]) if border is None else border
     known = field.voxel_ijk
     filled = find_border_inside(field, border) if field.leaves else known[:0]
-    reaches = np.zeros(len(known), bool)
-    for rows, inside in border_faces(field, border):
-        reaches[rows] |= inside.any(0)
+    reaches, ends = np.zeros(len(known), bool), block_ijk(field.factor) / field.factor  # 0 to 1
+    for axis, end in product(range(3), range(2)):  # a face of the fine lattice
+        rows = np.flatnonzero(known[:, axis] == border[end, axis] - end)
+        nodes = np.flatnonzero(ends[:, axis] == end)
+        reaches[rows] |= (field.blocks[nodes[:, None], rows] <= 0).any(0)
     solid = np.concatenate([known[reaches], filled])
     if not len(solid):
         return field
@@ -80,7 +84,7 @@ def find_border_inside(field: FineField, border: IntArray | None = None) -> IntA
     if field.border_inside is not None:
         return field.border_inside
     border = np.array([(0, 0, 0), field.shape]) if border is None else border
-    grid, found = field.placed, [np.empty((0, 3), np.int64)]
+    grid, found = field.grid, [np.empty((0, 3), np.int64)]
     ends = [
         np.isin(np.arange(n), (low, high - 1))
         for n, low, high in zip(field.shape, *border.tolist())

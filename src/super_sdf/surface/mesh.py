@@ -184,21 +184,13 @@ def row_keys(rows: NDArray[np.float64]) -> NDArray[np.uint64]:
 
 def vertex_type(grid: SdfGrid, factor: int) -> type[np.float32] | type[np.float64]:
     """Return the dtype that resolves neighbouring vertices: float32 if possible, else float64."""
-    reach = grid.reach
+    reach, least = grid.reach, CLEARANCE / 2 * grid.voxel_size / factor
     for kind in (np.float32, np.float64):
-        if tells_vertices_apart(kind, reach, grid, factor):
+        finfo = np.finfo(kind)
+        is_fine = max(float(finfo.tiny), float(finfo.eps) * reach) < least
+        if is_fine and reach < float(finfo.max):
             return kind
     raise GridError(
         f"the grid reaches to {reach:.6g}, too far from the origin for its spacing, "
         f"{grid.voxel_size:.6g}: vertices could not be told apart; give a nearer origin"
     )
-
-
-def tells_vertices_apart(
-    kind: type[np.float32] | type[np.float64], reach: float, grid: SdfGrid, factor: int
-) -> bool:
-    """Return whether floats of this kind resolve neighbouring vertices up to ``reach``."""
-    least = CLEARANCE / 2 * grid.voxel_size / factor
-    finfo = np.finfo(kind)
-    fine = float(finfo.tiny) < least and float(finfo.eps) * reach < least
-    return fine and reach < float(finfo.max)
