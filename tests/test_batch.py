@@ -214,7 +214,6 @@ LISTS = {
     "[1]": 'list.jsonl, line 1: [1]: give an object, {"in": "a.npy"}',
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': give the path of a grid",
-    '{"in": "a.npy", "out": "report.jsonl/x.ply"}': "a.npy would become report.jsonl/x.ply, but",
     '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: factor is 3: give an even number",
     '{"in": "a.npy", "Factor": 2}': "list.jsonl, line 1: 'Factor' is unknown: give in, out, "
     + BATCH_LISTS[0],

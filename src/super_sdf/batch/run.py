@@ -57,15 +57,14 @@ class Batch:
         """Return the jobs in some states."""
         return [job for job in self.jobs if job.state in states]
 
-    def plan(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the files that are to be done, or were done or failed in earlier runs."""
+    def listed(self, *states: str) -> list[dict[str, Any]]:
+        """Return the grids and the outputs of jobs in some states, and why they failed."""
 
         def known(job: Job) -> dict[str, Any]:
             reason = {"reason": job.row["reason"]} if job.row.get("reason") else {}
             return {"in": os.path.abspath(job.source), "out": job.target, **reason}
 
-        states = "to_do", "done_before", "failed_before", "refused"
-        return {state: [known(job) for job in self.of(state)] for state in states}
+        return [known(job) for job in self.of(*states)]
 
     def run(self, progress: Progress | None = None) -> None:
         """Convert what is to be converted; call ``progress`` after each file is in the report."""

@@ -125,17 +125,14 @@ def planned(
 
 def summary(batch: Batch) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
-    plan, rows = batch.plan(), [job.row for job in batch.of("done", "done_before")]
-    failed = [{k: job.row[k] for k in ("in", "out", "reason")} for job in batch.of("failed")]
-    failures = [*plan["failed_before"], *plan["refused"], *failed]
+    rows = [job.row for job in batch.of("done", "done_before")]
+    failures = batch.listed("failed_before", "refused", "failed")
     meshes = [(len(row.get("labels", [row])), bool(row["closed"])) for row in rows]
+    states = ("done", "done_before", "failed_before", "refused")
     return {
-        "done": len(batch.of("done")),
+        **{state: len(batch.of(state)) for state in states},
         "failed": len(failures),
-        "done_before": len(plan["done_before"]),
-        "not_begun": len(plan["to_do"]),
-        "failed_before": len(plan["failed_before"]),
-        "refused": len(plan["refused"]),
+        "not_begun": len(batch.of("to_do")),
         "warned": sum(bool(row["warnings"] or row.get("beside")) for row in rows),
         "closed": sum(count for count, is_closed in meshes if is_closed),
         "open": sum(count for count, is_closed in meshes if not is_closed),
@@ -157,7 +154,8 @@ def sentence(batch: Batch) -> str:
 
 def print_plan(batch: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
-    plan = batch.plan()
+    states = ("to_do", "done_before", "failed_before", "refused")
+    plan = {state: batch.listed(state) for state in states}
     if as_json:
         main.print_stdout(plan)
     for state, rows in plan.items() if not as_json else ():

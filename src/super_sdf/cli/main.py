@@ -69,11 +69,9 @@ class Command(click.Command):
         rows: dict[str, list[Any]] = {name: [] for name in (GRID, VALUES, MESH, WORK, OUTPUT)}
         for param in self.get_params(ctx):
             if isinstance(param, click.Option) and (record := param.get_help_record(ctx)):
-                rows[
-                    getattr(
-                        OPTIONS.get(name := str(param.name)), "group", HEADINGS.get(name, OUTPUT)
-                    )
-                ].append(record)
+                name = str(param.name)
+                group = OPTIONS[name].group if name in OPTIONS else HEADINGS.get(name, OUTPUT)
+                rows[group].append(record)
         headings = [heading for heading, some in rows.items() if some]
         for heading in headings:
             with formatter.section(heading if len(headings) > 1 else "Options"):

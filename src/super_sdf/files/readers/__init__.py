@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Triple
-from ...errors import FileError, GridError, OptionError, OutOfMemoryError
+from ...errors import FileError, GridError, OptionError
 from ...grid.samples import as_direction, as_triple, check_direction
-from ...threads import in_words
+from ...threads import check_bound
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
 MOST_NAMED = 10  # arrays that an error lists
@@ -46,17 +46,13 @@ class Request:
     numbers: tuple[int, ...]  # along the axes that are not in space, of which one is read
     axes: str  # the order in a file that does not state one: "xyz" or "zyx"
     files: ExitStack  # closes what the reader opens, once the samples are read
-    left: int | None = None  # bytes of memory that the process may still take, if that is known
+    max_memory: int | None = None  # bytes that the process may hold; default: a share of the free
 
     def check_fits(self, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
         """Raise OutOfMemoryError if an array that is loaded whole does not fit."""
+        what = f"{self.path}, {' x '.join(map(str, shape))} {dtype}, loaded whole,"
         need = COPIES * prod(map(int, shape)) * dtype.itemsize
-        if self.left is not None and need > self.left:
-            raise OutOfMemoryError(
-                f"{self.path}, {' x '.join(map(str, shape))} {dtype}, is loaded whole, which takes "
-                f"{in_words(need)} of memory, {in_words(self.left)} are left; allow more "
-                "(--max-memory), or save it as .npy in C order"
-            )
+        check_bound(need, what, self.max_memory, "save it as .npy in C order, or ")
 
     def choose(self, names: Sequence[str], what: str) -> str:
         """Return the name of the array to read: the one asked for, else the only one."""
@@ -206,11 +202,8 @@ def find_placement(
     """
     direction = XYZ if volume.direction is None else np.asarray(volume.direction, np.float64)
     check_direction(direction)
-
-    def nearness(order: tuple[int, ...]) -> float:
-        return float(np.abs(direction[(0, 1, 2), order]).sum())
-
-    order = max(permutations(range(3)), key=nearness)
+    orders = permutations(range(3))  # of which the axes are taken in the nearest
+    order = max(orders, key=lambda axes: float(np.abs(direction[(0, 1, 2), axes]).sum()))
     is_back = direction[(0, 1, 2), order] < 0
     turned = direction[:, order] * np.where(is_back, -1, 1)
     is_straight = np.abs(turned - XYZ).max() <= STRAIGHT

@@ -34,15 +34,17 @@ def one_unit(units: Sequence[str]) -> tuple[bool, tuple[str, ...]]:
     return True, (f"lengths are in the unit that it states, {listed}",) * bool(listed)
 
 
-def measured(name: str, places: Any, about: Mapping[str, Any]) -> Axis:
-    """Return an axis by its coordinates, which must be evenly spaced, and their attributes.
+def measured(name: str, count: int, scale: Any, about: Mapping[str, Any]) -> Axis:
+    """Return an axis by its name and a scale, if there is one of its length, with attributes.
 
+    The scale has the coordinates, which must be evenly spaced, or all the same, if none are known.
     By the conventions for climate and forecast data an axis may be ``positive: down``, and ``axis``
     may name it.
     """
-    if places is None or len(places) < 2:
+    places = np.asarray(scale[:] if getattr(scale, "shape", ()) == (count,) else [0])
+    if places[0] == places[-1]:
         return Axis(name)
-    start, step = even_steps(name, np.asarray(places))
+    start, step = even_steps(name, places)
     unit, alias, positive = (
         said.decode() if isinstance(said, bytes) else str(said)
         for said in (about.get(key, "") for key in ("units", "axis", "positive"))

@@ -13,7 +13,6 @@ from ...options import LPS
 from . import PLACE, Request, Volume, of_array, triple
 from .axes import Axis, measured, placed, stored
 
-NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
 ORDER = "its axes are taken as x, y, z, the order of ndgrid; of meshgrid save permute(V, [2 1 3])"
@@ -52,16 +51,9 @@ def _axes(values: Any) -> list[Axis]:
         return [Axis(str(tag.get("key", "")), step=step) for tag, step in zip(tags, steps)]
     axes = []
     for dim, count in zip(values.dims, values.shape):
-        scale = dim[0] if len(dim) else None
-        name = dim.label or ("" if scale is None else (scale.name or "").rsplit("/", 1)[-1])
-        if (
-            scale is None
-            or scale.shape != (count,)
-            or NO_COORDINATES in bytes(scale.attrs.get("NAME", b""))
-        ):
-            axes.append(Axis(name))
-        else:
-            axes.append(measured(name, _check_own(scale)[:], scale.attrs))
+        scale = _check_own(dim[0]) if len(dim) else None
+        name = dim.label or str(getattr(scale, "name", "")).rsplit("/", 1)[-1]
+        axes.append(measured(name, count, scale, getattr(scale, "attrs", {})))
     return axes
 
 
@@ -88,11 +80,10 @@ def read_netcdf(request: Request) -> Volume:
     variables = file.variables
     shapes = {f"/{name}": values.shape for name, values in variables.items()}
     values = variables[request.choose_array(shapes, "variable of three axes")[1:]]
-    scales = [variables.get(name) for name in values.dimensions]
-    axes = [
-        Axis(name) if scale is None else measured(name, scale.data, scale._attributes)
-        for name, scale in zip(values.dimensions, scales)
-    ]
+    axes = []
+    for name, count in zip(values.dimensions, values.shape):
+        scale = variables.get(name)
+        axes.append(measured(name, count, scale, getattr(scale, "_attributes", {})))
     place = placed(request, axes, values._attributes, values.shape)
     return Volume(*stored(values.data, values._attributes), **place)
 

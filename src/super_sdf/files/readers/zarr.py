@@ -127,10 +127,7 @@ def _named_axes(nodes: dict[str, Any], name: str) -> list[Axis]:
     names = [str(each or "") for each in said or array.attrs.get("_ARRAY_DIMENSIONS") or ()]
     for axis, count in zip(names if len(names) == array.ndim else [""] * array.ndim, array.shape):
         scale: Any = nodes.get(f"{name.rpartition('/')[0]}/{axis}".lstrip("/")) if axis else None
-        if getattr(scale, "shape", None) == (count,):
-            axes.append(measured(axis, scale[:], scale.attrs))
-        else:
-            axes.append(Axis(axis))
+        axes.append(measured(axis, count, scale, getattr(scale, "attrs", {})))
     return axes
 
 
