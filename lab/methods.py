@@ -120,9 +120,9 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     number = np.ravel_multi_index(tuple(voxel_ijk.T), shape)
     spheres = SampleSpheres(shape, number, blocks[len(blocks) // 2])
     parts = share_parts(neighbour_table(voxel_ijk, shape))
-    fine = FineField(shape, factor, voxel_ijk, blocks, parts, spheres=spheres)
     grid = SdfGrid.trusted(whole[..., 0, 0, 0], side, low + side / 2)
-    return extract_mesh(fine, grid, mesher=SHARP)
+    fine = FineField(shape, factor, voxel_ijk, blocks, parts, grid, spheres=spheres)
+    return extract_mesh(fine, mesher=SHARP, cap=False)
 
 
 def dual_contouring(case: Case, network: Decoder) -> Surface:

@@ -33,7 +33,7 @@ def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGri
         np.zeros(shape, np.float32), (float(factor),) * 3, (half * factor + 0.5,) * 3
     )
     spheres = SampleSpheres(shape, np.arange(len(voxels)), blocks[len(blocks) // 2])
-    return FineField(shape, factor, voxels, blocks, parts, spheres=spheres), grid
+    return FineField(shape, factor, voxels, blocks, parts, grid, spheres=spheres), grid
 
 
 def test_threads_change_nothing(monkeypatch):
@@ -77,13 +77,13 @@ def test_a_face_joins_its_inside_corners_where_its_saddle_is_inside(face, inner,
     corners[list(face)] = inner, outer, inner, outer
     lattice = np.full((5, 5, 5), 9.0)
     lattice[1:3, 1:3, 1:3] = corners.reshape(2, 2, 2)
-    mesh = extract_mesh(*dense_field(lattice), mesher="marching")
+    mesh = extract_mesh(*dense_field(lattice), mesher="marching", cap=False)
     assert mesh.is_closed() and mesh.components()[0] == pieces
 
 
 def test_vertices_are_those_of_scikit_image():
     lattice = np.random.default_rng(0).normal(size=(13, 11, 15)).astype(np.float32)
-    mesh = extract_mesh(*dense_field(lattice), mesher="marching")
+    mesh = extract_mesh(*dense_field(lattice), mesher="marching", cap=False)
     want = np.unique(np.round(marching_cubes(lattice, 0.0, method="lorensen")[0], 5), axis=0)
     assert len(mesh.vertices) == len(want)
     assert cKDTree(want).query(mesh.vertices)[0].max() < 2 * CLEARANCE

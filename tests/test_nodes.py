@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from super_sdf import SdfGrid
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.field import FineField
 from super_sdf.refine.nodes import average_shared, block_ijk, share_parts
@@ -23,7 +24,8 @@ def test_nodes_have_a_number_for_each_position_and_are_plain_means_of_all_blocks
     blocks = blocks.astype(np.float32)
     blocks[:, -1] = 0
     parts = share_parts(table)
-    field = FineField((6, 5, 7), factor, voxels, blocks[:, :-1], parts)
+    grid = SdfGrid.trusted(np.zeros((6, 5, 7), np.float32), 1.0)
+    field = FineField(grid.shape, factor, voxels, blocks[:, :-1], parts, grid)
     numbers = field.numbers.ravel()
     position = (voxels[:, None] * factor + block_ijk(factor)).reshape(-1, 3)
     different, inverse = np.unique(position, axis=0, return_inverse=True)

@@ -33,7 +33,6 @@ from .refine.band import (
     neighbour_table,
     no_surface,
     survey,
-    survey_within,
 )
 from .refine.bounds import SampleSpheres, keep_within_bounds
 from .refine.field import COUNTS, FineField
@@ -92,7 +91,7 @@ def refine_band(
         grid,
         band.offset,
         SampleSpheres(grid.shape, number, patches[exact, CENTRE]),
-        band.leaves,
+        band.whole.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
         found=(len(patches), int(np.count_nonzero(band.sampled & ~band.lipschitz))),
     )
@@ -122,11 +121,6 @@ def upsample(
     -------
     FineField
         Values at the nodes of spacing h/K in every voxel that can hold the surface.
-
-    Raises
-    ------
-    SuperSdfError
-        As ``reconstruct``.
     """
     asked = Options(factor, offset=offset)  # checks them
     lattice, decoder = _prepared(grid, network, asked, progress)
@@ -157,25 +151,14 @@ def extract_mesh(
         From ``upsample`` or ``read_field``.
     grid : SdfGrid, optional
         A coarse grid for spacing, origin and direction. Default: the one that the field was made
-        from. A field that was made without its grid stays open.
+        from.
     mesher, cap
         As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
-
-    Raises
-    ------
-    OptionError
-        If an argument is invalid; if there are more vertices than 32-bit numbers.
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
-    grid, samples, asked = (
-        field.placed if grid is None else grid,
-        field.spheres,
-        Options(mesher=mesher),
-    )
-    check_grid(grid)
-    chosen = asked.mesher_for(exact=samples is not None and len(samples.distance) > 0)
-    cap = Options(cap=cap).cap and field.grid is not None
+    grid, asked = check_grid(field.grid if grid is None else grid), Options(mesher=mesher, cap=cap)
+    chosen = asked.mesher_for(exact=len(field.spheres.distance) > 0)
     check_can_close(grid, cap=cap)
     return extract(field, cubic_grid(grid), mesher=chosen, cap=cap)[0]
 
@@ -225,14 +208,9 @@ def reconstruct(
 
     Raises
     ------
-    OptionError
-        If an argument is invalid, such as an odd factor.
-    GridError
-        If there is no surface, or the distances end within 1.5 spacings of the offset.
-    ModelError
-        If the network returns values that are not finite.
-    OutOfMemoryError
-        If not even small tiles of the grid fit in the memory.
+    OptionError, GridError, ModelError, OutOfMemoryError
+        If an argument is invalid; if there is no surface at the offset; if the network returns
+        values that are not finite; if not even small tiles of the grid fit in the memory.
     """
     chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     exact = None
@@ -315,9 +293,10 @@ def mesh_grid(
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
     most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
-    bands, whole = survey_within(lattice, chosen.offset, most, threads=threads)
+    bands = [survey(lattice, chosen.offset, threads=threads, most=most)]
     steps.finish("band")
-    if bands:
+    whole = bands[0].whole
+    if whole.count() <= most:
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:
         raise OutOfMemoryError(
@@ -338,7 +317,7 @@ def mesh_grid(
     count = len(parts)
     leaves = any(part.leaves for part in parts)
     counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
-    counts.update(band_voxels=int(whole.cells.sum()), noisy_voxels=whole.noisy)
+    counts.update(band_voxels=whole.count(), noisy_voxels=whole.noisy)
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, chosen.offset)

@@ -36,8 +36,7 @@ VERSION = 2
 
 def write_sparse(field: FineField, path: Path) -> None:
     """Write a field to an ``.npz`` file."""
-    grid, side, none = field.placed, field.factor + 1, np.empty((0, 3), np.int32)
-    spheres = field.spheres or SampleSpheres(field.shape, np.empty(0, int), np.empty(0, np.float32))
+    grid, side, none = field.grid, field.factor + 1, np.empty((0, 3), np.int32)
     arrays: dict[str, Any] = {
         "version": VERSION,
         "shape": field.shape,
@@ -50,8 +49,8 @@ def write_sparse(field: FineField, path: Path) -> None:
         "leaves": field.leaves,
         "voxels": field.voxel_ijk,
         "values": field.blocks.T.reshape(-1, side, side, side),
-        "samples": spheres.number,
-        "sample_values": spheres.distance,
+        "samples": field.spheres.number,
+        "sample_values": field.spheres.distance,
         "border_inside": find_border_inside(field) if field.leaves else none,
     }
     with path.open("wb") as file:
@@ -122,7 +121,7 @@ def saving_field(
     with replacing(check_free(path, force=force), force=force) as part:
 
         def write(field: FineField) -> dict[str, Any]:
-            check_all_seen(field.placed, "write the mesh alone, without its field")
+            check_all_seen(field.grid, "write the mesh alone, without its field")
             if kind != ".npz" and field.border_inside is not None:
                 said = f"{kind} needs the coarse samples, which a field from a file has not"
                 raise FileError(f"{path} cannot be written: {said}; write .npz")

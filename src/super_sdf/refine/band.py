@@ -58,6 +58,10 @@ class BandSummary:
     high: float = -np.inf
     leaves: bool = False  # whether a sample on the border is inside: the solid leaves the grid
 
+    def count(self) -> int:
+        """Return the number of voxels of the band."""
+        return int(self.cells.sum())
+
     def add(self, found: tuple[NDArray[Any], ...]) -> None:
         """Count what ``_find`` found in some planes."""
         voxel_ijk, patches, lipschitz, sampled, *_, leaves = found
@@ -84,31 +88,21 @@ class Band:
     # samples beyond the band may be exact distances if they lie between these, in half voxels
     limits: tuple[float, float]
     trusted: SampleSpheres  # of the samples that are exact, and of some beyond the band
-    leaves: bool  # see ``BandSummary``
+    whole: BandSummary
 
 
 def survey(
-    grid: SdfGrid, offset: float = 0.0, *, threads: int = 1, whole: BandSummary | None = None
-) -> Band:
-    """Return the band of a cubic grid, which is read once.
-
-    With ``whole`` the grid is a part of another one, of which that is the summary.
-    """
-    (band,), _ = survey_within(grid, offset, threads=threads, whole=whole)
-    return band
-
-
-def survey_within(
     grid: SdfGrid,
     offset: float = 0.0,
-    most: float = np.inf,
     *,
     threads: int = 1,
     whole: BandSummary | None = None,
-) -> tuple[list[Band], BandSummary]:
-    """Return the band, in a list that is empty if there are over ``most`` voxels; and its summary.
+    most: float = np.inf,
+) -> Band:
+    """Return the band of a cubic grid, which is read once.
 
-    See ``survey``.
+    With ``whole`` the grid is a part of another one, of which that is the summary. Of a band of
+    over ``most`` voxels only the summary is returned.
     """
     side = -(-max(grid.shape) // CELLS)
     summary = BandSummary(side, np.zeros([-(-n // side) for n in grid.shape], np.int64))
@@ -127,9 +121,7 @@ def survey_within(
         count += len(found[0])
         parts.append(found)
         if count > most:
-            parts.clear()
-    if not parts:
-        return [], summary
+            parts = [tuple(each[:0] for each in found)]
     whole = whole or summary
     ijk, patches, lipschitz, sampled, decoded, number, value, _ = map(np.concatenate, zip(*parts))
     del parts, found
@@ -142,7 +134,7 @@ def survey_within(
     order = np.argsort(number, kind="stable") if is_trusted else slice(0)
     trusted = SampleSpheres(grid.shape, number[order], value[order])
     known = ijk, patches, lipschitz, sampled, decoded, exact
-    return [Band(grid, offset, *known, limits, trusted, whole.leaves)], summary
+    return Band(grid, offset, *known, limits, trusted, whole)
 
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:

@@ -60,6 +60,9 @@ class SampleSpheres:
         return np.pad(planes.reshape(-1, ny, nz), widths, constant_values=np.nan)
 
 
+NO_SPHERES = SampleSpheres((0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float32))
+
+
 def keep_within_bounds(
     blocks: FloatArray,
     parts: SharedParts,
@@ -76,7 +79,7 @@ def keep_within_bounds(
     """
     if factor < LEAST_FACTOR or not len(samples.distance):
         return
-    thin, steps = np.zeros(blocks.shape[1], bool), sample_places()[0]
+    thin, steps = np.zeros(blocks.shape[1], bool), around_block(factor)[0]
 
     def work(rows: slice) -> list[tuple[NDArray[np.intp], FloatArray]]:
         moves = []
@@ -110,18 +113,17 @@ def _bounded(
 ) -> tuple[NDArray[np.intp], FloatArray]:
     """Return which of n blocks exceed their bounds, (m,), and their values within these, (m, Q).
 
-    ``values`` are (n, Q), and ``around``, (n, m), the samples round each block in the order of
-    ``sample_places``, its own first. Blocks are numbered twice in between: from n on they are
-    bounded by spheres whose centres are inside.
+    ``values`` are (n, Q), and ``around``, (n, m), the samples of ``around_block``. Blocks are
+    numbered twice in between: from n on they are bounded by spheres whose centres are inside.
     """
     count, own = len(values), around[:, 0]
-    slack = sample_places()[1] - np.abs(around - own[:, None])
+    _, apart, to_nodes, looked_at = around_block(factor)
+    slack = apart - np.abs(around - own[:, None])
     close = np.flatnonzero(slack < SLACK)
     size, block = around.ravel().take(close), close // around.shape[1]
     place = close - block * around.shape[1]
     block += count * (size < 0)
     size = np.abs(size)
-    to_nodes, looked_at = node_distances(factor)
     to_looked, looked = to_nodes.take(looked_at, 1), values.take(looked_at, 1)
     looked, over = np.concatenate([-looked, looked]), np.empty_like(size)
     for some in chunks_of(len(block), CHUNK // PAIRS):
@@ -154,22 +156,15 @@ def _bounded(
 
 
 @lru_cache
-def sample_places() -> tuple[IntArray, FloatArray]:
-    """Return the steps from a sample to those around, (m, 3), itself first, and distances, (m,)."""
-    reach = REACH_OF_SAMPLES
-    steps = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
-    distance = 2 * np.linalg.norm(steps, axis=1)
-    order = np.argsort(distance, kind="stable")
-    order = order[distance[order] <= 2 * reach]
-    return steps[order].astype(np.int32), distance[order].astype(np.float32)
+def around_block(factor: int) -> tuple[IntArray, FloatArray, FloatArray, NDArray[np.intp]]:
+    """Return where samples round a block are, its own first, and 27 nodes, as of 2 cells a side.
 
-
-@lru_cache
-def node_distances(factor: int) -> tuple[FloatArray, NDArray[np.intp]]:
-    """Return the distances from the samples round a block to its nodes, (m, Q), and 27 nodes.
-
-    Those are at the ends and in the middle of the block.
+    Steps from its own sample, (m, 3), distances from this, (m,), and from the nodes, (m, Q).
     """
-    apart = 2 * sample_places()[0][:, None] - block_offsets(factor).astype(np.float64)
-    distance: FloatArray = np.linalg.norm(apart, axis=2).astype(np.float32)
-    return distance, np.flatnonzero((block_ijk(factor) % (factor // 2) == 0).all(1))
+    steps = np.indices((2 * REACH_OF_SAMPLES + 1,) * 3).reshape(3, -1).T - REACH_OF_SAMPLES
+    apart = 2 * np.linalg.norm(steps, axis=1)
+    order = np.argsort(apart, kind="stable")[: np.count_nonzero(apart <= 2 * REACH_OF_SAMPLES)]
+    to_nodes = np.linalg.norm(2 * steps[order, None] - block_offsets(factor).astype(float), axis=2)
+    nodes = np.flatnonzero((block_ijk(factor) % (factor // 2) == 0).all(1))
+    own = apart[order].astype(np.float32)
+    return steps[order].astype(np.int32), own, to_nodes.astype(np.float32), nodes

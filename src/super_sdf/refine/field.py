@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray, FloatArray, IntArray
-from ..errors import OptionError
 from ..grid.interpret import NONE_EXACT, Field
 from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
 from ..threads import chunks_of
 from .band import rescale
-from .bounds import SampleSpheres
+from .bounds import NO_SPHERES, SampleSpheres
 from .nodes import (
     BARELY_INSIDE,
     BARELY_OUTSIDE,
@@ -49,7 +48,7 @@ class FineField:
     blocks : (Q, D) float32
         Signed distances at the nodes of each voxel's block, in half voxels, negative inside. The
         Q = (K+1)^3 nodes are in C order; blocks that share a node have equal values there.
-    grid : SdfGrid, optional
+    grid : SdfGrid
         The coarse grid, for positions and units. That of a field from a file has no samples.
     offset : float
         The distance from the solid, in world units, of the surface at which the values are 0.
@@ -60,9 +59,9 @@ class FineField:
     voxel_ijk: IntArray
     blocks: FloatArray
     parts: SharedParts  # which voxels share which nodes
-    grid: SdfGrid | None = None
+    grid: SdfGrid
     offset: float = 0.0
-    spheres: SampleSpheres | None = None  # by which the mesher "sharp" places vertices
+    spheres: SampleSpheres = NO_SPHERES  # by which the mesher "sharp" places vertices
     # Whether the solid may leave the grid: a sample on the border is inside. If False, a surface
     # that crosses the border all the same is closed there
     leaves: bool = True
@@ -112,11 +111,8 @@ class FineField:
         return ijk
 
     def positions(self) -> NDArray[np.float64]:
-        """Return the world positions of all nodes, each once, (n, 3).
-
-        OptionError if the field was made without its ``grid``.
-        """
-        return self.placed.to_world(self.node_ijk / self.factor - 0.5)
+        """Return the world positions of all nodes, each once, (n, 3)."""
+        return self.grid.to_world(self.node_ijk / self.factor - 0.5)
 
     def distances(self) -> NDArray[np.float64]:
         """Return the signed distances at ``positions``, (n,), in world units, negative inside."""
@@ -124,14 +120,7 @@ class FineField:
 
     def in_world_units(self, values: FloatArray) -> NDArray[np.float64]:
         """Return values in half voxels as distances in world units, float64: without rounding."""
-        return np.multiply(values, self.placed.voxel_size / 2, dtype=np.float64)
-
-    @property
-    def placed(self) -> SdfGrid:
-        """The coarse grid; OptionError if the field was made without it."""
-        if self.grid is None:
-            raise OptionError("the field has no grid: make it with upsample(grid, network)")
-        return self.grid
+        return np.multiply(values, self.grid.voxel_size / 2, dtype=np.float64)
 
 
 class FineLattice(SamplePlanes):
@@ -151,7 +140,7 @@ class FineLattice(SamplePlanes):
 
     def read(self, first: int, last: int) -> FloatArray:
         """Return planes ``first`` to before ``last`` of nodes, (last - first, ny, nz) float32."""
-        field, factor, grid = self.field, self.field.factor, self.field.placed
+        field, factor, grid = self.field, self.field.factor, self.field.grid
         if first == last:
             return np.empty((0, *self.shape[1:]), np.float32)
         start = max((first - 1) // factor - 1, 0)  # coarse planes on which those of nodes depend
@@ -195,7 +184,7 @@ def fine_grid(field: FineField) -> SdfGrid:
     from the coarse grid away from the surface, when they are needed. They are relative to the
     surface at the field's offset.
     """
-    grid, blocks = field.placed, field.blocks
+    grid, blocks = field.grid, field.blocks
     ends = np.array([blocks.min(initial=np.inf), blocks.max(initial=-np.inf)], np.float32)
     lowest, highest = field.in_world_units(ends).tolist()
     kind = Field() if grid.field.exact == (-np.inf, np.inf) else Field("noisy", True, NONE_EXACT)

@@ -84,7 +84,7 @@ def find_border_inside(field: FineField, border: IntArray | None = None) -> IntA
     if field.border_inside is not None:
         return field.border_inside
     border = np.array([(0, 0, 0), field.shape]) if border is None else border
-    grid, found = field.placed, [np.empty((0, 3), np.int64)]
+    grid, found = field.grid, [np.empty((0, 3), np.int64)]
     ends = [
         np.isin(np.arange(n), (low, high - 1))
         for n, low, high in zip(field.shape, *border.tolist())

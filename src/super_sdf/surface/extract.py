@@ -84,7 +84,7 @@ def extract(
     field = close(field, cap=cap, border=border)
     crossings = marching.find_crossings(field, threads)
     features = None
-    if mesher == "sharp" and field.spheres is not None and len(field.spheres.distance):
+    if mesher == "sharp" and len(field.spheres.distance):
         from .sharp.features import find_features
 
         features = find_features(field, crossings, border, rounded, threads)
@@ -133,6 +133,6 @@ def coarse_surface(grid: SdfGrid, offset: float = 0.0) -> Mesh:
     cell_ijk = np.argwhere(some & ~every).astype(np.int32)
     blocks = np.stack([values[tuple((cell_ijk + corner).T)] for corner in CORNERS])
     parts = share_parts(neighbour_table(cell_ijk, some.shape))
-    field = FineField(some.shape, 1, cell_ijk, blocks, parts)
+    field = FineField(some.shape, 1, cell_ijk, blocks, parts, grid)
     middle = tuple(grid.to_world([0.5, 0.5, 0.5]).tolist())
     return extract(field, with_fields(grid, origin=middle), mesher="marching", cap=False)[0]

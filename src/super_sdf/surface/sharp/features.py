@@ -348,7 +348,6 @@ def _measure(
     there = crossing >= 0
     point, normal = planes.point.take(crossing, 0), planes.normal.take(crossing, 0)
     wedges = wedges_of(np.moveaxis(point, 2, 0) / factor, np.moveaxis(normal, 2, 0) * there, there)
-    assert field.spheres is not None  # otherwise no features are looked for
     near = find_spheres(wedges, field.voxel_ijk.take(patches.row, 0), field.spheres)
     leant = lean(wedges, near)
     contact = contact_of(leant, near)
