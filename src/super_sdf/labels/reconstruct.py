@@ -27,7 +27,7 @@ from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.contract import Decoder, adapt
 from ..network.network import load_network, network_for
 from ..simplify.collapsing import Unsimplified, collapse_edges, within
-from ..simplify.walls import Walls, faults, meshes_of
+from ..simplify.walls import Walls, faults, labels_apart
 from ..surface.mesh import Mesh, vertex_type
 from ..threads import Progress
 from .fields import label_fields
@@ -226,7 +226,7 @@ def label_meshes(
         if not found:
             warnings.append("the meshes were not simplified: no way was found within the error")
         walls = found or walls
-    return meshes_of(walls), notes, warnings
+    return [mesh for mesh, _ in labels_apart(walls)], notes, warnings
 
 
 def spared(walls: Walls, distance: float, spacing: float) -> Walls:

@@ -11,8 +11,7 @@ from xml.etree import ElementTree
 
 from ...errors import GridError
 from ..formats import check_beside
-from . import Request, Volume
-from .axes import Axis, placed
+from . import Axis, Request, Volume, placed
 
 
 def read_tiff(request: Request) -> Volume:
@@ -36,7 +35,6 @@ def read_tiff(request: Request) -> Volume:
         )
     if request.axes != "zyx" or not {*"xyz"} <= {*names}:  # pages are z, whatever they are called
         names = names[:-3] + request.axes
-    request.check_fits(shape, series.dtype)
     stated = _imagej_axes(file) if ome is None else _ome_axes(ome)
     axes, order = [stated.get(name, Axis(name)) for name in names], [n for n in names if n in "xyz"]
     place = placed(request, axes, {}, shape, "".join(order))

@@ -9,9 +9,7 @@ values of the leaves, packed one by one.
 
 In a file that is written here, the voxels nearer to the surface than three spacings are active. All
 others have the background, which is those three spacings, or minus the background inside. A level
-set is closed: a solid that leaves the lattice is cut off at its border, so no node is deeper inside
-than the border is away, and voxels beyond are outside. Nothing is packed: zlib would take long and
-save about a fifth. OpenVDB 5 and later read the file.
+set is closed: a solid that leaves the lattice is cut off at its border. OpenVDB 5 reads the file.
 """
 
 from __future__ import annotations

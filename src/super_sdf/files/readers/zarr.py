@@ -21,8 +21,7 @@ import numpy as np
 
 from ...errors import FileError, GridError, seen
 from ..formats import check_beside
-from . import Request, Volume
-from .axes import Axis, measured, placed, stored
+from . import Axis, Request, Volume, measured, placed, stored
 
 METADATA = (".zarray", ".zmetadata", "zarr.json")
 CODECS_IN = ("compressor", "filters", "codecs", "index_codecs")  # keys of metadata
@@ -127,10 +126,7 @@ def _named_axes(nodes: dict[str, Any], name: str) -> list[Axis]:
     names = [str(each or "") for each in said or array.attrs.get("_ARRAY_DIMENSIONS") or ()]
     for axis, count in zip(names if len(names) == array.ndim else [""] * array.ndim, array.shape):
         scale: Any = nodes.get(f"{name.rpartition('/')[0]}/{axis}".lstrip("/")) if axis else None
-        if getattr(scale, "shape", None) == (count,):
-            axes.append(measured(axis, scale[:], scale.attrs))
-        else:
-            axes.append(Axis(axis))
+        axes.append(measured(axis, count, scale, getattr(scale, "attrs", {})))
     return axes
 
 
