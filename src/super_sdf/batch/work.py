@@ -41,7 +41,6 @@ class Settings:
     workers: int = 0
     force: bool = False  # convert everything again; replace files that are not as a batch made them
     retry: bool = False  # try inputs again that failed before
-    fail_fast: bool = False  # start nothing more after the first failure
     check: bool = False  # against the samples; meshes without a certificate are made again
     items: Path | None = None  # the folder for what a page shows of each mesh
     cluster: str | None = None  # "local", or the address of a scheduler: where files are converted

@@ -10,8 +10,7 @@ from typing import Any
 
 from ...errors import FileError
 from ...options import LPS
-from . import PLACE, Request, Volume, of_array, triple
-from .axes import Axis, measured, placed, stored
+from . import PLACE, Axis, Request, Volume, measured, of_array, placed, stored, triple
 
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
@@ -20,27 +19,31 @@ ORDER = "its axes are taken as x, y, z, the order of ndgrid; of meshgrid save pe
 
 def read_hdf5(request: Request) -> Volume:
     """Read ``FILE.h5:/DATASET``; without a name the only dataset of three axes."""
+    datasets = _datasets_in(request)
+    if "/ITKImage/0/VoxelData" in datasets:  # in LPS, with a direction a row
+        spacing, origin, directions, values = (
+            datasets[f"/ITKImage/0/{name}"]
+            for name in ("Spacing", "Origin", "Directions", "VoxelData")
+        )
+        place = {"spacing": triple(spacing[:][::-1]), "origin": triple(origin), "space": LPS}
+        return _volume_of(values, {**place, "direction": directions[:].T[:, ::-1]})
+    shapes = {name: values.shape or () for name, values in datasets.items()}
+    values = datasets[request.choose_array(shapes, "3D dataset")]
+    return _volume_of(values, placed(request, _axes(values), values.attrs, values.shape))
+
+
+def _datasets_in(request: Request) -> dict[str, Any]:
+    """Return the datasets of a file by their paths, without links to other files."""
     import h5py
 
-    file = request.files.enter_context(h5py.File(request.path, "r"))
-    shapes: dict[str, tuple[int, ...]] = {}
+    file, found = request.files.enter_context(h5py.File(request.path, "r")), dict[str, Any]()
 
     def note(name: str, entry: Any) -> None:
         if isinstance(entry, h5py.Dataset):
-            shapes[f"/{name}"] = entry.shape or ()
+            found[f"/{name}"] = entry
 
     file.visititems(note)
-    if "ITKImage" in file:  # in LPS, with a direction a row
-        image = file["ITKImage/0"]
-        place: dict[str, Any] = {
-            "spacing": triple(image["Spacing"][:][::-1]),
-            "origin": triple(image["Origin"]),
-            "direction": image["Directions"][:].T[:, ::-1],
-            "space": LPS,
-        }
-        return _volume_of(image["VoxelData"], place)
-    values = file[request.choose_array(shapes, "3D dataset")]
-    return _volume_of(values, placed(request, _axes(values), values.attrs, values.shape))
+    return found
 
 
 def _axes(values: Any) -> list[Axis]:
@@ -99,11 +102,12 @@ def read_mat(request: Request) -> Volume:
 
     is_hdf5 = h5py.is_hdf5(request.path)
     if is_hdf5:
-        file = request.files.enter_context(h5py.File(request.path, "r"))
-        kinds = {key: str(file[key].attrs.get("MATLAB_class", b""), "ascii") for key in file}
-        shapes = {key: file[key].shape or () for key, kind in kinds.items() if kind in NUMBERS}
-        values = file[request.choose_array(shapes)]
-        stated = {key: _check_own(file[key])[()].T for key in PLACE if key in file}
+        datasets = {name[1:]: values for name, values in _datasets_in(request).items()}
+        kinds = {name: each.attrs.get("MATLAB_class", b"") for name, each in datasets.items()}
+        numeric = [name for name, kind in kinds.items() if str(kind, "ascii") in NUMBERS]
+        shapes = {name: datasets[name].shape or () for name in numeric if "/" not in name}
+        values = datasets[request.choose_array(shapes)]
+        stated = {key: _check_own(datasets[key])[()].T for key in PLACE if key in datasets}
     else:
         shapes = {name: shape for name, shape, kind in whosmat(request.path) if kind in NUMBERS}
         name = request.choose_array(shapes)

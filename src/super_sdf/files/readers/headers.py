@@ -18,8 +18,7 @@ import numpy as np
 from ...errors import FileError, GridError
 from ...options import LPS, RAS
 from ..formats import check_beside, split_header
-from . import LABELS, Index, Names, Request, Volume, from_affine, kept_of, triple
-from .axes import one_unit
+from . import LABELS, Index, Names, Request, Volume, from_affine, kept_of, one_unit, triple
 
 SPACES = {"right-anterior-superior": RAS, "ras": RAS, "left-posterior-superior": LPS, "lps": LPS}
 # Fields in one spelling of those that the format allows

@@ -11,8 +11,7 @@ from xml.etree import ElementTree
 
 from ...errors import GridError
 from ..formats import check_beside
-from . import Request, Volume
-from .axes import Axis, placed
+from . import Axis, Request, Volume, placed
 
 
 def read_tiff(request: Request) -> Volume:

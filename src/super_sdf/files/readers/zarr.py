@@ -21,8 +21,7 @@ import numpy as np
 
 from ...errors import FileError, GridError, seen
 from ..formats import check_beside
-from . import Request, Volume
-from .axes import Axis, measured, placed, stored
+from . import Axis, Request, Volume, measured, placed, stored
 
 METADATA = (".zarray", ".zmetadata", "zarr.json")
 CODECS_IN = ("compressor", "filters", "codecs", "index_codecs")  # keys of metadata
