@@ -50,8 +50,6 @@ TAKES = (
         show_default=True, help="Mesh file format."),
     *map(table_option, OPTIONS),
     *(SHARED[name] for name in ("names", "cluster", "jobs")),
-    option("--fail-fast", is_flag=True,
-        help="Start no further file after the first failure."),
     option("--retry", is_flag=True,
         help="Retry inputs that failed before and have not changed."),
     option("--dry-run", is_flag=True, help="Show what would be done; write nothing."),
@@ -119,7 +117,7 @@ def planned(
         sources, meshes = zip(*((job.source, folder / job.target) for job in jobs))
         main.check_page("--report", page, sources, meshes, force=given["force"] or is_page(page))
         items = items_folder(page)
-    some = {name: given[name] for name in ("cluster", "force", "retry", "fail_fast", "check")}
+    some = {name: given[name] for name in ("cluster", "force", "retry", "check")}
     return jobs, Settings(folder, options, given["jobs"], items=items, names=names, **some)
 
 

@@ -26,9 +26,7 @@ COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 OUTPUT = "Output"
-HEADINGS = {"names": VALUES} | dict.fromkeys(
-    ("cluster", "jobs", "fail_fast", "retry", "dry_run"), WORK
-)
+HEADINGS = {"names": VALUES} | dict.fromkeys(("cluster", "jobs", "retry", "dry_run"), WORK)
 """Those of options that are not in the table; the others are about the output."""
 FILE = click.Path(path_type=Path)
 
