@@ -46,8 +46,8 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     "functions": 700,  # 600
     "labels": 1065,  # 900
     "simplify check truth": 1235,  # 1,100: with the walls between labels
-    "batch": 910,  # 900
-    "pages": 409,  # 400
+    "batch": 900,
+    "pages": 400,
     "cli": 880,  # 800
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 48, 110  # 95, 45, 110 in the design
