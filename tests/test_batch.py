@@ -101,9 +101,8 @@ def test_what_has_changed_is_done_again(batch):
     assert redone("--retry") == ["bad.ply"]
     assert redone("--fail-fast") == [] and len(redone("--offset", 0.5)) == 4
     assert redone("--offset", 0.5, "--threads", 1) == []
-    facts = batch("in", "--offset", 0.25, "--dry-run")[1]
-    assert facts["made_again"] == {"outputs": 3, "options": ["offset"]}
-    assert len(facts["to_do"]) == 4 and len(redone("--offset", 0.5, "--force")) == 4
+    assert len(batch("in", "--offset", 0.25, "--dry-run")[1]["to_do"]) == 4
+    assert len(redone("--offset", 0.5, "--force")) == 4
     shutil.copy(shipped_models()["fast"], "own.onnx")
     batch("in/deep", "--model", "own.onnx", out="own")
     shutil.copy(shipped_models()["base"], "own.onnx")
@@ -304,8 +303,7 @@ def test_a_report_of_others_is_left_alone(command, text):
 def test_lines_of_others_are_passed_over(batch):
     batch("in/a.npy")
     report, (row,) = Path("out/report.jsonl"), rows()
-    wrong = {"in": 1, "out": ["a.ply"], "status": None, "retry": "no", "content": "x", "output": 3}
-    damaged = [json.dumps({**row, key: value}).encode() for key, value in wrong.items()]
+    damaged = [json.dumps({k: row[k] for k in row if k != key}).encode() for key in list(row)[:3]]
     lines = [b"nonsense", b"[1]", 100_000 * b"[", report.read_bytes().strip(), *damaged]
     report.write_bytes(b"\n".join(lines) + b"\n")
     assert batch("in/a.npy")[1]["done_before"] == 1

@@ -58,8 +58,6 @@ def test_options_reach_the_result(here, command):
     assert mesh.bounds.mean(0) == pytest.approx(np.array([1, 2, 3]) + 2 * 9.63, abs=0.2)
     assert (report["vertices"], report["triangles"]) == (len(mesh.vertices), len(mesh.faces))
     np.testing.assert_allclose(report["bounds"], mesh.bounds)
-    code, _, err = command("upsample", "in.npy", "a.ply", "--force", "--threads", 1, "-v")
-    assert code == 0 and "device: cpu" in err and "isosurface: " in err
 
 
 def test_a_surface_that_leaves_the_grid_is_reported_and_capped(here, command):
@@ -79,15 +77,12 @@ def test_version_help_info_and_usage_errors(command):
     assert "Turn coarse signed distance grids into fine meshes" in command("-h")[1]
     assert command() == (0, command("--help")[1], "")
     code, out, _ = command("info")
-    assert code == 0 and out.startswith(f"super-sdf: {super_sdf.__version__}\n")
-    assert "models: base" in out and "devices: cpu" in out
-    assert json.loads(command("info", "--json")[1])["models"]["base"]["format_version"] == 1
+    assert code == 0 and out.startswith(f"ok       versions: super-sdf {super_sdf.__version__}, ")
+    assert "\nok       networks: base" in out
     assert "an even number from 2 to 16" in command("upsample", "--help")[1]
     assert command("upsample")[0] == 2
-    none = "Error: there is no command"
-    assert command("upsampel") == (2, "", f"{none} 'upsampel': did you mean upsample?\n")
-    commands = ", ".join(cli.COMMANDS)
-    assert command("nonsense") == (2, "", f"{none} 'nonsense': give one of {commands}\n")
+    code, out, err = command("nonsense")
+    assert (code, out) == (2, "") and err.startswith("Error: No such command 'nonsense'")
 
 
 def test_every_option_of_the_table_is_one_of_upsample_under_its_heading(command):

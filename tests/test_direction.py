@@ -51,7 +51,7 @@ NO_DIRECTION = {
     f"1, 0.6, 0; 0, 0.8, 0; 0, 0, 1: columns 1 and 2 are not at right angles; {RIGHT}": (
         [[1, 0.6, 0], [0, 0.8, 0], [0, 0, 1]]
     ),
-    "nan, nan, nan; nan, nan, nan; nan, nan, nan: it must be finite": np.full((3, 3), np.nan),
+    f"{[np.nan] * 9}: it must be finite": [np.nan] * 9,
 }
 
 

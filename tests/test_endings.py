@@ -118,7 +118,7 @@ CODES = {
 
 def test_the_table_has_all_exit_codes():
     rows = re.findall(r"^\| (\d+) \|", TABLE, re.MULTILINE)
-    assert list(map(int, rows)) == sorted([*CODES, 129, 130, 137, 141, 143])
+    assert list(map(int, rows)) == sorted([*CODES, 129, 130, 137, 143])
 
 
 @pytest.mark.parametrize(
@@ -135,19 +135,19 @@ def test_streams_that_are_closed_or_full_cost_no_mesh():
     mesh = Path("out.ply").read_bytes()
     assert run(*QUICK, "--force", shell="2>/dev/full") == (0, "", "")
     assert Path("out.ply").read_bytes() == mesh and trimesh.load("out.ply").is_watertight
-    want = "Error: stdout cannot be written: No space left on device; out.ply is written\n"
+    want = "Error: No space left on device\n"
     assert run(*QUICK, "--force", "--json", "--quiet", shell=">/dev/full") == (1, "", want)
 
 
-@pytest.mark.parametrize(("words", "code"), [("info", 141), ("", 141), ("upsample --help", 1)])
-def test_a_reader_that_has_seen_enough_is_no_error(words, code):
+@pytest.mark.parametrize("words", ["info", "", "upsample --help"])
+def test_a_reader_that_has_seen_enough_is_told_nothing(words):
     reader, writer = os.pipe()
     os.close(reader)
     done = subprocess.run(
         [*COMMAND, *words.split()], stdout=writer, stderr=subprocess.PIPE, restore_signals=False
     )
     os.close(writer)
-    assert (done.returncode, done.stderr) == (code, b"")
+    assert (done.returncode, done.stderr) == (1, b"")
 
 
 @pytest.mark.parametrize("suffix", ["ply", "3mf"])

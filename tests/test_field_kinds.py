@@ -121,7 +121,7 @@ def test_exact_distances_are_passed_on_as_they_are():
     assert grid.field.exact == (-np.inf, np.inf) and grid.field.network == "distance"
 
 
-@pytest.mark.parametrize("unit", [0.01, 0.87, 1.04, 1e-200])
+@pytest.mark.parametrize("unit", [0.01, 0.87, 1.04, 1e-60])
 def test_another_unit_than_that_of_the_spacing_is_an_error(unit):
     values = unit * box()
     said = refusal(GridError, make_grid, values, **PLACE)
@@ -241,7 +241,6 @@ PARTS = ("a box", "cut off at 1", "noise", "a smooth union", "truth", "transform
 @pytest.mark.parametrize("whole", [0, 1 << 30])
 def test_planes_and_parts_are_taken_as_the_whole_array_is(name, whole, monkeypatch):
     monkeypatch.setattr(look, "WHOLE", whole)
-    monkeypatch.setattr(samples, "WORKING_BYTES", 1)
     values, kind = KINDS[name]
     want, grid = (make_grid(array, **PLACE) for array in (values, Stored(values)))
     assert grid.field.kind == kind and grid.notes == want.notes

@@ -3,6 +3,7 @@
 import os
 import re
 import zipfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,8 +51,17 @@ def tip() -> SdfGrid:
     return SdfGrid.trusted(np.linalg.norm(ijk - [10.2, 7.0, 6.6], axis=-1) - 4.9, 1.0)
 
 
+def turned(step: float = 0.5) -> SdfGrid:
+    """Return a ball in a grid of turned and mirrored axes, of which z has another spacing."""
+    off = np.moveaxis(np.indices((14, 15, 16)), 0, -1) - [6.2, 6.9, 7.1]
+    values = np.linalg.norm(off * [0.5, 0.5, step], axis=-1) - 2.05
+    direction = [[0.0, 0.0, 1.0], [0.8, 0.6, 0.0], [0.6, -0.8, 0.0]]
+    return make_grid(values, spacing=(0.5, 0.5, step), origin=(3, -4, 5), direction=direction)
+
+
 NO_SPACE = "cannot be written: No space left on device"
-GRIDS = {"whole": ball, "leaving": cut_ball, "tip": tip}
+GRIDS = {"whole": ball, "leaving": cut_ball, "tip": tip, "turned": turned}
+GRIDS["unequal"] = partial(turned, 0.75)
 
 
 def same(one, other) -> bool:
@@ -72,6 +82,7 @@ def test_a_field_that_was_read_back_gives_the_same_mesh(name, cap, mesher):
         assert same(want, extract_mesh(*given, **how))
     assert want.is_closed() == (cap or name != "leaving")
     assert np.array_equal(back.distances(), field.distances())
+    assert np.array_equal(back.positions(), field.positions())
     write_field(back, "again.npz")
     assert Path("again.npz").read_bytes() == Path("field.npz").read_bytes()
 
@@ -141,10 +152,8 @@ def test_the_command_writes_the_mesh_and_the_field(command):
     np.savez("grid.npz", values=cut_ball().values, spacing=0.3, origin=[1, 2, 3])
     run = "upsample", "grid.npz", "--quality=fast"
     code, _, said = command(*run, "a.ply", "--save-field", "a.npz")
-    assert code == 0 and said.splitlines()[-1] == (
-        "a.npz: the refined field, lattice 57 x 61 x 65, spacing 0.075, 0.075, 0.075, "
-        "origin 0.85, 1.85, 2.85"
-    )
+    assert code == 0
+    assert said.splitlines()[-1] == "a.npz: the refined field, lattice 57 x 61 x 65"
     write_mesh(extract_mesh(read_field("a.npz")), "b.ply")
     assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
     code, out, _ = command(*run, "c.ply", "--save-field", "c.npy", "--open", "--json")
@@ -253,24 +262,12 @@ def test_targets_are_refused_before_anything_is_written():
     assert read_field("old.npz").factor == 2
 
 
-TURNED = [[0.0, 0.0, 1.0], [0.8, 0.6, 0.0], [0.6, -0.8, 0.0]]  # mirrored
-
-
-@pytest.mark.parametrize("spacing", [(0.5, 0.5, 0.5), (0.5, 0.5, 0.75)])
-def test_direction_and_spacing_are_kept(spacing):
-    off = (np.indices((14, 15, 16)).T - (6.2, 6.9, 7.1)) * spacing
-    values = np.linalg.norm(off, axis=-1).T - 4.1 * min(spacing)
-    grid = make_grid(values, spacing=spacing, origin=(3, -4, 5), direction=TURNED)
-    field = upsample(grid, trilinear)
-    for name in ("a.npz", "a.vti"):
-        write_field(field, name)
-    image, again = read_grid("a.vti"), read_field("a.npz")
+def test_image_data_lies_where_the_turned_field_does():
+    field = upsample(turned(0.75), trilinear)
+    write_field(field, "a.vti")
     ends = np.indices((2, 2, 2)).reshape(3, -1).T
     corners = [
         sorted(np.round(some.to_world(ends * (np.array(some.shape) - 1)), 5).tolist())
-        for some in (image, fine_grid(field))
+        for some in (read_grid("a.vti"), fine_grid(field))
     ]
     np.testing.assert_allclose(*corners, atol=2e-5)  # in an order that no axis decides
-    np.testing.assert_array_equal(again.positions(), field.positions())
-    for mesher in ("marching", "sharp"):
-        assert same(extract_mesh(again, mesher=mesher), reconstruct(grid, trilinear, mesher=mesher))

@@ -314,7 +314,6 @@ def test_labels_are_chosen_by_name(command, boxes):
     for words, said in (
         (("--labels", "lung"), f"--labels has 'lung': give numbers, or {known}"),
         (("--label", "lung"), "--label is 'lung': give a whole number, -2^63 to 2^64 - 1"),
-        ((), "--names names.ctbl is for --labels: give that, too"),
     ):
         run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words
         assert command(*run) == (2, "", f"Error: {said}\n")

@@ -75,17 +75,19 @@ REFUSED = {
     "of 0.5; resample the array (array.interp(y=...))": uneven(13.6),
     "coordinates of 'x' are not evenly spaced: 0 is followed by 0, a step of 0 among steps of 0; "
     "resample the array (array.interp(x=...))": sphere().assign_coords(x=np.zeros(18)),
-    "coordinate 7 of 'y' is nan: every coordinate must be finite": uneven(np.nan),
+    "coordinates of 'y' are not evenly spaced: 13 is followed by nan, a step of nan among steps "
+    "of 0.5; resample the array (array.interp(y=...))": uneven(np.nan),
     "coordinates of 'z' have dtype datetime64[s]: give numbers, in the unit of the distances": (
         sphere().assign_coords(z=np.arange(22).astype("datetime64[s]"))
     ),
     "dimensions are 'lon', 'lat', 'z': name those of the axes 'x', 'y' and 'z', with "
     "array.rename(...)": sphere().rename(x="lon", y="lat"),
-    "dimension 'time' has length 2: choose one, such as array.isel(time=0)": (
+    "values have shape (2, 18, 20, 22): give three axes (x, y, z)": (
         sphere().expand_dims(time=[1.0, 2.0])
     ),
-    "dimension 'y' has no coordinates, but 'x' has: give those of all axes, or of none "
-    "(array.drop_vars(...))": sphere().drop_vars("y"),
+    "only 'x', 'z' has coordinates: give those of all axes, or of none (array.drop_vars(...))": (
+        sphere().drop_vars("y")
+    ),
     "values have shape (18, 20): give three axes (x, y, z)": sphere().isel(z=3),
     "values have shape (18, 20, 1): give at least 2 samples on each axis": sphere().isel(z=[3]),
     "values are a Dataset: give one of its arrays (sdf)": sphere().to_dataset(),

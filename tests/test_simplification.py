@@ -224,7 +224,7 @@ def test_wrong_arguments_are_said(message):
 
 
 def test_the_command_simplifies_and_says_how_far_off(here, command):
-    words = ("upsample", "ball.npz", "a.ply", "--simplify", 0.02, "--check", "--json", "-v")
+    words = ("upsample", "ball.npz", "a.ply", "--simplify", 0.02, "--check", "--json")
     code, out, err = command(*words, *QUICK)
     report = json.loads(out)
     found, surface = report["simplified"], report["check"]["surface"]
@@ -241,10 +241,9 @@ def test_the_command_simplifies_and_says_how_far_off(here, command):
     assert err.splitlines()[-2] == (
         f"Simplified: from {found['triangles_before']:,} to {found['triangles']:,} triangles; "
         f"largest distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
-        f"{off['largest_back']:.4f} back; mean {off['mean']:.4f} and {off['mean_back']:.4f}; "
-        f"at most {0.5 * max(off['largest'], off['largest_back']):.4g} in world units"
+        f"{off['largest_back']:.4f} back"
     )
-    assert "simplify: " in err
+    assert "simplify" in report["seconds"]
     assert command("upsample", "ball.npz", "b.ply", "--tolerance", 0.01, *QUICK)[0] == 0
     assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
     _, _, err = command("upsample", "ball.npz", "c.3mf", "--simplify", 0.02, "--unit", "mm", *QUICK)

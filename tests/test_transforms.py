@@ -165,5 +165,3 @@ def test_two_slices_are_a_mask(dtype):
         spacing = np.where(np.arange(3) == axis, 5.0, 1.0)
         grid = make_grid(turned.astype(dtype), spacing=spacing, origin=0)
         np.testing.assert_array_equal(grid.values < 0, turned)
-        plane = np.moveaxis(np.broadcast_to([-0.5, 0.5], (9, 8, 2)), 2, axis)
-        assert make_grid(plane, spacing=1, inside="negative").field.kind == "distance"

@@ -88,15 +88,12 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
             lack = f"the Dask scheduler at {address} has no workers"
             raise ClusterError(f"{lack}: start some with 'dask worker {address}'")
         for worker, version in answers.items():
-            _check_version(worker, version, __version__)
+            if version != __version__:
+                said = (
+                    f"worker {worker} has another super-sdf ({version}) than here ({__version__})"
+                )
+                raise ClusterError(f"{said}: install the same version there and here")
         yield client
-
-
-def _check_version(worker: str, there: Any, here: str) -> None:
-    """Raise ClusterError unless a worker has the version of the process that asks."""
-    if there != here:
-        said = f"worker {worker} has another super-sdf ({there}) than here ({here})"
-        raise ClusterError(f"{said}: install the same version there and here")
 
 
 def completed(
@@ -117,8 +114,7 @@ def completed(
             if client.status != "running" or time.monotonic() - seen > PATIENCE_SECONDS:
                 raise ClusterError("the Dask scheduler, or all workers, were lost: run it again")
             while len(running) < max(threads, 1) and (task := take()) is not None:
-                call = partial(_at_worker, __version__, work)
-                running[client.submit(call, task, pure=False)] = task
+                running[client.submit(partial(_at_worker, work), task, pure=False)] = task
             if not running:
                 return
             done = set[Any]()
@@ -146,10 +142,9 @@ def completed(
             client.cancel(list(running))
 
 
-def _at_worker(version: str, work: Callable[..., Any], task: Any) -> Any:
-    """Work at a task in a worker, which may have come after the others were checked."""
+def _at_worker(work: Callable[..., Any], task: Any) -> Any:
+    """Work at a task in a worker, within its memory."""
     worker = get_worker()
-    _check_version(worker.address, __version__, version)
     limit = worker.memory_manager.memory_limit or 0
     return work(task, memory=int(SHARE * limit / worker.state.nthreads) or None)
 

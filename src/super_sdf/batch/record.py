@@ -23,6 +23,7 @@ from ..files.formats import files_of, is_store, split_member
 from ..files.output import naming
 
 NAME, LOCK_NAME, STAGE_NAME = "report.jsonl", ".super-sdf-batch.lock", ".super-sdf-parts"
+KEYS = {"in", "out", "status", "retry", "content", "output", "asked"}  # of every row
 OWN_NAMES = (NAME, LOCK_NAME, STAGE_NAME)
 CHUNK = 1 << 20  # bytes read at a time
 NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}  # some network drives
@@ -77,12 +78,8 @@ class Record:
     def _take(self, row: Any) -> None:
         """Keep what is a row in memory; pass over a line that is none."""
         with suppress(TypeError, KeyError, AttributeError):
-            known, content = outputs_of(row), row["content"] or {"sha256": ""}
-            texts = [row["in"], row["out"], row["status"], content["sha256"]]
-            digests = {name: each["sha256"] for name, each in known.items()}
-            texts += digests.values()
-            is_row = isinstance(row["asked"], dict) and isinstance(row["retry"], bool)
-            if is_row and all(isinstance(text, str) for text in texts):
+            digests = {name: each["sha256"] for name, each in outputs_of(row).items()}
+            if row.keys() >= KEYS:
                 self.rows[row["out"]] = row
                 for name, digest in digests.items():
                     self.made[row["out"]][name].add(digest)

@@ -43,7 +43,6 @@ class Batch:
 
     def __init__(self, jobs: Sequence[Job], settings: Settings) -> None:
         self.jobs, self.settings, self.record = jobs, settings, Record(settings.folder)
-        self.changed: dict[str, list[str]] = {}  # options of meshes that are made again
         self.written: dict[str, str] = {}  # in this run: the output of each file
         self.inputs = {os.path.realpath(job.source) for job in jobs}
         self.has_failed, self.seconds = False, 0.0  # of the run
@@ -67,11 +66,6 @@ class Batch:
 
         states = "to_do", "done_before", "failed_before", "refused"
         return {state: [known(job) for job in self.of(state)] for state in states}
-
-    def made_again(self) -> dict[str, Any]:
-        """Return how many outputs are made again since options changed, and which options."""
-        options = dict.fromkeys(name for names in self.changed.values() for name in names)
-        return {"outputs": len(self.changed), "options": list(options)}
 
     def run(self, progress: Progress | None = None) -> None:
         """Convert what is to be converted; call ``progress`` after each file is in the report."""
@@ -112,8 +106,7 @@ class Batch:
         threads, memory = options.threads, options.max_memory
         if count > 1:  # before the workers fill the memory
             threads = threads or max(1, count_cores() // count)
-            if (bound := memory_bound(memory)) is not None:
-                memory = max(1, bound - (held_memory() or 0)) // count
+            memory = max(1, memory_bound(memory) - held_memory()) // count
 
         def take() -> Job | None:
             is_over = not left or (settings.fail_fast and self.has_failed)
@@ -173,15 +166,12 @@ class Batch:
     def _plan(self, job: Job) -> None:
         """Say whether a job is done, has failed for good, is refused, or is to be done."""
         settings, how, row = self.settings, self._how(job), self.record.rows.get(job.target)
-        is_ok, changed = bool(row and row["status"] == "ok"), set[str]()
         if row:
-            now, old = ({**{k: each.get(k) for k in how}, **each["asked"]} for each in (how, row))
-            keys = (now | old).keys() - {"asked"}
-            changed = {key for key in keys if now.get(key) != old.get(key)}
+            is_ok, same_path = row["status"] == "ok", row["in"] == os.path.abspath(job.source)
             again = settings.check and "check" not in row if is_ok else settings.retry
-            same_path = row["in"] == os.path.abspath(job.source)
             if (
-                not (settings.force or row["retry"] or again or changed - {"model"})
+                not (settings.force or row["retry"] or again)
+                and all(row.get(key) == value for key, value in how.items() if key != "model")
                 and is_unchanged(job.source, row["content"], same_path=same_path)
                 and all(is_unchanged(settings.folder / n, k) for n, k in outputs_of(row).items())
             ):
@@ -191,8 +181,6 @@ class Batch:
         targets = [job.target] if not job.has_label_files else outputs_of(row) if row else []
         if why := job.wrong or self._why_not(job, targets):
             job.row, job.state = job.failed(why) | how, "refused"
-        elif is_ok and changed - {"model"}:
-            self.changed[job.target] = sorted(changed - {"turns"})
 
     def _how(self, job: Job) -> Row:
         """Return what a row says of how a mesh was made: enough to make it again."""
@@ -201,10 +189,10 @@ class Batch:
             asked["names"] = hashlib.sha256(json.dumps(names).encode()).hexdigest()
         return dict(json.loads(json.dumps({**self.network, "asked": asked})))
 
-    def write_page(self, path: Path, lead: str, interrupted: str = "") -> None:
-        """Write the page of the batch as it stands, also of other runs' rows, but not of labels.
+    def write_page(self, path: Path, lead: str) -> None:
+        """Write the page of the batch, also of other runs' rows, but not of labels.
 
-        ``lead`` is its first sentence. After an interrupt no mesh is drawn that was not yet.
+        ``lead`` is its first sentence.
         """
         from ..pages import html, items
 
@@ -216,13 +204,13 @@ class Batch:
                 del rows[name]
 
         def draw(name: str) -> items.Item | None:
-            if (job := jobs.get(name)) and not interrupted:
+            if job := jobs.get(name):
                 return items.item_of_files(folder / name, job.source, job.options)
             return None
 
-        left, why = len(self.of("to_do")), f", {interrupted}" * bool(interrupted)
-        alert = f"Incomplete{why}: {left} not finished; run it again to go on"
-        facts = {"title": f"Batch: {folder}", "lead": lead, "alert": alert if left or why else ""}
+        left = len(self.of("to_do"))
+        alert = f"Incomplete: {left} not finished; run it again to go on" if left else ""
+        facts = {"title": f"Batch: {folder}", "lead": lead, "alert": alert}
         html.write_batch_page(path, facts, rows, draw, force=self.settings.force)
 
 
@@ -237,6 +225,6 @@ def count_workers(asked: int, device: str, jobs: int, max_memory: int | None = N
     """Return how many processes to use: as asked, or one per core; no more than there is to do."""
     if not asked and device != "cpu" and (device == "cuda" or "cuda" in available_devices()):
         return 1  # on a GPU
-    free, cores = max_memory or free_memory(), count_cores()
-    room = cores if free is None else free // (MIN_BYTES_PER_WORKER if asked else BYTES_PER_WORKER)
+    cores, each = count_cores(), MIN_BYTES_PER_WORKER if asked else BYTES_PER_WORKER
+    room = (max_memory or free_memory()) // each
     return max(1, min(asked or cores, cores, room, jobs))

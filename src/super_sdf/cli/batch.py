@@ -5,17 +5,17 @@ from __future__ import annotations
 import os
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+from click import argument, option
 
-from ..errors import SuperSdfError, WriteError, check_modules
+from ..errors import check_modules
 from ..files.formats import LISTED, NAMED
-from ..options import MESH_FORMATS, OPTIONS, WORK
+from ..options import MESH_FORMATS, OPTIONS
 from . import main
-from .main import SHARED, option, table_option
+from .main import SHARED, table_option
 
 if TYPE_CHECKING:
     from ..batch.inputs import Job
@@ -43,18 +43,18 @@ MOST_FAILURES = 20  # printed; the report has all
 
 # fmt: off
 TAKES = (
-    click.argument("sources", metavar="IN...", nargs=-1, required=True),
+    argument("sources", metavar="IN...", nargs=-1, required=True),
     option("--out", "folder", metavar="DIR", required=True, type=main.FILE,
         help="Folder for the meshes and report.jsonl; subfolders of IN are kept."),
     option("--format", "kind", type=click.Choice(MESH_FORMATS), default=MESH_FORMATS[0],
         show_default=True, help="Mesh file format."),
     *map(table_option, OPTIONS),
     *(SHARED[name] for name in ("names", "cluster", "jobs")),
-    option("--fail-fast", is_flag=True, group=WORK,
+    option("--fail-fast", is_flag=True,
         help="Start no further file after the first failure."),
-    option("--retry", is_flag=True, group=WORK,
+    option("--retry", is_flag=True,
         help="Retry inputs that failed before and have not changed."),
-    option("--dry-run", is_flag=True, group=WORK, help="Show what would be done; write nothing."),
+    option("--dry-run", is_flag=True, help="Show what would be done; write nothing."),
     *(SHARED[name] for name in ("check", "report")),
     option("--force", is_flag=True,
         help="Convert everything again; replace files that are not as a batch wrote them."),
@@ -77,26 +77,21 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     with folder_lock(folder):
         batch = Batch(jobs, settings)
         total = len(batch.of("to_do"))
-        main.print_stderr(*made_again(batch) if not quiet else ())
         try:
             with main.progress_bar("converting", quiet or not total) as progress:
                 batch.run(progress)
+            batch.seconds = time.perf_counter() - start
             if page:
                 batch.write_page(page, sentence(batch))
         except KeyboardInterrupt:
-            with suppress(SuperSdfError):
-                if page:
-                    batch.write_page(page, sentence(batch), "interrupted")
             done = f"{len(batch.of('done'))} of {total} are done and kept"
             raise KeyboardInterrupt(f"{done}; run it again to go on") from None
-    batch.seconds = time.perf_counter() - start
-    report = folder / "report.jsonl"
     if given["as_json"]:
-        main.print_stdout(summary(batch), f"all is in {report}")
+        main.print_stdout(summary(batch))
     lines = [f"Failed: {job.failure()}" for job in batch.of("failed_before", "refused", "failed")]
     more, failed = len(lines) - MOST_FAILURES, bool(lines)
-    lines[MOST_FAILURES:] = [f"and {more} more, see {report}"] * (more > 0)
-    main.print_stderr(*lines, *[] if quiet else [*remarks(batch), sentence(batch)])
+    lines[MOST_FAILURES:] = [f"and {more} more, see {batch.record.path}"] * (more > 0)
+    main.print_stderr(*lines, *[sentence(batch)] * (not quiet))
     if failed:
         sys.exit(1)
 
@@ -112,12 +107,11 @@ def planned(
 
     names = read_names(given["names"]) if given["names"] else None
     jobs = find_jobs(sources, f".{given['kind']}", options, names)
-    of_labels = [job.options for job in jobs if job.options.labels is not None]
-    main.check_names(given, bool(of_labels))
-    for each in of_labels:
-        check_options(each, [name for name in ("check", "report") if given[name]])
-    if any(job.options.goals() for job in jobs):  # a list may say so
-        check_modules("simplify", "simplify")
+    for job in jobs:
+        if job.options.labels is not None:
+            check_options(job.options, [name for name in ("check", "report") if given[name]])
+        if job.options.goals():  # a list may say so
+            check_modules("simplify", "simplify")
     if page:
         from ..pages.html import is_page
         from ..pages.items import items_folder
@@ -125,8 +119,6 @@ def planned(
         sources, meshes = zip(*((job.source, folder / job.target) for job in jobs))
         main.check_page("--report", page, sources, meshes, force=given["force"] or is_page(page))
         items = items_folder(page)
-        if items.exists() and not items.is_dir():
-            raise WriteError(f"{items}, for the meshes of the page, is no folder: move it")
     some = {name: given[name] for name in ("cluster", "force", "retry", "fail_fast", "check")}
     return jobs, Settings(folder, options, given["jobs"], items=items, names=names, **some)
 
@@ -144,60 +136,34 @@ def summary(batch: Batch) -> dict[str, Any]:
         "not_begun": len(plan["to_do"]),
         "failed_before": len(plan["failed_before"]),
         "refused": len(plan["refused"]),
+        "warned": sum(bool(row["warnings"] or row.get("beside")) for row in rows),
         "closed": sum(count for count, is_closed in meshes if is_closed),
         "open": sum(count for count, is_closed in meshes if not is_closed),
         "seconds": round(batch.seconds, 3),
-        "made_again": batch.made_again(),
         "failures": failures,
-        "report": str(batch.settings.folder / "report.jsonl"),
+        "report": str(batch.record.path),
     }
 
 
 def sentence(batch: Batch) -> str:
     """Return in one line what was done."""
-    facts, seconds = summary(batch), round(batch.seconds)
-    shown = {"done": "done", "failed": "failed"}
-    more = {"done_before": "done before", "not_begun": "not begun"}
-    if not batch.of("done", "failed", "to_do"):
-        shown = {"done_before": "done before"}
-        more = {"failed_before": "failed before (--retry tries again)", "refused": "refused"}
-    more = {key: words for key, words in more.items() if facts[key]}
-    counts = ", ".join(f"{facts[key]} {words}" for key, words in (shown | more).items())
-    nothing = "" if "done" in shown else "nothing to do: "
-    time_ = f"{batch.seconds:.1f} s" if seconds < 60 else f"{seconds // 60} min {seconds % 60} s"
-    return f"{nothing}{counts}; {facts['closed']} meshes closed, {facts['open']} open; {time_}"
-
-
-def remarks(batch: Batch) -> list[str]:
-    """Return how many of the new meshes have notes, warnings and checks in the report."""
-    rows, report = [job.row for job in batch.of("done")], batch.settings.folder / "report.jsonl"
-    checks = [row["check"] for row in rows if "check" in row]
-    means = [check["residual"]["mean"] for check in checks if check.get("residual")]
-    counts = {
-        "Note: {} have notes": sum(bool(row["inferred"]) for row in rows),
-        "Warning: {} have warnings": sum(bool(r["warnings"] or r.get("beside")) for r in rows),
-        "Warning: {} have no residual": len(checks) - len(means),
-        f"Check: mean residual {max(means, default=0):.4f} voxels at most, of {{}}": len(means),
-    }
-    return [f"{text.format(count)}: see {report}" for text, count in counts.items() if count]
-
-
-def made_again(batch: Batch) -> list[str]:
-    """Return a line that says how much is made again since options changed, if anything is."""
-    again = batch.made_again()
-    names = ", ".join(name.replace("_", "-") for name in again["options"])
-    return [f"Note: {again['outputs']} are made again, since these changed: {names}"] * bool(names)
+    facts, always = summary(batch), ("done", "failed")
+    words = {key: key.replace("_", " ") for key in (*always, "done_before", "not_begun")}
+    words |= {"failed_before": "failed before (--retry tries again)", "warned": "with warnings"}
+    counts = [f"{facts[key]} {said}" for key, said in words.items() if facts[key] or key in always]
+    meshes = f"{facts['closed']} meshes closed, {facts['open']} open"
+    return f"{', '.join(counts)}; {meshes}; {facts['seconds']:.1f} s"
 
 
 def print_plan(batch: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
     plan = batch.plan()
     if as_json:
-        main.print_stdout({**plan, "made_again": batch.made_again()})
+        main.print_stdout(plan)
     for state, rows in plan.items() if not as_json else ():
         for row in rows:
             end = row.get("reason") or f"-> {batch.settings.folder / row['out']}"
             line = f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}"
             main.print_stdout("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
     counts = [f"{len(rows)} {kind.replace('_', ' ')}" for kind, rows in plan.items() if rows]
-    main.print_stderr(*made_again(batch), ", ".join(counts) or "nothing to do")
+    main.print_stderr(", ".join(counts) or "nothing to do")

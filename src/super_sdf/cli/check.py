@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click import argument, option
 
 from ..errors import check_modules
 from ..options import READ, Options
 from . import main
-from .main import SHARED, option, table_option
+from .main import SHARED, table_option
 
 HELP = """Check the mesh file MESH against the signed distance grid GRID that it was made from.
 
@@ -31,8 +32,8 @@ Examples:
 
 # fmt: off
 TAKES = (
-    click.argument("mesh", metavar="MESH", type=main.FILE),
-    click.argument("grid", metavar="GRID", type=main.FILE),
+    argument("mesh", metavar="MESH", type=main.FILE),
+    argument("grid", metavar="GRID", type=main.FILE),
     option("--tolerance", type=click.FloatRange(0), metavar="D",
         help="Fail if the largest residual of a sample is above D, in world units."),
     option("--max-mean", type=click.FloatRange(0), metavar="VOXELS",
@@ -66,9 +67,9 @@ def command(mesh: Path, grid: Path, **given: Any) -> None:
     failed += [f"the mesh has {fault}" for fault in faults]
     if given["as_json"]:
         said = {"mesh": str(mesh), "grid": str(grid), **found.report(), "limits_exceeded": failed}
-        main.print_stdout(said, "nothing was written")
+        main.print_stdout(said)
     elif not given["quiet"]:
-        main.print_stdout("\n".join(found.lines()), "nothing was written")
+        main.print_stdout("\n".join(found.lines()))
     main.print_stderr(*(f"Note: {note}" for note in found.grid.notes if not given["quiet"]))
     main.print_stderr(*(f"Limit exceeded: {sentence}" for sentence in failed))
     if failed:

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import click
+from click import argument, option
 
 from ..errors import OptionError, check_modules
 from . import main
-from .main import SHARED, option
+from .main import SHARED
 
 HELP = """Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
 
@@ -25,8 +26,8 @@ Examples:
 
 # fmt: off
 TAKES = (
-    click.argument("source", metavar="MESH", type=main.FILE),
-    click.argument("target", metavar="OUT", type=main.FILE),
+    argument("source", metavar="MESH", type=main.FILE),
+    argument("target", metavar="OUT", type=main.FILE),
     option("-n", "samples", type=click.IntRange(2), help="Samples along the longest axis."),
     option("--spacing", type=click.FloatRange(0, min_open=True), metavar="H",
         help="World distance between samples, instead of -n."),

@@ -6,11 +6,11 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-import click
+from click import argument, option
 
 from ..options import OPTIONS
 from . import main
-from .main import SHARED, option, table_option
+from .main import SHARED, table_option
 
 HELP = """Look at meshes, and at grids refined as by upsample, in the browser.
 
@@ -26,7 +26,7 @@ Examples:
 
 # fmt: off
 TAKES = (
-    click.argument("sources", metavar="MESH|GRID...", nargs=-1, required=True),
+    argument("sources", metavar="MESH|GRID...", nargs=-1, required=True),
     option("--out", type=main.FILE, metavar="PAGE.html",
         help="File for the page. Default: one in the temporary folder that only you can read."),
     SHARED["force"],

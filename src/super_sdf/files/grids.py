@@ -76,7 +76,8 @@ def read_grid(
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arrays = read_array(path, given, axes, space, max_memory)
     notes, space = arrays.pop("notes"), arrays.pop("space")
-    return with_fields(make_grid(**arrays, **values).noted(notes), space=space)
+    grid = make_grid(**arrays, **values)
+    return with_fields(grid, notes=(*notes, *grid.notes), space=space)
 
 
 def read_array(

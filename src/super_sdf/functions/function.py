@@ -17,10 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import CORNERS, without_device
 from ..errors import GridError, OptionError, OptionTypeError, seen
-from ..grid.derived import sample_near
-from ..grid.look import ORDINARY
+from ..grid.interpret import ORDINARY
 from ..grid.samples import as_triple, check_spacing
 from ..grid.sdf_grid import SdfGrid, check_grid, make_grid
+from .near import sample_near
 
 Points = NDArray[np.float64]  # (n, 3)
 Numbers = NDArray[np.float64]  # (n,)

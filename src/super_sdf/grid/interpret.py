@@ -17,16 +17,7 @@ from ..arrays import Triple
 from ..errors import GridError
 from ..options import AUTO, DISTANCE, MASK, NOISY, SMOOTH, Options
 from . import derived
-from .look import (
-    Extremes,
-    Floats,
-    Look,
-    border_share,
-    look_at,
-    named,
-    typical_slope,
-    which_level,
-)
+from .look import Extremes, Floats, Look, border_share, look_at, named, typical_slope, which_level
 from .recognise import Answer, cut_values, recognise
 from .samples import (
     LEAST_SPACING,
@@ -38,7 +29,7 @@ from .samples import (
     is_cubic,
     steps_of,
 )
-from .unknown import Known, with_known
+from .unknown import Known, check_infinite, with_known
 
 INNER = 0.25  # spacings: as deep at least samples inside are, where parts of a solid touch
 NONE_EXACT: Extremes = (0.0, 0.0)
@@ -49,6 +40,7 @@ FILLED, TOO_NEAR = 1.75, 0.85
 SNAP = 0.02  # a spacing this close to a usual one is taken as that
 UNEQUAL = 1.01  # ratio from which spacings that the values show differ
 APPROXIMATE = "from the values, so the size of the mesh is approximate (give --spacing)"
+ORDINARY = 1e-100, 1e100  # sizes whose squares are numbers, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,18 +68,6 @@ class Field:
         known = {name: np.asarray(x, float) for name, x in self.facts.items() if x is not None}
         facts = {name: np.round(x, 4).tolist() for name, x in known.items()}
         return {"kind": self.kind, "given": self.given, **facts}
-
-
-@dataclass(frozen=True, eq=False)
-class Taken:
-    """Samples to refine, their extremes and spacing, and how they are to be used."""
-
-    samples: SampleArray
-    extremes: Extremes
-    spacing: Triple
-    positive_inside: bool
-    field: Field
-    notes: list[str]
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,90 +105,102 @@ class Case:
         self.notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
         return check_spacing(spacing)
 
-    def taken(self, spacing: Triple, field: Field, facts: dict[str, Any], **more: Any) -> Taken:
-        """Return the samples as they are taken."""
+    def taken(
+        self, spacing: Triple, field: Field, facts: dict[str, Any], **more: Any
+    ) -> dict[str, Any]:
+        """Return the arguments with which a grid is made of the samples."""
         facts = {name: x for name, x in facts.items() if name != "spacing"}
         field = replace(field, facts=facts, given=self.wanted.field == field.kind)
         if self.known is not None and self.known.unseen is not None:
             field = replace(field, unseen=self.known.unseen, why_open=self.known.why_open)
-        positive = (
-            more.pop("positive_inside") if "positive_inside" in more else self.positive_inside
-        )
-        kept = {"samples": self.samples, "extremes": (self.look.low, self.look.high)} | more
-        return Taken(
-            **kept, spacing=spacing, positive_inside=positive, field=field, notes=self.notes
-        )
+        if "positive_inside" not in more:
+            more["positive_inside"] = self.positive_inside
+        kept = {"values": self.samples, "extremes": (self.look.low, self.look.high)}
+        return {**kept, **more, "spacing": spacing, "field": field, "notes": tuple(self.notes)}
 
 
 def interpret(
     samples: SampleArray, wanted: Options, spacing: ArrayLike | None, hint: str = ""
-) -> Taken:
-    """Return what the values of a grid are taken as; ``hint`` is a kind that the file states."""
+) -> dict[str, Any]:
+    """Return what the values of a grid are taken as, as arguments of ``SdfGrid.trusted``.
+
+    ``hint`` is a kind that the file states.
+    """
     steps = None if spacing is None else check_spacing(spacing)
     check_kind(samples.dtype, samples.shape)
     notes: list[str] = []
     if wanted.inside == AUTO and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
-    if wanted.label is not None or samples.dtype == np.bool_:
-        mask = samples if wanted.label is None else labelled(samples, wanted.label)
-        look = look_at(mask)
-        if look.low == look.high:
-            raise GridError(f"every value is {bool(look.low)}: a constant field has no surface")
-        return _of_mask(Case(mask, look, wanted, steps, notes), mask)
-    if wanted.unknown is not None:
+    if wanted.label is not None:
+        samples = labelled(samples, wanted.label)
+    if wanted.unknown is not None and samples.dtype.kind != "b":
         value = wanted.unknown
         samples = changed(samples, lambda planes: np.where(planes == value, np.nan, planes))
+    given = samples
     if wanted.level is not None:
         samples = changed(samples, partial(np.add, -float(wanted.level)))
         which = "below" if wanted.inside == "negative" else "above"
         notes.append(f"values {which} {wanted.level:g} are taken as inside (see --inside)")
-    if wanted.scale is not None:
+    if wanted.scale is not None and samples.dtype.kind != "b":
         samples = changed(samples, partial(np.multiply, float(wanted.scale)))
     case = Case(samples, look_at(samples), wanted, steps, notes)
-    if case.look.low > case.look.high:
+    look = case.look
+    if look.low > look.high:
         raise GridError("no value is finite: there is no surface")
-    if case.look.low == case.look.high:
-        raise GridError(f"every value is {case.look.low:.6g}: a constant field has no surface")
+    if look.low == look.high:
+        only = look.low if samples.dtype.kind == "b" else f"{look.low:.6g}"
+        raise GridError(f"every value is {only}: a constant field has no surface")
+    if samples.dtype.kind == "b":
+        return _of_mask(case, samples)
+    if not ORDINARY[0] < (largest := max(abs(look.low), abs(look.high))) < ORDINARY[1]:
+        raise GridError(f"the largest value is {largest:.6g}: multiply the values, --scale")
+    if look.infinite:
+        check_infinite(samples)
     if wanted.level is not None:
-        return _of_level(case)
+        return _of_level(case, given)
     if wanted.field == MASK:
-        return _of_sides(case if case.look.is_finite else _with_known(case), {})
-    given = None if steps is None else np.array(steps_of(steps))
-    answer = Answer(wanted.field, "", {"cut": cut_values(case.look), "spacing": given})
+        return _of_sides(case if look.is_finite else _with_known(case), {}, given)
+    steps_given = None if steps is None else np.array(steps_of(steps))
+    answer = Answer(wanted.field, "", {"cut": cut_values(look), "spacing": steps_given})
     if wanted.field == AUTO:
-        answer = recognise(samples, case.look, given, hint)
-    elif len(case.look.few) == 2:
+        answer = recognise(samples, look, steps_given, hint)
+    elif len(look.few) == 2:
         answer = Answer(MASK, "there are two values", answer.facts)
-    return _as_recognised(case, answer)
+    if answer.refusal and not (
+        answer.kind == DISTANCE and wanted.inside != AUTO and look.is_one_sided
+    ):
+        raise _refused(answer, look, given if wanted.scale else samples)
+    return _as_recognised(case, answer, given)
 
 
-def _as_recognised(case: Case, answer: Answer) -> Taken:
+def _refused(answer: Answer, look: Look, given: SampleArray) -> GridError:
+    """Return the error for values that cannot be meshed as they are."""
+    said, side = answer.refusal, ""
+    if answer.kind == DENSITY:  # a level is one of the values
+        said = which_level(look_at(given), signed=not look.is_one_sided)
+    if look.is_one_sided:
+        which = (
+            ("below", "smallest", look.low) if look.low >= 0 else ("above", "largest", look.high)
+        )
+        side = "no value is {} 0 (the {} is {:.6g}): ".format(*which)
+    return GridError(("no solid is chosen: " if answer.kind == "labels" else side) + said)
+
+
+def _as_recognised(case: Case, answer: Answer, given: SampleArray) -> dict[str, Any]:
     wanted, facts = case.wanted, answer.facts
-    if answer.refusal and not (answer.kind == DISTANCE and wanted.inside != AUTO
-                               and case.look.is_one_sided):  # fmt: skip
-        low, high = case.look.low, case.look.high
-        said = answer.refusal
-        if answer.kind == DENSITY and wanted.scale is not None:  # a level is one of the values
-            said = which_level(case.look, signed=not case.look.is_one_sided, unit=wanted.scale)
-        side = ""
-        if case.look.is_one_sided and answer.kind != "labels":
-            which = ("below", "smallest", low) if low >= 0 else ("above", "largest", high)
-            side = "no value is {} 0 (the {} is {:.6g}): ".format(*which)
-        side = "no solid is chosen: " if answer.kind == "labels" else side
-        raise GridError(side + said)
     if not case.look.is_finite or "unknown_values" in facts:
         case = _with_known(case, facts.get("unknown_values", ()))
     if answer.kind == MASK:
         if "two values" not in answer.why:
             case.notes.append(f"the values are {answer.why}")
-        return _of_sides(case, facts)
+        return _of_sides(case, facts, given)
     if answer.kind == SMOOTH:
         if answer.why:
             case.notes.append(
                 f"values taken as smooth (--field smooth), since {answer.why}: the surface is that "
                 "of their cubic spline"
             )
-        return _of_spline(case, facts)
+        return _of_spline(case, facts, given)
     if case.spacing is None:
         case = replace(case, spacing=_estimated(case, facts))
     assert case.spacing is not None
@@ -266,32 +258,31 @@ def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
 # Masks
 
 
-def _of_sides(case: Case, facts: dict[str, Any]) -> Taken:
+def _of_sides(case: Case, facts: dict[str, Any], given: SampleArray) -> dict[str, Any]:
     """Return the mask that the sides of values make; 0 is on the side ``zeros``, else inside."""
     look, wanted, samples = case.look, case.wanted, case.samples
+    if len(look.few) == 2 and 0 in look.few and wanted.inside == AUTO:
+        # the other value is inside, wherever it is
+        case = replace(case, wanted=replace(wanted, inside="positive"))
+        return _of_mask(case, changed(samples, partial(np.not_equal, 0), np.bool_), facts)
     if len(look.few) == 2:
-        low = min(look.few)
-        if 0 in look.few and wanted.inside == AUTO:  # the other value is inside, wherever it is
-            case = replace(case, wanted=replace(wanted, inside="positive"))
-            mask = changed(samples, partial(np.not_equal, 0), np.bool_)
-            return _of_mask(case, mask, facts)
-        return _of_mask(case, changed(samples, partial(np.less, low), np.bool_), facts)
+        return _of_mask(case, changed(samples, partial(np.less, min(look.few)), np.bool_), facts)
     if look.low > 0 or look.high < 0:
         raise GridError(
             f"every value is {'above' if look.low > 0 else 'below'} 0 (they go from {look.low:.6g} "
-            f"to {look.high:.6g}), so their signs make no mask: {which_level(look)}"
+            f"to {look.high:.6g}), so their signs make no mask: {which_level(look_at(given))}"
         )
     if "step" in facts:
         spacing = case.spacing_or(facts["step"], "the step of the transform")
         case = replace(case, spacing=spacing)
     below, zeros = border_share(look, lambda x: x < 0), facts.get("zeros", 0)
     is_positive = below > 0.5 if wanted.inside == AUTO else wanted.inside == "positive"
-    if look.high == 0 or zeros > 0 or (look.low < 0 and zeros == 0 and is_positive):
-        return _of_mask(case, changed(samples, partial(np.less_equal, 0), np.bool_), facts)
-    return _of_mask(case, changed(samples, partial(np.less, 0), np.bool_), facts)
+    with_zeros = look.high == 0 or zeros > 0 or (look.low < 0 and zeros == 0 and is_positive)
+    above = partial(np.less_equal if with_zeros else np.less, 0)
+    return _of_mask(case, changed(samples, above, np.bool_), facts)
 
 
-def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None) -> Taken:
+def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None) -> dict[str, Any]:
     """Return the distances of the samples that are true to those that are not, on the lattice."""
     positive = case.wanted.inside == "positive"
     if case.wanted.inside == AUTO:  # the border is outside
@@ -310,8 +301,8 @@ def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None)
     )
     h = min(steps_of(spacing))
     more = {"extremes": derived.extremes_of_masks(h), "positive_inside": False}
-    samples = derived.mask_planes(mask, h)
-    return case.taken(spacing, mask_field(spacing), facts or {}, samples=samples, **more)
+    values = derived.mask_planes(mask, h)
+    return case.taken(spacing, mask_field(spacing), facts or {}, values=values, **more)
 
 
 def mask_field(spacing: Triple) -> Field:
@@ -323,61 +314,62 @@ def mask_field(spacing: Triple) -> Field:
 # Densities, and fields with the surface of their spline
 
 
-def _of_level(case: Case) -> Taken:
+def _of_level(case: Case, given: SampleArray) -> dict[str, Any]:
     """Return values from which a level was taken, above it positive."""
     look, wanted = case.look, case.wanted
-    level = float(wanted.level or 0)
     if look.low >= 0 or look.high <= 0:
-        unit = wanted.scale or 1.0
-        low, high = (x / unit + level for x in (look.low, look.high))
+        before = look_at(given)
         raise GridError(
-            f"no value is {'above' if look.high <= 0 else 'below'} the level {level:g} (they go "
-            f"from {low:.6g} to {high:.6g}): {which_level(look, shift=level, unit=unit)}"
+            f"no value is {'above' if look.high <= 0 else 'below'} the level {wanted.level:g} "
+            f"(they go from {before.low:.6g} to {before.high:.6g}): {which_level(before)}"
         )
     if len(look.few) == 2 or wanted.field == MASK:
         return _of_mask(case, changed(case.samples, partial(np.less, 0), np.bool_))
     if not look.is_finite:
         case = _with_known(case)
     spacing = case.spacing_or(1, "since densities show none (give --spacing)")
-    return _of_spline(replace(case, spacing=spacing), {}, DENSITY)
+    return _of_spline(replace(case, spacing=spacing), {}, given, DENSITY)
 
 
-def _of_spline(case: Case, facts: dict[str, Any], kind: str = SMOOTH) -> Taken:
+def _of_spline(
+    case: Case, facts: dict[str, Any], given: SampleArray, kind: str = SMOOTH
+) -> dict[str, Any]:
     """Return values in steps of their slope beside the surface, to be meshed by their spline."""
     if case.look.is_one_sided:
-        raise GridError(f"no value is on the other side of 0: {which_level(case.look)}")
-    spacing = case.spacing or _estimated(case, facts)
-    slope = 1.0
+        raise GridError(f"no value is on the other side of 0: {which_level(look_at(given))}")
+    spacing, slope = case.spacing or _estimated(case, facts), 1.0
     if case.wanted.scale is None:
         slope = _slope_at_surface(case.look, np.array(steps_of(spacing)))
-    cubic = is_cubic(spacing)
-    own = Field(kind, exact=NONE_EXACT, network=None, own_lattice=not cubic,
-                has_jumps=bool(facts.get("cut")) and kind == SMOOTH)  # fmt: skip
-    low, high = (x / slope for x in (case.look.low, case.look.high))
-    samples: SampleArray = changed(case.samples, lambda values: values / slope)
+    own = Field(
+        kind,
+        exact=NONE_EXACT,
+        network=None,
+        own_lattice=not is_cubic(spacing),
+        has_jumps=bool(facts.get("cut")) and kind == SMOOTH,
+    )
+    extremes = case.look.low / slope, case.look.high / slope
+    values: SampleArray = changed(case.samples, lambda planes: planes / slope)
     if "inside" in facts:
-        samples = derived.without_inner_faces(
-            samples, facts["inside"], INNER * min(steps_of(spacing))
-        )
-    return case.taken(spacing, own, facts, samples=samples, extremes=(low, high))
+        deep = INNER * min(steps_of(spacing))
+        values = derived.without_inner_faces(values, facts["inside"], deep)
+    return case.taken(spacing, own, facts, values=values, extremes=extremes)
 
 
 def _slope_at_surface(look: Look, steps: Floats) -> float:
     """Return the typical slope beside the surface, in world units; of steps over 0 if unknown."""
     slope = typical_slope(look, steps, cut_values(look))
     if not np.isfinite(slope):
-        pairs = look.all_pairs * look.scale
-        slope = float(np.abs(pairs[0] - pairs[1]).max(initial=0)) / float(steps.min())
+        slope = float(np.abs(look.pairs[0] - look.pairs[1]).max(initial=0)) / float(steps.min())
     return slope or 1.0
 
 
 # Distances
 
 
-def _of_distances(case: Case, facts: dict[str, Any]) -> Taken:
+def _of_distances(case: Case, facts: dict[str, Any]) -> dict[str, Any]:
     """Return distances, of which some may be cut off; what is missing is filled in if it helps."""
     spacing, look, cut = case.spacing, case.look, facts["cut"]
-    if case.known is not None and case.known.unknown:  # unknown samples are taken as cut off
+    if case.known is not None:  # unknown samples are taken as cut off
         cut = [look.low, look.high]
     assert spacing is not None
     positive = case.positive_inside
@@ -386,15 +378,15 @@ def _of_distances(case: Case, facts: dict[str, Any]) -> Taken:
     exact = (-high, -low) if positive else (low, high)
     steps = steps_of(spacing)
     at = min(-low, high) / max(steps)
-    own, samples = Field(exact=exact), case.samples
+    own, values = Field(exact=exact), case.samples
     if at < FILLED:
         case.notes.append(f"distances that are cut off {at:.3g} voxels from the surface")
     if at < TOO_NEAR:
         cubic = is_cubic(spacing)
         own = Field(exact=exact if cubic else NONE_EXACT, network=None, own_lattice=not cubic)
     elif at < FILLED:
-        samples = derived.filled_planes(samples, steps, (look.low, look.high))
-    return case.taken(spacing, own, facts, samples=samples, positive_inside=positive)
+        values = derived.filled_planes(values, steps, (look.low, look.high))
+    return case.taken(spacing, own, facts, values=values, positive_inside=positive)
 
 
 def _estimated(case: Case, facts: dict[str, Any]) -> Triple:
@@ -404,9 +396,8 @@ def _estimated(case: Case, facts: dict[str, Any]) -> Triple:
         facts = recognise(case.samples, look).facts
     found = facts.get("spacing")
     if found is None:
-        unit = facts["unit"] * look.scale if "unit" in facts else None
-        found = np.full(3, unit or _slope_at_surface(look, np.ones(3)))
-    found = np.array(found, np.float64)
+        found = facts.get("unit") or _slope_at_surface(look, np.ones(3))
+    found = np.ones(3) * found
     if not LEAST_SPACING <= found.min() <= found.max() <= MOST_SPACING:
         raise GridError(
             f"spacing not given: the values change by {found.max():.6g} from sample to sample; give"

@@ -1,30 +1,30 @@
 """What the samples of a grid look like: all numbers once, and some of them more closely.
 
-All planes are read once, in order. What needs neighbours is asked of ``SLABS`` planes at most, with
-two to either side: half of them where the sign changes most, the others spread evenly. A small grid
-is one slab. Of these, seeded samples are kept: what is asked are shares, for which they suffice.
+All planes are read once, in order. What needs neighbours is asked of a part: a small grid as it is,
+of others some planes with two to either side, half of them where the sign changes most, the others
+spread evenly. Of that part seeded samples are kept: what is asked are shares, for which they do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray
-from .samples import SampleArray, let_go, spread_planes
+from ..arrays import BoolArray
+from .samples import SampleArray, let_go
 
 Floats: TypeAlias = NDArray[np.float64]
 Extremes: TypeAlias = tuple[float, float]
 """The smallest and the largest sample."""
 
-WHOLE = 1 << 18  # samples of a grid that is one slab
-SLABS = 16
-BOXES, LINES, PAIRS = 3000, 8000, 16_000  # that are kept
-ORDINARY = 1e-30, 1e30  # of the largest value: others are divided by it, so that squares are finite
+WHOLE = 1 << 18  # samples of a grid that is a part as it is
+SLABS, CLOSER = (4, 8), 1 << 20  # how many planes, least and most; samples of all of them, about
+BOXES, LINES, PAIRS = 3000, 8000, 5300  # that are kept
+FREQUENT = 0.01  # share of the samples, amid equal ones, that have one value
 MOST_LABELS, FEW = 1000, 3  # different values that are listed; that are looked for first
 ENOUGH = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
@@ -41,16 +41,9 @@ FACES = np.array([(1, 2, 2), (3, 2, 2), (2, 1, 2), (2, 3, 2), (2, 2, 1), (2, 2, 
 BOX = np.indices((5, 5, 5)).reshape(3, -1).T - 2
 
 
-class Slab(NamedTuple):
-    """Some planes of a grid; ``own`` are those that are asked, the others are beside them."""
-
-    planes: NDArray[Any]
-    own: slice
-
-
 @dataclass(frozen=True, eq=False)
 class Look:
-    """What is known of a grid's samples; in float64 arrays, NaN is unknown or beyond the grid."""
+    """What is known of a grid's samples; in float arrays, NaN is unknown or beyond what is seen."""
 
     shape: tuple[int, ...]
     low: float  # of the finite samples
@@ -59,16 +52,14 @@ class Look:
     infinite: int
     few: list[Any]  # different finite values, up to ``FEW`` of them, as found
     faces: NDArray[Any]  # all samples on the border of the grid
-    slabs: list[Slab] = field(default_factory=list)
-    scale: float = 1.0  # by which what is kept was divided
+    # samples that are asked, (p, ny, nz); a plane of NaN is between planes that are not neighbours
+    part: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0)))
     # samples (n, 5, 5, 5) round some beside the surface at 0
     boxes: Floats = field(default_factory=lambda: np.empty((0, 5, 5, 5)))
     # (m, 3, 5), through samples that are neither the lowest nor the highest
     lines: Floats = field(default_factory=lambda: np.empty((0, 3, 5)))
-    pairs: list[Floats] = field(default_factory=list)  # of each axis: different neighbours, (2, k)
-    at_ends: tuple[float, float] = 0.0, 0.0  # share of the samples amid the lowest, the highest
-    # other values, and their shares, of which one sample in 100 is amid equal ones
-    common: dict[float, float] = field(default_factory=dict)
+    pairs: Floats = field(default_factory=lambda: np.empty((2, 0)))  # different neighbours, (2, k)
+    frequent: dict[float, float] = field(default_factory=dict)  # values, and the share of samples
 
     @property
     def is_finite(self) -> bool:
@@ -80,16 +71,11 @@ class Look:
         """Whether no value is below 0, or none above."""
         return self.low >= 0 or self.high <= 0
 
-    @property
-    def all_pairs(self) -> Floats:
-        """The pairs of all axes."""
-        return np.concatenate(self.pairs, axis=1)
-
     def without(self, value: float) -> Look:
         """Return the same with the kept samples of a value unknown."""
         boxes, lines = (np.where(x == value, np.nan, x) for x in (self.boxes, self.lines))
         sides = np.sign(boxes[(slice(None), *FACES.T)]) * np.sign(boxes[:, 2, 2, 2])[:, None]
-        pairs = [x[:, (x != value).all(0)] for x in self.pairs]
+        pairs = self.pairs[:, (self.pairs != value).all(0)]
         return replace(self, boxes=boxes[(sides < 0).any(1)], lines=lines, pairs=pairs)
 
 
@@ -108,14 +94,15 @@ def look_at(samples: SampleArray) -> Look:
             least, most = finite.min(initial=np.inf), finite.max(initial=-np.inf)
         low, high = min(low, least.item()), max(high, most.item())
         inside = plane > 0
-        changes[i] = sum(int(np.count_nonzero(a != b)) for a, b in _beside(inside, former))
+        sides = [(inside[1:], inside[:-1]), (inside[:, 1:], inside[:, :-1])]
+        sides += [] if former is None else [(inside, former)]
+        changes[i] = sum(int(np.count_nonzero(a != b)) for a, b in sides)
         former = inside
-        for part in (plane[:1], plane):
-            few = few if len(few) >= FEW else _more_values(part, few)
-        is_end = i in (0, len(samples) - 1)
-        faces += [plane.ravel()] if is_end else []
+        for rows in (plane[:1], plane):
+            few = few if len(few) >= FEW else _more_values(rows, few)
+        faces += [plane.ravel()] if i in (0, len(samples) - 1) else []
         faces += [plane[0], plane[-1], plane[:, 0], plane[:, -1]]
-        if i % SLABS == 0:
+        if i % 16 == 0:
             let_go(samples)
     shape, together = tuple(map(int, samples.shape)), np.concatenate(faces)
     look = Look(shape, low, high, unknown, infinite, few, together)
@@ -123,13 +110,7 @@ def look_at(samples: SampleArray) -> Look:
         return look
     if high <= 0:
         changes = np.array([np.count_nonzero(plane < 0) for plane in samples])
-    look = replace(look, slabs=_slabs(samples, changes))
-    return _with_samples(look)
-
-
-def _beside(plane: BoolArray, former: BoolArray | None) -> list[tuple[BoolArray, BoolArray]]:
-    sides = [(plane[1:], plane[:-1]), (plane[:, 1:], plane[:, :-1])]
-    return sides if former is None else [*sides, (plane, former)]
+    return _closer(look, *_part_of(samples, changes))
 
 
 def _more_values(part: NDArray[Any], few: list[Any]) -> list[Any]:
@@ -144,67 +125,56 @@ def _more_values(part: NDArray[Any], few: list[Any]) -> list[Any]:
     return few
 
 
-def _slabs(samples: SampleArray, changes: NDArray[np.int64]) -> list[Slab]:
-    count = len(samples)
-    if np.prod(samples.shape, dtype=float) <= WHOLE:
-        return [Slab(np.asarray(samples[:]), slice(0, count))]
+def _part_of(samples: SampleArray, changes: NDArray[np.int64]) -> tuple[NDArray[Any], BoolArray]:
+    """Return the part that is asked, (p, ny, nz), and which planes are not there for others."""
+    count, plane = len(samples), int(np.prod(samples.shape[1:]))
+    small = samples.dtype in (np.float16, np.float32) or samples.dtype.itemsize < 3
+    kind = np.float32 if small else np.float64
+    if count * plane <= WHOLE:
+        return np.asarray(samples[:], kind), np.ones(count, bool)
+    half = int(np.clip(CLOSER // plane, *SLABS)) // 2
     total = np.cumsum(changes)
-    where = np.searchsorted(total, (np.arange(SLABS // 2) + 0.5) / (SLABS // 2) * total[-1])
-    chosen = {*where.clip(0, count - 1).tolist(), *spread_planes(0, count - 1, SLABS // 2)}
-    slabs = []
-    for i in sorted(chosen):
+    where = np.searchsorted(total, (np.arange(half) + 0.5) / half * total[-1]).clip(0, count - 1)
+    chosen = np.unique([*where, *np.linspace(0, count - 1, half).astype(int)])
+    parts, own = list[NDArray[Any]](), list[BoolArray]()
+    for i in chosen.tolist():
         low = max(i - 2, 0)
-        slabs.append(Slab(np.asarray(samples[low : i + 3]), slice(i - low, i - low + 1)))
+        slab = np.asarray(samples[low : i + 3], kind)
         let_go(samples)
-    return slabs
+        parts += [slab, np.full((1, *slab.shape[1:]), np.nan, kind)]
+        own.append(np.arange(len(slab) + 1) == i - low)
+    return np.concatenate(parts), np.concatenate(own)
 
 
-def _with_samples(look: Look) -> Look:
-    """Return a look with boxes, lines and pairs."""
-    random, largest = np.random.default_rng(0), max(abs(look.low), abs(look.high))
-    scale = 1.0 if ORDINARY[0] < largest < ORDINARY[1] else float(largest)
-    boxes, lines, pairs = list[Floats](), list[Floats](), [list[Floats](), [], []]
-    ends, count = np.zeros(2, np.int64), 0
-    others: dict[float, int] = {}
-    for planes, own in look.slabs:
-        # beside the ends along the first axis nothing is known, even if there are more planes
-        kind = np.float32 if planes.dtype in (np.float16, np.float32) else np.float64
-        values = planes.astype(kind, copy=False)
-        if not look.is_finite:
-            values = np.where(np.isfinite(values), values, np.nan)
-        padded = np.pad(values, 2, constant_values=np.nan)
-        flat, step = padded.ravel(), np.array([padded[0].size, padded.shape[2], 1])
-        base = 2 * int(step.sum())
-        for places, offsets, most, found in (
-            (_beside_surface(planes, own), BOX, BOXES, boxes),
-            (_between_ends(planes, own, look), AXES, LINES, lines),
-        ):
-            some = _some(places, most // len(look.slabs), random)
-            at = np.stack(np.unravel_index(some, planes.shape), 1) @ step + base
-            found.append(flat.take(at[:, None] + offsets @ step).astype(np.float64))
-        for axis in range(3):
-            around = np.moveaxis(planes, axis, 0)
-            one, other = around[:-1], around[1:]
-            some = _some(np.flatnonzero(one != other), PAIRS // 3 // len(look.slabs), random)
-            at = np.unravel_index(some, one.shape)
-            pairs[axis].append(np.stack([one[at], other[at]]).astype(np.float64))
-        inner, neighbours = equal_neighbours(Slab(planes, own))
-        amid = inner[neighbours == 6]  # samples amid equal ones
-        ends += [np.count_nonzero(amid == look.low), np.count_nonzero(amid == look.high)]
-        count += inner.size
-        rest = amid[(amid > look.low) & (amid < look.high)]
-        for value, times in zip(*np.unique(rest, return_counts=True)):
-            others[float(value)] = others.get(float(value), 0) + int(times)
-    together = [np.concatenate(each, axis=1) / scale for each in pairs]
-    return replace(
-        look,
-        scale=scale,
-        boxes=(np.concatenate(boxes) / scale).reshape(-1, 5, 5, 5),
-        lines=(np.concatenate(lines) / scale)[:, ON_LINES],
-        pairs=[each[:, np.isfinite(each).all(0)] for each in together],
-        at_ends=(ends[0] / count, ends[1] / count),
-        common={x: n / count for x, n in others.items() if n > 0.01 * count},
-    )
+def _closer(look: Look, part: NDArray[Any], own: BoolArray) -> Look:
+    """Return a look with samples of a part of the grid; those asked lie in the own planes."""
+    random = np.random.default_rng(0)
+    if not look.is_finite:
+        part = np.where(np.isfinite(part), part, np.nan)
+    padded = np.pad(part, 2, constant_values=np.nan)
+    flat, step = padded.ravel(), np.array([padded[0].size, padded.shape[2], 1])
+
+    def around(asked: BoolArray, offsets: NDArray[Any], most: int) -> Floats:
+        asked[~own] = False
+        at = np.stack(np.unravel_index(_some(np.flatnonzero(asked), most, random), part.shape), 1)
+        found: Floats = flat.take(((at + 2) @ step)[:, None] + offsets @ step).astype(np.float64)
+        return found
+
+    boxes = around(beside_surface(part), BOX, BOXES).reshape(-1, 5, 5, 5)
+    lines = around((part > look.low) & (part < look.high), AXES, LINES)[:, ON_LINES]
+    pairs = list[Floats]()
+    for axis in range(3):
+        lines_of = np.moveaxis(part, axis, 0)
+        one, other = lines_of[:-1], lines_of[1:]
+        places = np.flatnonzero((one != other) & ~np.isnan(one) & ~np.isnan(other))
+        at = np.unravel_index(_some(places, PAIRS, random), one.shape)
+        pairs.append(np.stack([one[at], other[at]]).astype(np.float64))
+    amid = part[equal_neighbours(part) == 6]  # samples amid equal ones
+    found, times = np.unique(amid, return_counts=True)
+    shares = zip(found.tolist(), (times / np.count_nonzero(~np.isnan(part))).tolist())
+    frequent = {value: share for value, share in shares if share > FREQUENT}
+    together = np.concatenate(pairs, axis=1)
+    return replace(look, part=part, boxes=boxes, lines=lines, pairs=together, frequent=frequent)
 
 
 def _some(places: NDArray[np.intp], most: int, random: np.random.Generator) -> NDArray[np.intp]:
@@ -215,27 +185,30 @@ def _some(places: NDArray[np.intp], most: int, random: np.random.Generator) -> N
     return places[(parts * (len(places) / most)).astype(np.intp)]
 
 
-def _beside_surface(planes: NDArray[Any], own: slice) -> NDArray[np.intp]:
-    """Return the samples of the own planes (flat places) with another side beside them."""
-    sides = (planes > 0).view(np.int8) - (planes < 0).view(np.int8)
-    near = np.zeros(planes.shape, bool)
-    known = None if planes.dtype.kind != "f" else ~np.isnan(planes)
+def beside_surface(values: NDArray[Any]) -> BoolArray:
+    """Return which samples have a known one of another sign beside them."""
+    sides = (values > 0).view(np.int8) - (values < 0).view(np.int8)
+    near, known = np.zeros(values.shape, bool), ~np.isnan(values)
     for axis in range(3):
-        s, n = np.moveaxis(sides, axis, 0), np.moveaxis(near, axis, 0)
-        crossing = s[1:] != s[:-1]
-        if known is not None:
-            k = np.moveaxis(known, axis, 0)
-            crossing &= k[1:] & k[:-1]
+        s, n, k = (np.moveaxis(x, axis, 0) for x in (sides, near, known))
+        crossing = (s[1:] != s[:-1]) & k[1:] & k[:-1]
         n[1:] |= crossing
         n[:-1] |= crossing
-    near[: own.start] = near[own.stop :] = False
-    return np.flatnonzero(near)
+    return near
 
 
-def _between_ends(planes: NDArray[Any], own: slice, look: Look) -> NDArray[np.intp]:
-    inner = (planes > look.low) & (planes < look.high)
-    inner[: own.start] = inner[own.stop :] = False
-    return np.flatnonzero(inner)
+def equal_neighbours(values: NDArray[Any]) -> NDArray[np.int8]:
+    """Return how many of their six neighbours equal samples, or are not known."""
+    equal, unknown = np.zeros(values.shape, np.int8), np.isnan(values)
+    for axis in range(3):
+        v, n, u = (np.moveaxis(x, axis, 0) for x in (values, equal, unknown))
+        same = v[1:] == v[:-1]
+        n[1:] += same | u[:-1]
+        n[:-1] += same | u[1:]
+        n[0] += 1
+        n[-1] += 1
+    equal[unknown] = 0
+    return equal
 
 
 def border_share(look: Look, is_marked: Callable[[NDArray[Any]], BoolArray]) -> float:
@@ -252,8 +225,8 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
     """
     boxes = look.boxes[:, 1:4, 1:4, 1:4]
     lines = np.stack([boxes[:, :, 1, 1], boxes[:, 1, :, 1], boxes[:, 1, 1]], 1)
-    lines = np.where(np.isin(lines, [x / look.scale for x in cut]), np.nan, lines)
-    rise = np.diff(lines) / (steps[:, None] / look.scale)
+    lines = np.where(np.isin(lines, cut), np.nan, lines)
+    rise = np.diff(lines) / steps[:, None]
     mean = np.sqrt((rise.mean(2) ** 2).sum(1))
     known = np.isfinite(mean) & (mean > 0)
     if known.sum() >= max(ENOUGH, len(lines) / 2) or not len(cut):
@@ -270,18 +243,12 @@ def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int
         flat = np.ravel(plane)
         if flat.dtype.kind == "f":
             flat = flat[np.isfinite(flat)]
-        some = flat[:: max(flat.size // TRIED, 1)]
-        if len(np.unique(some)) > MOST_LABELS:
+        if len(np.unique(flat[:: max(flat.size // TRIED, 1)])) > MOST_LABELS:
             return None
-        if flat.dtype.kind in "iu" and flat.dtype.itemsize == 1:
-            many = np.bincount(flat.view(np.uint8), minlength=256)
-            at = np.flatnonzero(many)
-            found, times = at.astype(np.uint8).view(flat.dtype), many[at]
-        else:  # the first sample of each run, and how long it is
-            first = np.flatnonzero(np.append(flat.size > 0, flat[1:] != flat[:-1]))
-            long = np.diff(np.append(first, flat.size))
-            found, which = np.unique(flat[first], return_inverse=True)
-            times = np.bincount(which, long).astype(np.int64)
+        # the first sample of each run, and how long it is
+        first = np.flatnonzero(np.append(flat.size > 0, flat[1:] != flat[:-1]))
+        found, which = np.unique(flat[first], return_inverse=True)
+        times = np.bincount(which, np.diff(np.append(first, flat.size))).astype(np.int64)
         for value, number in zip(found.tolist(), times.tolist()):
             counts[value] = counts.get(value, 0) + number
         if len(counts) > MOST_LABELS:
@@ -291,94 +258,46 @@ def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int
     return kept, np.array([counts[value] for value in values], np.int64)
 
 
-def equal_neighbours(slab: Slab) -> tuple[NDArray[Any], NDArray[np.int8]]:
-    """Return the samples of the own planes, and how many of their six neighbours equal them."""
-    planes, own = slab
-    equal: NDArray[np.int8] = np.zeros(planes.shape, np.int8)
-    for axis in range(3):
-        v, n = np.moveaxis(planes, axis, 0), np.moveaxis(equal, axis, 0)
-        same = v[1:] == v[:-1]
-        n[1:] += same
-        n[:-1] += same
-        n[0] += 1  # beyond the border the grid goes on
-        n[-1] += 1
-    return planes[own], equal[own]
-
-
-def valleys(slab: Slab, slope: float, sign: int) -> tuple[int, int]:
-    """Count valleys of slope, sign * values above 0, where 0 is near and the sign does not change.
-
-    And the changes of sign of neighbours. Of one plane only those along it are counted.
-    """
-    planes, own = slab
-    values: FloatArray = np.asarray(planes[own] * (sign / slope), np.float32)
-    values[np.isinf(values)] = np.nan
-    count = changes = 0
-    for axis in range(3):
-        v = np.moveaxis(values, axis, 0)
-        changes += int(np.count_nonzero((v[1:] > 0) != (v[:-1] > 0)))
-        before, x, after = v[:-2], v[1:-1], v[2:]
-        low = (x >= 0) & (x < 0.52) & (before > x) & ((after > x) | ((after == x) & (x > 0.25)))
-        count += int((low & (before + after - 2 * x > 0.9)).sum())
-    return count, changes
-
-
 # What a refusal names
 
 
-def which_level(look: Look, *, signed: bool = False, shift: float = 0.0, unit: float = 1.0) -> str:
-    """Return the advice to give a level: the one over which neighbours differ most.
+def which_level(look: Look, *, signed: bool = False) -> str:
+    """Return the advice to give a level: that over which neighbours differ most.
 
     It is the shortest number among those that are about as good, and never a value of a sample.
-    ``shift`` was taken from all values, which then were multiplied by ``unit``.
     """
-    pairs = look.all_pairs * (look.scale / unit) + shift
-    low, high = np.sort(pairs, axis=0)
-    ends = np.quantile(pairs, [0.002, 0.998]).tolist()
+    low, high = np.sort(look.pairs, axis=0)
+    ends = np.quantile(look.pairs, [0.002, 0.998]).tolist()
     levels = np.linspace(ends[0], ends[1], LEVELS + 2)[1:-1]
-    first, last = np.searchsorted(levels, [low, high])
-    sums, counts = np.zeros((2, LEVELS + 1))
-    for at, side in ((first, 1), (last, -1)):
-        sums += side * np.bincount(at, high - low, LEVELS + 1)
-        counts += side * np.bincount(at, None, LEVELS + 1)
-    total = np.cumsum(counts)[:-1]
-    steps = np.where(
-        total >= max(LEAST, SHARE * total.max()), np.cumsum(sums)[:-1] / total.clip(1), 0
-    )
-    faces = np.sort(look.faces[np.isfinite(look.faces)]) / unit + shift
+    over = (low[:, None] < levels) & (high[:, None] >= levels)
+    total = over.sum(0)
+    steps = np.where(total >= max(LEAST, SHARE * total.max()), (high - low) @ over, 0)
+    steps = steps / total.clip(1)
+    faces = np.sort(look.faces[np.isfinite(look.faces)])
     share = np.searchsorted(faces, levels) / max(len(faces), 1)  # of the border, below a level
-    middle = look.lines[:, 0, 2] * (look.scale / unit) + shift
-    inner = np.array([np.mean(middle < level) for level in levels])
+    inner = (look.lines[:, 0, 2][:, None] < levels).mean(0) if len(look.lines) else share
     # values that grow outwards: above are only the corners of the grid
     grows = (1 - share > GROWS * (1 - inner)) & (share > 0.5)
     if grows[steps.argmax()] and (all_above := share < 0.1).any():
         steps = np.where(all_above, steps, 0)
     good = levels[steps >= AS_GOOD * steps.max()]
-    level = _short_number(good)
-    values = np.unique(np.append(pairs, [x + shift for x in (look.low, look.high)]))
+    middle = float(np.median(good))
+    short = (float(f"{middle:.{digits}g}") for digits in (1, 2, 3))
+    level = next((x for x in short if good.min() <= x <= good.max()), middle)
     if look.faces.dtype.kind in "iu":
         level = float(np.floor(level)) + 0.5
+    values = np.unique(np.append(look.pairs, (look.low, look.high)))
     at = int(np.searchsorted(values, level))
     if at < len(values) and values[at] == level:
-        beside = values[at - 1] if at else values[at + 1]
-        level = float(beside + values[at]) / 2
-    outside = border_share(look, lambda x: x / unit > level - shift) > MOST_OUTSIDE
+        level = float(values[at - 1 if at else 1] + level) / 2
+    outside = border_share(look, lambda x: x > level) > MOST_OUTSIDE
     option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
     other = " (or --field smooth, if it is at 0)" if signed else ""
     return f"they look like densities: give the level of their surface, such as {option}{other}"
 
 
-def _short_number(good: Floats) -> float:
-    middle = float(np.median(good))
-    for digits in (1, 2, 3):
-        short = float(f"{middle:.{digits}g}")
-        if good.min() <= short <= good.max():
-            return short
-    return middle
-
-
 def which_label(samples: SampleArray) -> str:
-    """Return the advice to choose a label: the most frequent one that is not the border's."""
+    """Return the advice to choose a label: the most frequent that is not the border's."""
     found = different_values(samples)
     if found is None:
         return "they are labels: choose one with --label, or some with --labels"

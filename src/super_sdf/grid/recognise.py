@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .look import (
     BOX,
@@ -31,11 +30,10 @@ from .look import (
     different_values,
     equal_neighbours,
     typical_slope,
-    valleys,
     which_label,
     which_level,
 )
-from .samples import SampleArray
+from .samples import SampleArray, over_three
 
 # 2. Labels: share of the samples off the background that equal 4 or more of their 6 neighbours; of
 # neighbours that differ, how many by one rank; by how much labels may be off whole numbers, and
@@ -96,6 +94,7 @@ ENOUGH = 20  # samples from which a share is evidence
 
 FACES = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
 LENGTHS = BOX.astype(np.float64)
+TRANSFORM = "a distance transform, so only their sign says something"
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,25 +112,18 @@ def recognise(
 ) -> Answer:
     """Return what samples are; ``given`` is the spacing (3,), ``hint`` what a file says of them."""
     facts: dict[str, Any] = {"cut": cut_values(look)}
-    if hint == "labels":
+    if len(look.few) == 2 and hint != "labels":
+        return Answer("mask", "there are two values", facts)
+    if hint == "labels" or (not hint and _are_labels(samples, look, facts)):
         return Answer("labels", "", facts, which_label(samples))
-    if len(look.few) == 2:
-        if not is_plane(look):
-            return Answer("mask", "there are two values", facts)
-        steps = np.full(3, look.high - look.low) if given is None else given
-        return Answer("distance", "", facts | {"spacing": steps})
-    if look.is_finite and not hint and _are_labels(samples, look, facts):
-        return Answer("labels", "", facts, which_label(samples))
-    transform = "a distance transform, so only their sign says something"
     follow = not hint and _follow_from_signs(look, given, facts)
     is_sure = follow and (facts["shape"] >= FOLLOW or facts["zeros"] >= ZEROS)
     if (is_sure and facts["stepped"]) or (follow and _jump_over_0(look)):
-        return Answer("mask", transform, facts | {"zeros": _side_of_zeros(look)})
+        return Answer("mask", TRANSFORM, facts | {"zeros": _side_of_zeros(look)})
     signs = look
     look = _without_sentinels(look, facts)
     facts["digit"] = _last_digit(look)
-    is_cut = np.isin(look.lines, np.array(facts["cut"]) / look.scale)
-    unit = _find_unit(np.where(is_cut, np.nan, look.lines), given, facts)
+    unit = _find_unit(np.where(np.isin(look.lines, facts["cut"]), np.nan, look.lines), given, facts)
     enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
     if unit is not None and enough and facts["slopes"] >= SLOPES:
         steps = unit * (np.ones(3) if given is None else given)
@@ -139,7 +131,7 @@ def recognise(
         if facts["contradictions"] <= CONTRADICTIONS:
             return _distances(look, unit, given, facts)
     if follow and facts["stepped"]:
-        return Answer("mask", transform, facts | {"zeros": _side_of_zeros(signs)})
+        return Answer("mask", TRANSFORM, facts | {"zeros": _side_of_zeros(signs)})
     if hint == "density":
         return Answer("density", "", facts, which_level(look))
     if look.is_one_sided:
@@ -155,37 +147,30 @@ def recognise(
 
 def cut_values(look: Look) -> list[float]:
     """Return the lowest and the highest value, as far as many samples have them."""
-    ends = zip((look.low, look.high), look.at_ends)
-    return [value for value, share in ends if share > CUT]
+    return [value for value in (look.low, look.high) if look.frequent.get(value, 0) > CUT]
 
 
-# Questions 1 to 3: masks and labels
-
-
-def is_plane(look: Look) -> bool:
-    """Return whether two values differ along an axis of two samples only: a plane is between."""
-    if 2 not in look.shape or look.slabs[0].planes.dtype.kind in "iub":
-        return False
-    lines = [np.moveaxis(look.slabs[0].planes, axis, 0) for axis in range(3)]
-    return any(len(x) == 2 and bool((x == x[:, :1, :1]).all()) for x in lines)
+# Questions 2 and 3: labels and masks
 
 
 def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool:
-    some = look.all_pairs.ravel() * look.scale
-    if not (_are_whole(some[:: len(some) // 100 + 1]) and _are_whole(some)):
+    if not look.is_finite or not _are_whole(look.pairs.ravel()):
         return False
     found = different_values(samples)
     if found is None or not _are_whole(found[0].astype(np.float64)):
         return False
     distinct, counts = found
     facts["different"] = len(distinct)
-    ranks = [np.searchsorted(distinct, pair * look.scale) for pair in look.pairs]
-    steps = np.concatenate([np.abs(one - other) for one, other in ranks])
-    facts["by_rank"] = by_rank = float((steps == 1).mean()) if len(steps) else 0.0
-    if len(distinct) > 3 and by_rank >= BY_RANK:
-        facts["amid"] = _share_amid(look, distinct, counts, 6)
+    ranks = np.abs(np.diff(np.searchsorted(distinct, look.pairs), axis=0))
+    facts["by_rank"] = float((ranks == 1).mean())
+    inner = ~np.isnan(look.part) & (look.part != distinct[counts.argmax()])
+    if len(distinct) > 3:  # images are cut off at their ends
+        inner &= (look.part != look.low) & (look.part != look.high)
+    equal = equal_neighbours(look.part)[inner]
+    if len(distinct) > 3 and facts["by_rank"] >= BY_RANK:
+        facts["amid"] = float((equal == 6).mean()) if len(equal) else 1.0
         return bool(facts["amid"] >= AMID)
-    facts["plateaus"] = _share_amid(look, distinct, counts, 4)
+    facts["plateaus"] = float((equal >= 4).mean()) if len(equal) else 1.0
     few = len(distinct) <= FEW_LABELS and look.low >= 0
     return bool(few or facts["plateaus"] >= PLATEAUS)
 
@@ -195,24 +180,11 @@ def _are_whole(values: Floats) -> bool:
     some = values[np.abs(values) > WHOLE]
     if not len(some) or np.abs(some).max() < 1 - FACTOR:
         return False
-    least = some[np.abs(some).argmin()]
-    factor = least / max(np.rint(np.abs(least)), 1) * np.sign(least)
+    least = np.abs(some).min()
+    factor = least / max(np.rint(least), 1)
     some = some / factor
     off = np.abs(some - np.rint(some)) <= np.maximum(WHOLE, 1e-9 * np.abs(some))
     return bool(abs(factor - 1) <= FACTOR and off.all())
-
-
-def _share_amid(look: Look, distinct: NDArray[Any], counts: NDArray[np.int64], least: int) -> float:
-    """Return the share of samples off the background that equal ``least`` neighbours or more."""
-    background, equal, total = distinct[counts.argmax()], 0, 0
-    for slab in look.slabs:
-        values, neighbours = equal_neighbours(slab)
-        inner = values != background
-        if len(distinct) > 3:  # images are cut off at their ends
-            inner &= (values != distinct[0]) & (values != distinct[-1])
-        equal += int(np.count_nonzero(neighbours[inner] >= least))
-        total += int(np.count_nonzero(inner))
-    return equal / total if total else 1.0
 
 
 def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
@@ -223,9 +195,9 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
     """
     boxes = look.boxes[:, 1:4, 1:4, 1:4]
     facts["zeros"] = float((look.boxes[:, 2, 2, 2] == 0).mean()) if len(look.boxes) else 0.0
-    facts["follow"], most, largest = 0.0, 0, max(abs(look.low), abs(look.high)) / look.scale
+    facts["follow"], most, largest = 0.0, 0, max(abs(look.low), abs(look.high))
     fine = np.repeat(np.ones(3, bool) if given is None else given < 1.01 * given.min(), 2)
-    cut = [x / look.scale for x in facts["cut"] if x]
+    cut = [x for x in facts["cut"] if x]
     whole = np.isfinite(boxes).all((1, 2, 3)) & (boxes[:, 1, 1, 1] != 0)
     for signs in (boxes > 0, boxes >= 0):  # 0 may be on either side
         along = (signs != signs[:, 1:2, 1:2, 1:2])[(slice(None), *FACES[fine].T)]
@@ -240,8 +212,7 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
         bits = np.packbits(signs[free].reshape(-1, 27), axis=1)
         key = np.ascontiguousarray(bits).view(np.uint32).ravel()
         order = np.argsort(key, kind="stable")
-        same = np.diff(key[order]) == 0
-        share = shape
+        same, share = np.diff(key[order]) == 0, shape
         if same.sum() >= 5 * ENOUGH:
             equal = np.abs(np.diff(x[order])[same]) <= 0.01 * typical
             share = max(shape, float(equal.mean()))
@@ -249,39 +220,26 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
             most, patterns = len(x), int(np.count_nonzero(~same)) + 1
             stairs = float((along[free].reshape(most, -1, 2).any(2).sum(1) > 1).mean())
             is_many = patterns > PATTERNS or patterns > OF_ALL * most
-            facts.update(follow=share, shape=shape, stairs=stairs, step=typical * look.scale)
+            facts.update(follow=share, shape=shape, stairs=stairs, step=typical)
             facts["stepped"] = stairs > STAIRS and is_many and len(cut) < 2
     return bool(facts["follow"] >= FOLLOW)
 
 
 def _jump_over_0(look: Look) -> bool:
-    """Return whether along an axis all steps over 0 are larger than all others."""
-    for one, other in look.pairs:
-        size, over = np.abs(one - other), (one > 0) != (other > 0)
-        if over.sum() > ENOUGH and size[over].min() > JUMPS * size[~over].max(initial=0):
-            return True
-    return False
+    """Return whether all steps over 0 are larger than all others."""
+    one, other = look.pairs
+    size, over = np.abs(one - other), (one > 0) != (other > 0)
+    return bool(over.sum() > ENOUGH and size[over].min() > JUMPS * size[~over].max(initial=0))
 
 
 def _side_of_zeros(look: Look) -> int:
-    """Return the side of samples that are 0: that which has none of its own beside some of them.
-
-    All 26 round a sample are beside it or, if that does not tell, the 6 along the axes.
-    """
-    for along_axes in (False, True):
-        lone = [0, 0]
-        for planes, own in look.slabs:
-            for nth, marked in enumerate((planes < 0, planes > 0)):
-                near = marked.copy()
-                for axis in range(3):
-                    source = marked if along_axes else near.copy()
-                    m, n = np.moveaxis(source, axis, 0), np.moveaxis(near, axis, 0)
-                    n[1:] |= m[:-1]
-                    n[:-1] |= m[1:]
-                lone[nth] += int(np.count_nonzero((planes == 0)[own] & ~near[own]))
-        if lone[0] != lone[1]:
-            return int(np.sign(lone[1] - lone[0]))
-    return 0
+    """Return the side of samples that are 0: that which has none of its own beside some of them."""
+    zeros = look.part == 0
+    lone = [
+        np.count_nonzero(zeros & ~over_three(side, np.logical_or))
+        for side in (look.part < 0, look.part > 0)
+    ]
+    return int(np.sign(lone[1] - lone[0]))
 
 
 # Question 4: unknown samples
@@ -291,13 +249,10 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
     """Return a look without values of many samples to which the others jump, if there are some."""
     if not look.low < 0 < look.high:
         return look
-    shares = {look.low: look.at_ends[0], look.high: look.at_ends[1], **look.common}
-    frequent = [value for value, share in shares.items() if share >= CUT]
-    pairs = look.all_pairs * look.scale
-    change, is_frequent = np.abs(pairs[0] - pairs[1]), np.isin(pairs, frequent).all(0)
-    found = []
-    for value in frequent:
-        at = (pairs == value).any(0)
+    change = np.abs(look.pairs[0] - look.pairs[1])
+    is_frequent, found = np.isin(look.pairs, list(look.frequent)).all(0), []
+    for value in look.frequent:
+        at = (look.pairs == value).any(0)
         steps = change[at & ~is_frequent]
         if not len(steps) or at.all():
             continue
@@ -313,7 +268,7 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
         facts["cut"] = [x for x in facts["cut"] if x not in found]
         facts.pop("perhaps_unknown", None)
     for value in found:
-        look = look.without(value / look.scale)
+        look = look.without(value)
     return look
 
 
@@ -322,9 +277,10 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
 
 def _last_digit(look: Look) -> float:
     """Return by how much values beside the surface typically differ at least."""
-    values = look.boxes[:, 2, 2, 2].astype(np.float32)
+    largest = max(abs(look.low), abs(look.high))
+    values = (look.boxes[:, 2, 2, 2] / largest).astype(np.float32)
     values = np.unique(values[np.isfinite(values)])
-    return float(np.median(np.diff(values))) if len(values) > 1 else 0.0
+    return float(np.median(np.diff(values))) * largest if len(values) > 1 else 0.0
 
 
 def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> Any:
@@ -334,23 +290,22 @@ def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> An
     """
     gradients, fourth = _smooth_gradients(inner)
     facts["smooth"] = len(gradients) / max(len(inner), 1)
+    facts["slopes"] = 0.0
     if len(gradients) < ENOUGH:
-        facts["slopes"] = 0.0
         return None
     h = 1.0 if given is None else float(given.max())
     gradients = gradients if given is None else gradients / given
-    slope = np.sqrt((gradients**2).sum(1))
-    unit = _commonest(slope)
+    slope = np.sort(np.sqrt((gradients**2).sum(1)))
+    third = max(len(slope) // 3, 1)  # the narrowest range that holds a third of them
+    at = int(np.argmin(slope[third:] / slope[:-third]))
+    facts["unit"] = unit = float(np.median(slope[at : at + third + 1]))
     facts["error"] = SAME_UNIT if fourth >= ENOUGH else 3 * SAME_UNIT
-    facts["unit"] = unit
     error = EXACT + min(facts["digit"] / unit / h, MOST_DIGIT) / 2
     facts["slopes"] = float((np.abs(slope / unit - 1) < error).mean())
     if facts["slopes"] < SLOPES and len(gradients) > 5 * ENOUGH:
         axes = _by_axis(gradients)
-        share = 0.0
-        if axes is not None:
-            share = float((np.abs(np.sqrt(((gradients / axes) ** 2).sum(1)) - 1) < EXACT).mean())
-        if axes is not None and share >= SLOPES:
+        share = float((np.abs(np.sqrt(((gradients / axes) ** 2).sum(1)) - 1) < EXACT).mean())
+        if share >= SLOPES:
             facts["slopes"] = share
             return axes
     return unit
@@ -373,21 +328,13 @@ def _smooth_gradients(lines: Floats) -> tuple[Floats, int]:
     return np.concatenate([fourth[smooth], second[flat]]), int(smooth.sum())
 
 
-def _commonest(x: Floats) -> float:
-    """Return the middle of the narrowest range that holds a third of positive numbers."""
-    x = np.sort(x)
-    n = max(len(x) // 3, 1)
-    i = int(np.argmin(x[n:] / x[:-n]))
-    return float(np.median(x[i : i + n + 1]))
-
-
-def _by_axis(gradients: Floats) -> Floats | None:
-    """Return the steps along the axes with which most gradients have length 1."""
+def _by_axis(gradients: Floats) -> Floats:
+    """Return the steps along the axes with which most gradients have length 1; NaN if none do."""
     keep = np.ones(len(gradients), bool)
     for _ in range(6):
         square = np.linalg.lstsq(gradients[keep] ** 2, np.ones(keep.sum()), rcond=None)[0]
         if (square <= 0).any():
-            return None
+            return np.full(3, np.nan)
         off = np.abs(np.sqrt(gradients**2 @ square) - 1)
         keep = off <= max(2 * np.median(off), 1e-6)
     return np.asarray(1 / np.sqrt(square))
@@ -408,35 +355,49 @@ def _contradictions(look: Look, steps: Floats, digit: float, noise: float = 0.0)
 
 def _distances(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any]) -> Answer:
     """Return distances, or why they are none to a surface in the grid."""
-    steps = np.ones(3) * unit * look.scale if given is None else given
+    steps = np.ones(3) * unit if given is None else given
     facts["spacing"] = steps
     if given is not None and np.ndim(unit):
-        shown = ",".join(f"{x:.4g}" for x in given * unit * look.scale)
+        shown = ",".join(f"{x:.4g}" for x in given * unit)
         said = f"the values show another spacing along each axis: --spacing {shown}"
         return Answer("distance", "", facts, said)
-    off = 0.0 if given is None else abs(float(unit) * look.scale - 1)
-    if facts["error"] < off <= ANOTHER_UNIT:
-        facts["slope"] = float(unit) * look.scale
+    off = 0.0 if given is None else abs(float(unit) - 1)
     if off > ANOTHER_UNIT:
-        scale = 1 / (unit * look.scale)
-        power, short = 10.0 ** np.round(np.log10(scale)), float(f"{scale:.2g}")
-        scale = next((x for x in (power, short) if abs(scale / x - 1) < 2e-3), scale)
-        shown = ",".join(f"{x:.4g}" for x in np.unique(steps) * unit * look.scale)
+        power, short = 10.0 ** np.round(np.log10(1 / unit)), float(f"{1 / unit:.2g}")
+        scale = next((x for x in (power, short) if abs(1 / unit / x - 1) < 2e-3), 1 / unit)
+        shown = ",".join(f"{x:.4g}" for x in np.unique(steps) * unit)
         said = (
             "they are distances in another unit than the spacing: multiply the values, --scale "
             f"{scale:.6g} (or the spacing is wrong: they show {shown})"
         )
         return Answer("distance", "", facts, said)
+    if off > facts["error"]:
+        facts["slope"] = float(unit)
     if look.is_one_sided:
         return _to_thin_walls(look, steps, facts)
     outside = 1 if border_share(look, lambda x: x > 0) >= 0.5 else -1
-    found = [valleys(slab, float(steps.min()), -outside) for slab in look.slabs]
-    facts["seams"] = sum(n for n, _ in found) / max(sum(n for _, n in found), 1)
+    found, changes = _valleys(look, float(steps.min()), -outside)
+    facts["seams"] = found / max(changes, 1)
     if facts["seams"] > SEAMS:
         why = "distances to parts that touch or overlap, with faces of these inside"
-        facts["inside"] = -outside
-        return Answer("smooth", why, facts)
+        return Answer("smooth", why, facts | {"inside": -outside})
     return Answer("distance", "", facts)
+
+
+def _valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
+    """Count valleys of slope, sign * values above 0, where 0 is near and the sign does not change.
+
+    And the changes of sign of neighbours.
+    """
+    count = changes = 0
+    values = look.part * (sign / slope)
+    for axis in range(3):
+        v = np.moveaxis(values, axis, 0)
+        changes += int(np.count_nonzero((v[1:] > 0) & (v[:-1] <= 0) | (v[1:] <= 0) & (v[:-1] > 0)))
+        before, x, after = v[:-2], v[1:-1], v[2:]
+        low = (x >= 0) & (x < 0.52) & (before > x) & ((after > x) | ((after == x) & (x > 0.25)))
+        count += int(np.count_nonzero(low & (before + after - 2 * x > 0.9)))
+    return count, changes
 
 
 def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
@@ -445,30 +406,28 @@ def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
     Along a line of samples the field falls towards a wall and rises behind it. What the distances
     on either side leave of the way between two samples is how thick it is.
     """
-    sign, h = (1 if look.low >= 0 else -1), float(steps.max())
-    nearest = min(abs(look.low), abs(look.high))
-    if (look.low if sign > 0 else look.high) in facts["cut"]:
+    sign = 1 if look.low >= 0 else -1
+    nearest = look.low if sign > 0 else look.high
+    if nearest in facts["cut"]:
         return Answer("density", "", facts, which_level(look))
-    if nearest > 1.05 / 2 * float(np.sqrt((steps**2).sum())):
+    if abs(nearest) > 1.05 / 2 * float(np.sqrt((steps**2).sum())):
         said = "every wall is nearer to some sample than that, so there is no surface"
         return Answer("distance", "", facts, said)
-    thickness = [np.empty(0)]
-    for planes, own in look.slabs:
-        for axis in range(3):
-            lines = np.moveaxis(planes if axis == 0 else planes[own], axis, 0) * (
-                sign / steps[axis]
-            )
-            before, left, right, after = (lines[i : len(lines) - 3 + i] for i in range(4))
-            falling, rising = before - left, after - right
-            left_over = (falling + rising) / 2 - left - right
-            thickness.append(left_over[(np.minimum(falling, rising) > 0.25) & (left_over > -0.6)])
+    thickness = []
+    for axis in range(3):
+        lines = np.moveaxis(look.part, axis, 0) * (sign / steps[axis])
+        before, left, right, after = (lines[i : len(lines) - 3 + i] for i in range(4))
+        falling, rising = before - left, after - right
+        left_over = (falling + rising) / 2 - left - right
+        thickness.append(left_over[(np.minimum(falling, rising) > 0.25) & (left_over > -0.6)])
     walls = np.concatenate(thickness)
     if not len(walls):
         said = "only samples on the border of the grid are near 0, so no surface lies in it"
         return Answer("distance", "", facts, said)
-    if np.median(walls[walls > -0.25]) > THICK if (walls > -0.25).any() else False:
+    walls = walls[walls > -0.25]
+    if len(walls) and np.median(walls) > THICK:
         return Answer("distance", "", facts)
-    return _unsigned(sign, h, facts)
+    return _unsigned(sign, float(steps.max()), facts)
 
 
 def _unsigned(sign: int, h: float, facts: dict[str, Any]) -> Answer:
@@ -480,42 +439,40 @@ def _unsigned(sign: int, h: float, facts: dict[str, Any]) -> Answer:
 
 def _is_cut_near(look: Look, given: Floats, facts: dict[str, Any]) -> bool:
     """Return whether values are distances cut off so near the surface that few slopes are left."""
-    cut = [abs(x) for x in facts["cut"]]
-    if not cut or min(cut) >= NARROW * given.max():
+    nearest = min(map(abs, facts["cut"]), default=np.inf)
+    if nearest >= NARROW * given.max():
         return False
-    size = np.abs(look.lines[:, 0, 2]) / (min(cut) / look.scale)
+    size = np.abs(look.lines[:, 0, 2]) / nearest
     size = size[np.isfinite(size)]
     facts["crowded"] = float((size > 0.9).mean()) if size.size else 0.0
-    if _contradictions(look, given / look.scale, facts["digit"]) > NEVER:
-        return False
     slope = typical_slope(look, given, facts["cut"])
-    return facts["crowded"] < CROWDED and SLOPE_NEAR[0] < slope < SLOPE_NEAR[1]
+    is_even = facts["crowded"] < CROWDED and SLOPE_NEAR[0] < slope < SLOPE_NEAR[1]
+    return is_even and _contradictions(look, given, facts["digit"]) <= NEVER
 
 
 # Questions 6 to 8: noise, densities, smooth fields
 
 
 def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answer:
-    values = np.unique(np.concatenate([look.all_pairs.ravel(), look.boxes[:, 2, 2, 2]]))
+    values = np.unique(np.append(look.pairs, look.boxes[:, 2, 2, 2]))
     values = values[np.isfinite(values)]
-    is_tsdf = facts["cut"] and abs(look.low + look.high) < ALIKE * look.high
     digit = float(np.diff(values).min())
-    has_few_digits = np.ptp(values) < IMAGE * digit
-    steps = _before_rounding(look, digit, given) if has_few_digits else None
-    if steps is not None:
-        facts["noise"] = digit / float(steps.max()) / 12**0.5  # standard deviation
-        why = f"distances rounded to {digit * look.scale:.3g}"
-        return Answer("noisy", why, facts | {"spacing": steps * look.scale})
-    if not is_tsdf and has_few_digits:
-        return Answer("density", "", facts, which_level(look, signed=True))
-    if given is not None and _is_noise(look, given / look.scale, facts):
+    if np.ptp(values) < IMAGE * digit:
+        steps = _before_rounding(look, digit, given)
+        if steps is not None:
+            facts["noise"] = digit / float(steps.max()) / 12**0.5  # standard deviation
+            why = f"distances rounded to {digit:.3g}"
+            return Answer("noisy", why, facts | {"spacing": steps})
+        if not facts["cut"] or abs(look.low + look.high) >= ALIKE * look.high:
+            return Answer("density", "", facts, which_level(look, signed=True))
+    if given is not None and _is_noise(look, given, facts):
         return Answer("noisy", "distances with noise", facts | {"spacing": given})
-    middle = np.abs(look.lines[:, 0, 2])
+    middle = look.lines[:, 0, 2]
     middle = middle[np.isfinite(middle)]
     if len(middle) >= ENOUGH:
-        facts["centred"] = float(np.median(middle) / np.quantile(middle, 0.995))
-        pairs = look.all_pairs
-        at_0, best = (((pairs[0] > x) != (pairs[1] > x)).sum() for x in (0.0, _parting(look)))
+        size, (one, other) = np.abs(middle), look.pairs
+        facts["centred"] = float(np.median(size) / np.quantile(size, 0.995))
+        at_0, best = (((one > x) != (other > x)).sum() for x in (0.0, _parting(middle)))
         facts["area"] = float(at_0 / max(best, 1))
         if facts["centred"] < CENTRED and facts["area"] > AREA:
             return Answer("density", "", facts, which_level(look, signed=True))
@@ -524,10 +481,10 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
 
 def _before_rounding(look: Look, digit: float, given: Floats | None) -> Floats | None:
     """Return the steps of distances that were rounded to a digit; None if these are none."""
-    steps = (np.ones(3) if given is None else given) / look.scale
-    slope = typical_slope(look, steps * look.scale)
+    steps = np.ones(3) if given is None else given
+    slope = typical_slope(look, steps)
     if given is None:
-        steps = steps * slope * look.scale
+        steps = steps * slope
     elif not abs(slope - 1) < SLOPE_OFF:
         return None
     if not digit <= ROUNDED * steps.max():
@@ -546,36 +503,32 @@ def _is_noise(look: Look, steps: Floats, facts: dict[str, Any]) -> bool:
     if len(fourth) < 5 * ENOUGH or facts["smooth"] > SMOOTH_SHARE:
         return False
     # a quarter of the differences of normal noise is below .3186 sqrt(70) of its deviation
-    noise = float(np.quantile(fourth, 0.25) / 0.3186 / 70**0.5 / steps.max())
-    facts["noise"] = noise
-    if np.quantile(fourth, 0.25) < SPREAD * np.median(fourth):
+    quarter = float(np.quantile(fourth, 0.25))
+    facts["noise"] = noise = quarter / 0.3186 / 70**0.5 / float(steps.max())
+    if quarter < SPREAD * np.median(fourth):
         return False
-    if _contradictions(look, steps, facts["digit"]) <= CONTRADICTIONS:
-        return False
-    return _contradictions(look, steps, facts["digit"], noise) <= NOISE
+    without, allowed = (_contradictions(look, steps, facts["digit"], x) for x in (0.0, noise))
+    return without > CONTRADICTIONS and allowed <= NOISE
 
 
 def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
     """Return densities, or unsigned distances of one slope or another."""
     sign = 1 if look.low >= 0 else -1
-    pairs = look.all_pairs
-    steep = float(np.quantile(np.abs(pairs[0] - pairs[1]), 0.98)) * look.scale
-    found = sum(valleys(slab, steep, sign)[0] for slab in look.slabs)
-    share = sum(slab.planes[slab.own].size for slab in look.slabs) / np.prod(look.shape)
-    nearest = look.low if sign > 0 else look.high
-    found /= share * float(np.prod(look.shape)) ** (2 / 3)
+    change = np.abs(look.pairs[0] - look.pairs[1])
+    steep = float(np.quantile(change, 0.98))
+    share = np.count_nonzero(~np.isnan(look.part)) / np.prod(look.shape)
+    found = _valleys(look, steep, sign)[0] / share / float(np.prod(look.shape)) ** (2 / 3)
     # steps between plateaus, with noise on them, make valleys, too
-    facts["rising"] = float(np.median(np.abs(pairs[0] - pairs[1]))) * look.scale / steep
-    is_unsigned = nearest not in facts["cut"] and facts["rising"] > RISING
-    if is_unsigned and VALLEY[0] < found < VALLEY[1]:
+    facts["rising"] = float(np.median(change)) / steep
+    is_unsigned = (look.low if sign > 0 else look.high) not in facts["cut"]
+    if is_unsigned and facts["rising"] > RISING and VALLEY[0] < found < VALLEY[1]:
         return _unsigned(sign, steep, facts)
     return Answer("density", "", facts, which_level(look))
 
 
-def _parting(look: Look) -> float:
+def _parting(values: Floats) -> float:
     """Return the level that parts the values into two of least variance (Otsu's)."""
-    middle = look.lines[:, 0, 2]
-    counts, edges = np.histogram(middle[np.isfinite(middle)], 512)
+    counts, edges = np.histogram(values, 512)
     mids = (edges[1:] + edges[:-1]) / 2
     below, mean = np.cumsum(counts)[:-1], np.cumsum(counts * mids)[:-1]
     above, other = counts.sum() - below, (counts * mids).sum() - mean

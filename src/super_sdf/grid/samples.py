@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from math import prod
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -24,8 +24,6 @@ FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
 LEAST_AT_ONCE = 4  # planes
 LARGE_FILE = 1 << 27  # bytes
-# Bytes taken at a time when planes are made of others, and per sample, measured.
-WORKING_BYTES, EACH = 1 << 26, 60
 
 # Spacings that differ by less than this ratio count as equal. Coarser axes are resampled to the
 # finest spacing, so a large ratio makes many samples of few.
@@ -65,7 +63,7 @@ class SamplePlanes(ABC):
 
     def crop(self, low: Index, high: Index) -> SampleArray:
         """Return the samples from index ``low`` to before ``high``, read when they are needed."""
-        return CroppedPlanes(self, low, high)
+        return MadePlanes(self, _same, dtype=self.dtype, box=(low, high))
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -103,104 +101,64 @@ SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
 """An array of samples in memory, or one whose planes are read or made when they are needed."""
 
 
-class LazyPlanes(SamplePlanes):
-    """An array of h5py, Zarr, Dask or the like, which is read by slices."""
-
-    def __init__(self, source: Any) -> None:
-        self.source, self.shape, self.dtype = source, tuple(source.shape), np.dtype(source.dtype)
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive)."""
-        return np.asarray(self.source[first:last])
-
-    def crop(self, low: Index, high: Index) -> SampleArray:
-        """Return the samples in a box, which alone is read."""
-        return np.asarray(self.source[_box(low, high)])
-
-
-class CroppedPlanes(SamplePlanes):
-    """The samples of another array in a box."""
-
-    def __init__(self, source: SamplePlanes, low: Index, high: Index) -> None:
-        self.source, self.box = source, _box(low, high)
-        self.shape, self.dtype = tuple(s.stop - s.start for s in self.box), source.dtype
-        self.beside = source.beside
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive)."""
-        start = self.box[0].start
-        return self.source.read(start + first, start + last)[:, self.box[1], self.box[2]]
-
-
-class DerivedPlanes(SamplePlanes):
+class MadePlanes(SamplePlanes):
     """Planes that are made of those of another array, and of some beside them.
 
-    ``make`` takes some planes of ``source`` and returns as many. Values depend on ``beside``
-    samples to either side along each axis. If they depend on their place in the grid, ``make``
-    takes ``numbered`` planes: whole ones, and the number of the first.
+    ``make`` takes some planes of ``source``, anything that is sliced, and returns as many. Values
+    depend on ``beside`` samples to either side along each axis. Of what is made, a ``box`` is kept.
     """
 
     def __init__(
         self,
-        source: SampleArray,
-        make: Callable[..., NDArray[Any]],
+        source: Any,
+        make: Callable[[NDArray[Any]], NDArray[Any]],
         beside: int = 0,
         dtype: DTypeLike = np.float64,
-        *,
-        numbered: bool = False,
+        box: tuple[Index, Index] | None = None,
     ) -> None:
-        self.source, self.make, self.beside, self.numbered = source, make, beside, numbered
-        self.shape, self.dtype = tuple(source.shape), np.dtype(dtype)
+        self.source, self.make, self.beside = source, make, beside
+        low, high = box or ((0, 0, 0), source.shape)
+        self.low, self.dtype = tuple(map(int, low)), np.dtype(dtype)
+        self.shape = tuple(int(b) - a for a, b in zip(self.low, high))
+
+    def read(self, first: int, last: int) -> NDArray[Any]:
+        """Return planes ``first`` to ``last`` (exclusive)."""
+        first, last = first + self.low[0], last + self.low[0]
+        start, stop = max(first - self.beside, 0), min(last + self.beside, self.source.shape[0])
+        made = self.make(np.asarray(self.source[start:stop]))[first - start : last - start]
+        rows, row = (slice(a, a + n) for a, n in zip(self.low[1:], self.shape[1:]))
+        return made[:, rows, row].astype(self.dtype, copy=False)
 
     def crop(self, low: Index, high: Index) -> SampleArray:
         """Return the samples in a box, made of those of the source in a box around it."""
-        if self.numbered:
-            return super().crop(low, high)
-        around = [max(n - self.beside, 0) for n in low]
-        beyond = [min(n + self.beside, count) for n, count in zip(high, self.shape)]
-        source = cropped(self.source, around, beyond)
-        made = DerivedPlanes(source, self.make, self.beside, self.dtype)
-        return CroppedPlanes(made, *([a - b for a, b in zip(ends, around)] for ends in (low, high)))
-
-    def read(self, first: int, last: int) -> NDArray[Any]:
-        """Return planes ``first`` to ``last`` (exclusive); some rows at a time, to save memory."""
-        low, high = max(first - self.beside, 0), min(last + self.beside, len(self))
-        out = np.empty((last - first, *self.shape[1:]), self.dtype)
-        if last <= first:
-            return out
-        source, own = np.asarray(self.source[low:high]), slice(first - low, last - low)
-        if self.numbered:
-            return self.make(source, low)[own]
-        step = WORKING_BYTES // (len(source) * self.shape[2] * EACH)
-        if step < self.shape[1]:
-            step = max(step - 2 * self.beside, 2 * self.beside, 1)
-        for start in range(0, self.shape[1], step):
-            stop, low_row = min(start + step, self.shape[1]), max(start - self.beside, 0)
-            made = self.make(source[:, low_row : stop + self.beside])[own]
-            out[:, start:stop] = made[:, start - low_row : stop - low_row]
-        return out
+        low, high = np.add(low, self.low), np.add(high, self.low)
+        around = np.maximum(low - self.beside, 0)
+        source = cropped(self.source, around, np.minimum(high + self.beside, self.source.shape))
+        box = low - around, high - around
+        return MadePlanes(source, self.make, self.beside, self.dtype, box)
 
 
-def cropped(samples: SampleArray, low: Index, high: Index) -> SampleArray:
+def _same(planes: NDArray[Any]) -> NDArray[Any]:
+    return planes
+
+
+def cropped(samples: Any, low: Index, high: Index) -> SampleArray:
     """Return the samples from index ``low`` (3,) to before ``high``."""
     if isinstance(samples, SamplePlanes):
         return samples.crop(low, high)
-    return samples[_box(low, high)]
-
-
-def _box(low: Index, high: Index) -> tuple[slice, ...]:
-    return tuple(slice(int(first), int(last)) for first, last in zip(low, high))
+    part: NDArray[Any] = np.asanyarray(samples[tuple(map(slice, map(int, low), map(int, high)))])
+    return part
 
 
 def changed(
     samples: SampleArray,
     change: Callable[[NDArray[Any]], NDArray[Any]],
     dtype: DTypeLike = np.float64,
-) -> DerivedPlanes:
+) -> MadePlanes:
     """Return samples changed one by one, each for itself; as float64 they are changed as such."""
     if dtype is np.float64:
-        return DerivedPlanes(samples, lambda planes: change(planes.astype(np.float64)))
-    return DerivedPlanes(samples, change, dtype=dtype)
+        return MadePlanes(samples, lambda planes: change(planes.astype(np.float64)))
+    return MadePlanes(samples, change, dtype=dtype)
 
 
 def let_go(samples: SampleArray) -> None:
@@ -222,11 +180,6 @@ def planes_at_once(samples: SampleArray) -> int:
     return max(2 * getattr(samples, "beside", 0), LEAST_AT_ONCE)
 
 
-def spread_planes(first: int, last: int, most: int) -> list[int]:
-    """Return evenly spread planes from ``first`` to ``last`` (inclusive), a limited number."""
-    return sorted({int(i) for i in np.linspace(first, last, most)})
-
-
 def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
     """Return values over a unit as float32; from ``FAR`` on their size does not matter."""
     return np.clip(values.astype(np.float64) / unit, -FAR, FAR).astype(np.float32)
@@ -242,19 +195,56 @@ def over_three(values: NDArray[Any], choose: np.ufunc) -> NDArray[Any]:
     return values
 
 
-def as_triple(number: ArrayLike, name: str) -> Triple:
-    """Return one number or three as three finite floats; ``name`` is that in messages."""
+def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
+    """Return samples as an array; those that are read by slices are not loaded."""
+    if isinstance(values, SamplePlanes):
+        return values
+    stored: Any = values
+    if hasattr(stored, "chunks") and isinstance(getattr(stored, "dtype", None), np.dtype):
+        return MadePlanes(stored, _same, dtype=stored.dtype)  # of h5py, Zarr or Dask
     try:
-        array = np.asarray(number)
+        samples: NDArray[Any] = np.asanyarray(without_device(values))
+    except (TypeError, ValueError, RuntimeError):  # ragged lists
+        raise GridError(f"values are {seen(values)}: give an array of three axes") from None
+    if not isinstance(samples, np.ma.MaskedArray):
+        return samples
+    if samples.dtype.kind in "fiu":
+        samples = samples.astype(np.result_type(samples.dtype, np.float32))
+    return np.ma.filled(samples, np.nan if samples.dtype.kind == "f" else False)
+
+
+def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    """Raise GridError if an array of this type and shape cannot be a grid."""
+    if dtype.kind not in "fiub":
+        raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
+    if len(shape) != 3:
+        raise GridError(f"values have shape {shape}: give three axes (x, y, z)")
+    if min(shape) < 2:
+        raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")
+
+
+# Where samples lie
+
+
+def as_numbers(given: ArrayLike, name: str, count: int, what: str) -> NDArray[np.float64]:
+    """Return finite numbers, (count,), of as many or of one; GridError, by a name, otherwise."""
+    try:
+        array = np.asarray(given)
         if array.dtype.kind not in "fiu":  # booleans and strings are refused
             raise TypeError
         with np.errstate(over="ignore"):  # of long doubles, which are found to be infinite below
-            triple = np.broadcast_to(array.astype(np.float64).ravel(), (3,))
+            numbers = np.broadcast_to(array.astype(np.float64).ravel(), (count,))
     except (TypeError, ValueError, RuntimeError):
-        raise GridError(f"{name} is {seen(number)}: give one number or three") from None
-    if not np.isfinite(triple).all():
-        raise GridError(f"{name} is {seen(number)}: it must be finite")
-    return float(triple[0]), float(triple[1]), float(triple[2])
+        raise GridError(f"{name} is {seen(given)}: give {what}") from None
+    if not np.isfinite(numbers).all():
+        raise GridError(f"{name} is {seen(given)}: it must be finite")
+    return numbers
+
+
+def as_triple(number: ArrayLike, name: str) -> Triple:
+    """Return one number or three as three finite floats; ``name`` is that in messages."""
+    x, y, z = as_numbers(number, name, 3, "one number or three").tolist()
+    return x, y, z
 
 
 def check_spacing(spacing: ArrayLike) -> Triple:
@@ -290,17 +280,10 @@ def check_direction(direction: ArrayLike | None) -> Direction:
     """Return a direction, nine numbers or (3, 3), row by row; None is along the world's axes."""
     if direction is None:
         return STRAIGHT
-    try:
-        array = np.asarray(direction)
-        if array.dtype.kind not in "fiu" or array.shape not in ((9,), (3, 3)):
-            raise TypeError
-    except (TypeError, ValueError, RuntimeError):
-        raise GridError(
-            f"direction is {seen(direction)}: give nine numbers, row by row, or a 3 x 3 matrix"
-        ) from None
-    matrix = array.astype(np.float64).reshape(3, 3)
-    if not np.isfinite(matrix).all():
-        raise GridError(f"direction is {in_rows(matrix)}: it must be finite")
+    what = "nine numbers, row by row, or a 3 x 3 matrix"
+    if np.size(np.asarray(direction, object)) == 1:
+        raise GridError(f"direction is {seen(direction)}: give {what}")
+    matrix = as_numbers(direction, "direction", 9, what).reshape(3, 3)
     products = matrix.T @ matrix
     off = np.abs(products - np.eye(3))
     if off.max() > SKEW:
@@ -317,7 +300,7 @@ def check_direction(direction: ArrayLike | None) -> Direction:
 
 def as_direction(matrix: Any) -> Direction:
     """Return a 3 x 3 matrix row by row, as floats."""
-    (a, b, c), (d, e, f), (g, h, i) = (map(float, row) for row in np.asarray(matrix))
+    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64).tolist()
     return (a, b, c), (d, e, f), (g, h, i)
 
 
@@ -326,69 +309,46 @@ def in_rows(matrix: Any) -> str:
     return "; ".join(", ".join(f"{entry:.4g}" for entry in row) for row in np.asarray(matrix))
 
 
-class Placed(NamedTuple):
-    """Samples along increasing x, y and z, and what their coordinates say: None if nothing."""
-
-    values: ArrayLike | SamplePlanes
-    spacing: ArrayLike | None = None
-    origin: ArrayLike | None = None
-
-
 def placed(
-    values: ArrayLike | SamplePlanes,
-    spacing: ArrayLike | None = None,
-    origin: ArrayLike | None = None,
-) -> Placed:
-    """Return samples and their place in the world; of a ``DataArray``, from its coordinates.
+    values: Any, spacing: ArrayLike | None = None, origin: ArrayLike | None = None
+) -> tuple[Any, ArrayLike | None, ArrayLike | None]:
+    """Return samples along x, y and z, spacing and origin; of a ``DataArray``, by its coordinates.
 
-    A spacing or an origin that is given replaces that of the coordinates. Dimensions are x, y and z
-    in any order, besides some of length 1.
+    What is given replaces that of the coordinates; None is not known. Dimensions are x, y and z in
+    any order, besides some of length 1.
     """
     xarray: Any = sys.modules.get("xarray")
     if xarray is None or not isinstance(values, (xarray.DataArray, xarray.Dataset)):
-        return Placed(values, spacing, origin)
+        return values, spacing, origin
     if isinstance(values, xarray.Dataset):
         names = ", ".join(map(str, values.data_vars)) or "none"
         raise GridError(f"values are a Dataset: give one of its arrays ({names})")
-    array: Any = values
-    if array.ndim < len(AXES):
-        check_kind(array.dtype, array.shape)  # raises
+    array: Any = values.squeeze(drop=True) if values.ndim > len(AXES) else values
     wanted = UNNAMED if set(array.dims) == set(UNNAMED) else AXES
-    extra = [name for name in array.dims if name not in wanted]
-    if not set(wanted) <= set(array.dims):
+    if set(array.dims) != set(wanted):
+        check_kind(array.dtype, array.shape)
         raise GridError(
             f"dimensions are {', '.join(map(repr, array.dims)) or 'none'}: name those of the axes "
             "'x', 'y' and 'z', with array.rename(...)"
         )
-    for name in extra:
-        if array.sizes[name] > 1:
-            raise GridError(
-                f"dimension {name!r} has length {array.sizes[name]:,}: choose one, such as "
-                f"array.isel({name}=0)"
-            )
-    array = array.isel(dict.fromkeys(extra, 0)).transpose(*wanted)
+    array = array.transpose(*wanted)
     check_kind(array.dtype, array.shape)
-    return _at_coordinates(array, spacing, origin)
-
-
-def _at_coordinates(array: Any, spacing: ArrayLike | None, origin: ArrayLike | None) -> Placed:
-    names = [x for x in array.dims if x in array.coords and array.coords[x].dims == (x,)]
     if array.chunks is not None:
         check_fits(array.nbytes, "the array of Dask, whole,", "save it as .npy and give its path")
-    samples: NDArray[Any] = np.asanyarray(array.values)
-    if not names:
-        return Placed(samples, spacing, origin)
-    if len(names) < len(AXES):
-        missing = next(name for name in array.dims if name not in names)
+    samples, steps, lowest = np.asanyarray(array.values), list[float](), list[float]()
+    named = [x for x in wanted if x in array.coords and array.coords[x].dims == (x,)]
+    if 0 < len(named) < len(AXES):
         raise GridError(
-            f"dimension {missing!r} has no coordinates, but {names[0]!r} has: give those of all "
-            "axes, or of none (array.drop_vars(...))"
+            f"only {', '.join(map(repr, named))} has coordinates: give those of all axes, or of "
+            "none (array.drop_vars(...))"
         )
-    firsts, steps = zip(*(even_steps(name, array.coords[name].values) for name in names))
-    samples = samples[tuple(slice(None, None, -1 if step < 0 else 1) for step in steps)]
-    lowest = [first + min(step, 0) * (n - 1) for first, step, n in zip(firsts, steps, array.shape)]
-    spacing = np.abs(steps) if spacing is None else spacing
-    return Placed(samples, spacing, lowest if origin is None else origin)
+    for axis, name in enumerate(named):
+        first, step = even_steps(name, array.coords[name].values)
+        lowest.append(first + min(step, 0) * (samples.shape[axis] - 1))
+        steps.append(abs(step))
+        samples = np.flip(samples, axis) if step < 0 else samples
+    spacing = steps or None if spacing is None else spacing
+    return samples, spacing, lowest or None if origin is None else origin
 
 
 def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
@@ -399,53 +359,17 @@ def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
             "the distances"
         )
     places = coordinates.astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(places))
-    if len(bad):
-        raise GridError(
-            f"coordinate {bad[0]} of {name!r} is {places[bad[0]]}: every coordinate must be finite"
-        )
-    first, count = float(places[0]), len(places)
-    step = float(places[-1] - first) / (count - 1)
+    first, steps = float(places[0]), np.diff(places)
+    step = float(places[-1] - first) / len(steps)
     is_float = coordinates.dtype.kind == "f"
     rounding = np.finfo(coordinates.dtype).eps * np.abs(places).max() if is_float else 0.0
-    off = np.abs(places - (first + step * np.arange(count))).max()
-    if step == 0 or off > EVEN * abs(step) + rounding:
-        steps = np.diff(places)
-        usual = float(np.median(steps))
-        worst = int(np.abs(steps - usual).argmax())
+    off = np.abs(places - (first + step * np.arange(len(places)))).max()
+    if step == 0 or not off <= EVEN * abs(step) + rounding:
+        usual = float(np.nanmedian(steps))
+        worst = int(np.nan_to_num(np.abs(steps - usual), nan=np.inf).argmax())
         raise GridError(
             f"coordinates of {name!r} are not evenly spaced: {places[worst]:.6g} is followed by "
             f"{places[worst + 1]:.6g}, a step of {steps[worst]:.6g} among steps of {usual:.6g}; "
             f"resample the array (array.interp({name}=...))"
         )
     return first, step
-
-
-def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
-    """Return samples as an array; those that are read by slices are not loaded."""
-    if isinstance(values, SamplePlanes):
-        return values
-    if hasattr(values, "chunks") and isinstance(getattr(values, "dtype", None), np.dtype):
-        return LazyPlanes(values)  # of h5py, Zarr or Dask
-    try:
-        samples: NDArray[Any] = np.asanyarray(without_device(values))
-    except (TypeError, ValueError, RuntimeError):  # ragged lists
-        raise GridError(f"values are {seen(values)}: give an array of three axes") from None
-    if not hasattr(samples, "mask"):
-        return samples
-    masked = np.ma.getmaskarray(samples)  # of a masked array: what is masked is unknown
-    if not masked.any() or samples.dtype.kind not in "fiu":
-        return np.asarray(np.ma.filled(samples, False) if masked.any() else samples.data)
-    data = np.array(samples.data, np.result_type(samples.dtype, np.float32))
-    data[masked] = np.nan
-    return data
-
-
-def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
-    """Raise GridError if an array of this type and shape cannot be a grid."""
-    if dtype.kind not in "fiub":
-        raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
-    if len(shape) != 3:
-        raise GridError(f"values have shape {shape}: give three axes (x, y, z)")
-    if min(shape) < 2:
-        raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")

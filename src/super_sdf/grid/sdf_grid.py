@@ -15,7 +15,6 @@ from ..options import AUTO, FieldKind, Inside, Options
 from .derived import Resampled
 from .interpret import Field, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
-from .recognise import is_plane
 from .samples import (
     EQUAL_SPACING,
     STRAIGHT,
@@ -101,15 +100,15 @@ class SdfGrid:
         origin: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
-        given = placed(values, spacing, origin)
-        samples = as_samples(given.values)
+        values, _, origin = placed(values, spacing, origin)
+        samples, steps = as_samples(values), check_spacing(spacing)
         look = _checked(samples)
-        low, high = look.low, look.high
-        if low == high:
-            raise GridError(f"every value is {low:.6g}: a constant field has no surface")
-        if len(look.few) == 2 and not is_plane(look):
+        if look.low == look.high:
+            raise GridError(f"every value is {look.low:.6g}: a constant field has no surface")
+        if len(look.few) == 2 and min(look.shape) > 2:
+            low, high = sorted(look.few)
             raise GridError(f"the only values are {low:.6g} and {high:.6g}: {MASK_HINT}")
-        below, steps = border_share(look, lambda x: x < 0), check_spacing(spacing)
+        below = border_share(look, lambda x: x < 0)
         if below > 0.5:
             raise GridError(
                 f"{below:.0%} of the grid's border is negative, which is inside: make the grid "
@@ -120,8 +119,8 @@ class SdfGrid:
         if rise > MOST_RISE * h:
             said = f"the values change by {rise:.6g} from sample to sample, but spacing is {h:.6g}"
             raise GridError(f"{said}: give distances in its unit, or use make_grid")
-        place, extremes = (steps, given.origin, ()), (low, high)
-        grid = self.trusted(samples, *place, direction=direction, extremes=extremes)
+        extremes = look.low, look.high
+        grid = self.trusted(samples, steps, origin, direction=direction, extremes=extremes)
         vars(self).update(vars(grid))
 
     @classmethod
@@ -143,8 +142,8 @@ class SdfGrid:
         and maximum, they are not searched for NaN and infinity. Values are taken as exact distances
         unless ``field`` says what they are.
         """
-        given = placed(values, spacing, origin)
-        samples = as_samples(given.values)
+        values, _, origin = placed(values, spacing, origin)
+        samples = as_samples(values)
         if extremes is None:
             look = _checked(samples)
             extremes = look.low, look.high
@@ -153,7 +152,7 @@ class SdfGrid:
         vars(grid).update(
             samples=samples,
             spacing=check_spacing(spacing),
-            origin=as_triple(0.0 if given.origin is None else given.origin, "origin"),
+            origin=as_triple(0.0 if origin is None else origin, "origin"),
             direction=check_direction(direction),
             notes=notes,
             positive_inside=positive_inside,
@@ -164,10 +163,6 @@ class SdfGrid:
             on_sample=None,
         )
         return grid
-
-    def noted(self, notes: tuple[str, ...]) -> SdfGrid:
-        """Return the same grid with more sentences on it, before those on what was inferred."""
-        return with_fields(self, notes=(*notes, *self.notes)) if notes else self
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -305,21 +300,12 @@ def make_grid(
     """
     told: dict[str, Any] = {"label": label, "level": level, "scale": scale, "unknown": unknown}
     wanted = Options(inside=inside, field=field, **told)
-    given = placed(values, spacing, origin)
-    taken, origin = interpret(as_samples(given.values), wanted, given.spacing, hint), given.origin
+    values, spacing, origin = placed(values, spacing, origin)
+    taken = interpret(as_samples(values), wanted, spacing, hint)
     if origin is None:
-        taken.notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+        taken["notes"] += ("origin not given: sample (0, 0, 0) is at 0, 0, 0",)
         origin = 0.0
-    return SdfGrid.trusted(
-        taken.samples,
-        taken.spacing,
-        origin,
-        tuple(taken.notes),
-        direction=direction,
-        positive_inside=taken.positive_inside,
-        extremes=taken.extremes,
-        field=taken.field,
-    )
+    return SdfGrid.trusted(origin=origin, direction=direction, **taken)
 
 
 def check_grid(grid: Any) -> SdfGrid:

@@ -126,11 +126,11 @@ def find_image(
         values, notes = place["values"], list(place["notes"])
     elif axes is not None:
         raise OptionError(f"--axes is {seen(axes)}: that is for files; transpose the array")
-    given = placed(values, place["spacing"], place["origin"])
-    samples, origin = as_samples(given.values), given.origin
+    values, spacing, origin = placed(values, place["spacing"], place["origin"])
+    samples = as_samples(values)
     check_kind(samples.dtype, samples.shape)
     labels, numbers, counts = find_labels(samples, wanted)
-    if given.spacing is None:
+    if spacing is None:
         notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
@@ -138,7 +138,7 @@ def find_image(
     if cut := [labels[n - 1] for n in np.unique(np.concatenate(ends)).tolist() if n]:
         said = "solids of labels run out of the grid: closed along the border"
         notes.append(f"{said} ({named(cut)})")
-    steps = check_spacing(1.0 if given.spacing is None else given.spacing)
+    steps = check_spacing(1.0 if spacing is None else spacing)
     where = (samples, steps, 0.0 if origin is None else origin, tuple(notes))
     more = {"direction": place["direction"], "extremes": extremes_of_masks(min(steps))}
     grid = with_fields(
