@@ -39,7 +39,7 @@ LONGEST_HEAD = 1 << 20  # bytes of a file's first line
 COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
 LISTS = ("facts", "certificate", "stages", "faults", "notes", "warnings", "remarks")
-COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "tiles")
+COUNTED = ("vertices", "triangles", "band_voxels", "noisy_voxels", "tiles")
 NOT_DRAWN = "not drawn: run the command again for its meshes"
 
 Entry = dict[str, Any]
