@@ -78,7 +78,7 @@ def errors_of(truth: solid.Solid, patch: np.ndarray, corners: np.ndarray, count:
     normal /= np.maximum(area, 1e-18)[:, None]
     points = np.einsum("pk,tkd->ptd", AT, corners).reshape(-1, 3)
     distance = truth.distance(points).reshape(len(AT), -1).mean(0)
-    true = normals_of(truth.mesh.vertices[truth.mesh.faces[truth.nearest_face(points)]])
+    true = normals_of(truth.mesh.vertices[truth.mesh.faces[truth.nearest(points)[1]]])
     true /= np.maximum(np.linalg.norm(true, axis=1), 1e-18)[:, None]
     turned = 1 - np.einsum("ptd,td->pt", true.reshape(len(AT), -1, 3), normal).mean(0)
     sums = [np.bincount(patch, area * error, count) for error in (distance, turned)]

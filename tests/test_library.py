@@ -118,22 +118,11 @@ def test_so_are_those_of_the_other_functions(message):
     assert str(caught.value) == message
 
 
-def test_mesh_and_field_say_what_they_are_in_a_line():
+def test_grid_field_mesh_and_network_say_what_they_are_in_a_line():
     field = upsample(GRID, trilinear, 2)
-    mesh = extract_mesh(field, GRID)
-    assert repr(GRID) == (
-        "SdfGrid(12 x 12 x 12 float32, spacing 1, 1, 1, origin 0, 0, 0, "
-        f"values {GRID.low:.6g} to {GRID.high:.6g})"
-    )
-    assert repr(field) == f"FineField(factor 2, {len(field.voxel_ijk):,} voxels of 12 x 12 x 12)"
-    assert repr(mesh).startswith(
-        f"Mesh({len(mesh.vertices):,} vertices float32, {len(mesh.faces):,}"
-    )
-    network = load_network("fast", threads=1)
-    reach = network.receptive_field
-    assert repr(network) == f"Network(fast-int8, receptive field {reach}, device cpu)"
-    for thing in (GRID, field, mesh, network):
-        assert "\n" not in repr(thing) and len(repr(thing)) < 160
+    for thing in (GRID, field, extract_mesh(field, GRID), load_network("fast", threads=1)):
+        said = repr(thing)
+        assert said.startswith(f"{type(thing).__name__}(") and "\n" not in said and len(said) < 160
 
 
 SAID = {

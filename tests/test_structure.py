@@ -36,21 +36,21 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together: they may shrink only; the design's figure beside
-    TOP: 1460,  # 1,250
+    TOP: 1419,  # 1,250
     "grid": 2529,  # 1,800
     "network": 500,
     "refine": 1303,  # 1,300
     "surface": 2186,
     "tiles": 300,
-    "files": 2885,  # 2,700: readers of twelve libraries
+    "files": 2830,  # 2,700: readers of twelve libraries
     "functions": 700,  # 600
-    "labels": 1060,  # 900
-    "simplify check truth": 1323,  # 1,100: with the walls between labels
-    "batch": 930,  # 900
-    "pages": 414,  # 400
-    "cli": 920,  # 800
+    "labels": 1059,  # 900
+    "simplify check truth": 1235,  # 1,100: with the walls between labels
+    "batch": 910,  # 900
+    "pages": 409,  # 400
+    "cli": 880,  # 800
 }
-MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 48, 112  # 95, 45, 110 in the design
+MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 48, 110  # 95, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 18_288, 37_300  # 17,800 and 36,000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {

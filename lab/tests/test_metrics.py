@@ -77,7 +77,7 @@ def in_voxels(reference: Mesh, result: Mesh) -> metrics.Numbers:
 def angles_of(reference: Mesh, result: Mesh) -> tuple[float | None, float | None]:
     """Return the mean angles near the edges of a reference and beyond."""
     curves, drawn = EdgeCurves.of(reference, SEED), metrics.sample_surface(result, (7, 1))
-    nearest = Solid(reference).nearest_face(drawn.points)
+    nearest = Solid(reference).nearest(drawn.points)[1]
     figures = edges.compare_angles(reference, nearest, curves, drawn, H)
     return figures["angle_near"], figures["angle_beyond"]
 

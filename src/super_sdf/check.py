@@ -156,35 +156,23 @@ class Certificate:
         if self.has_evidence:
             figures = self.figures()
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
-            in_world = figures["largest"] * self.grid.voxel_size
-            text = "residual in voxels: mean {mean:.4f}, 99th percentile {p99:.4f}, largest "
-            text += f"{{largest_signed:+.4f}} at ({at}), {in_world:.4g} in world units; "
-            text += f"{{share_above_tenth:.2%}} of the samples above {NOTICEABLE:g} voxel"
-            lines.append(text.format(**figures))
-        else:
-            why = "no sample is exact" if any(samples.values()) else "the samples are no distances"
-            lines.append(f"residual: unknown, since {why}")
-        if self.sample_volume:
-            lines.append(f"volume of the samples inside: {self.sample_volume:.6g}; {self._off()}")
-        counted = of.self_intersections is not None
-        sound = "closed, oriented, manifold" + ", no self-intersections" * counted
-        lines.append("faults: " + "; ".join(self.faults() or [f"none ({sound})"]))
-        lines += ["self-intersections: not counted"] * (not counted)
+            largest = figures["largest"] * self.grid.voxel_size
+            lines.append(f"largest residual: {largest:.4g} in world units, at ({at})")
+        lines += ["self-intersections: not counted"] * (of.self_intersections is None)
         lines += [f"{self.beyond:,} vertices lie beyond the grid, unchecked"] * (self.beyond > 0)
-        return lines
-
-    def _off(self) -> str:
-        share = self.surface.volume / (self.sample_volume or 1) - 1
-        return f"the mesh's volume is {share:+.2%} off that of the samples"
+        return [*lines, self.summary()]
 
     def summary(self) -> str:
         """Return the certificate in one line."""
-        if not self.has_evidence:
-            said = ["no sample is exact, so the residual is unknown"]
-            return "; ".join(said + [self._off()] * bool(self.sample_volume) + self.faults())
-        text = "residual {mean:.4f} voxels in the mean, {largest:.4f} at most, "
-        text += f"{{share_above_tenth:.2%}} of {len(self.values):,} samples above {NOTICEABLE:g}"
-        return "; ".join([text.format(**self.figures()), *(self.faults() or ["no faults"])])
+        said = "residual unknown, since no sample is exact"
+        if self.has_evidence:
+            said = "residual {mean:.4f} voxels in the mean, {largest_signed:+.4f} at most, "
+            said += f"{{share_above_tenth:.2%}} of {len(self.values):,} samples above "
+            said = said.format(**self.figures()) + f"{NOTICEABLE:g}"
+        elif self.sample_volume:
+            share = self.surface.volume / self.sample_volume - 1
+            said = f"volume {share:+.2%} off that of the samples, {self.sample_volume:.6g}"
+        return f"{said}; faults: {'; '.join(self.faults() or ['none'])}"
 
     def exceeded(self, tolerance: float | None, max_mean: float | None) -> list[str]:
         """Return a sentence for each limit that is exceeded.
@@ -230,7 +218,7 @@ def read_for_check(
     """
     if made is not None:
         return merged(made.mesh), made.grid
-    samples, read = read_grid(grid, **options.reading()), read_mesh(mesh, options.max_memory)
+    samples, read = read_grid(grid, **options.reading()), read_mesh(mesh)
     if options.unit and Path(mesh).suffix.lower() == ".glb":  # it is in metres
         read = Mesh(read.vertices / LENGTHS[options.unit], read.faces)
     return read, samples

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from .simplify.simplify import Simplified
     from .surface.mesh import Mesh
 
-READ, MESHED = 0.1, 0.3  # of the time, when the grid is read, and before a mesh is simplified
+READ = 0.1  # of the time of meshing, when the grid is read
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +76,10 @@ def convert(
         watch.lap("read")
         if progress:
             progress(round(READ * TOTAL), TOTAL)
-        shown = part_of(progress, READ, MESHED if options.goals() else 1)
+        shown = part_of(progress, READ, 1)
         made = mesh_grid(grid, network, options, progress=shown, **how)
         watch.take(made.seconds)
-        mesh, simplified, off = _reworked(made.mesh, grid, options, part_of(progress, MESHED, 1))
+        mesh, simplified, off = _reworked(made.mesh, grid, options)
         watch.lap("simplify" if simplified else "isosurface")
         world, beside = World(options.unit, grid.space), [Path(save_field)] if save_field else []
         write_meshes({Path(target): {"": mesh}}, force=force, world=world, beside=beside)
@@ -102,7 +102,7 @@ def _saving(path: str | Path | None, others: list[Path], *, force: bool) -> Any:
 
 
 def _reworked(
-    mesh: Mesh, grid: SdfGrid, options: Options, progress: Progress | None
+    mesh: Mesh, grid: SdfGrid, options: Options
 ) -> tuple[Mesh, Simplified | None, list[str]]:
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
     simplified, volume = None, volume_of_samples(grid) if options.keep_volume else None
@@ -118,7 +118,6 @@ def _reworked(
             error=options.error(grid.voxel_size),
             triangles=options.triangles,
             max_memory=options.max_memory,
-            progress=progress and (lambda share: progress(round(TOTAL * share), TOTAL)),
         )
         mesh = simplified.mesh
     if volume is None:

@@ -113,10 +113,15 @@ def one_of(names: Iterable[str]) -> Kind:
     return Kind(f"one of {', '.join(choices)}", make, choices)
 
 
-def _flag(value: Any) -> bool:
-    if not isinstance(value, (bool, np.bool_)):
-        raise TypeError
-    return bool(value)
+def having(give: str, test: Callable[[Any], bool], make: Callable[[Any], Any]) -> Kind:
+    """Return the kind of values that pass a test of their type."""
+
+    def checked(value: Any) -> Any:
+        if not test(value):
+            raise TypeError
+        return make(value)
+
+    return Kind(give, checked)
 
 
 def _label(value: Any) -> int:
@@ -145,25 +150,15 @@ def _bytes(value: Any) -> int:
     return int(COUNT.make(value))
 
 
-def _path(value: Any) -> Path:
-    if not isinstance(value, (str, PathLike)):
-        raise TypeError
-    return Path(value)
-
-
-def _called(value: Any) -> Any:
-    if not callable(value):
-        raise TypeError
-    return value
-
-
 ANY, ABOVE_0 = number("a finite number"), number("a number greater than 0", above=0)
 COUNT, POINT = number("", above=0, step=1), numbers((1, 3), "one number, or three")
-FLAG = Kind("True or False, in JSON true or false", _flag)
 LABEL = Kind("a whole number, -2^63 to 2^64 - 1", _label)
-NETWORK = Kind("one from load_network()", _called)
-PROGRESS = Kind("a function of (done, total), in thousandths", _called)
-PATH = Kind("the path of a file", _path)
+FLAG = having(
+    "True or False, in JSON true or false", lambda value: isinstance(value, (bool, np.bool_)), bool
+)
+PATH = having("the path of a file", lambda value: isinstance(value, (str, PathLike)), Path)
+NETWORK = having("one from load_network()", callable, lambda network: network)
+PROGRESS = having("a function of (done, total), in thousandths", callable, lambda call: call)
 
 
 class Option(NamedTuple):
@@ -282,7 +277,7 @@ class Options:
         "Network: fast is quicker than base, the default; best averages base over 4 turns of the "
         "grid, and takes 4 times as long.")
     model: str | None = _option(None, WORK, "labels",
-        Kind(PATH.give, lambda value: str(_path(value))),
+        Kind(PATH.give, lambda value: str(PATH.make(value))),
         "Use the network in this ONNX file instead of --quality.", metavar="FILE")
     precision: Precision = _option(AUTO, WORK, "labels", one_of(PRECISIONS),
         "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "

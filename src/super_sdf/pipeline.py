@@ -120,11 +120,6 @@ def upsample(
     -------
     FineField
         Values at the nodes of spacing h/K in every voxel that can hold the surface.
-
-    Raises
-    ------
-    SuperSdfError
-        As ``reconstruct``.
     """
     asked = Options(factor, offset=offset)  # checks them
     lattice, decoder = _prepared(grid, network, asked, progress)
@@ -158,11 +153,6 @@ def extract_mesh(
         from.
     mesher, cap
         As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
-
-    Raises
-    ------
-    OptionError
-        If an argument is invalid; if there are more vertices than 32-bit numbers.
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
@@ -217,14 +207,9 @@ def reconstruct(
 
     Raises
     ------
-    OptionError
-        If an argument is invalid, such as an odd factor.
-    GridError
-        If there is no surface, or the distances end within 1.5 spacings of the offset.
-    ModelError
-        If the network returns values that are not finite.
-    OutOfMemoryError
-        If not even small tiles of the grid fit in the memory.
+    OptionError, GridError, ModelError, OutOfMemoryError
+        If an argument is invalid; if there is no surface at the offset; if the network returns
+        values that are not finite; if not even small tiles of the grid fit in the memory.
     """
     chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     exact = None

@@ -85,18 +85,12 @@ def over_threads(
         yield from pool.map(work, pieces)
 
 
-def map_threads(
-    work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
-) -> list[Result]:
-    """Return the same as a list."""
-    return list(over_threads(work, pieces, threads))
-
-
 def map_chunks(
     work: Callable[[slice], Result], count: int, width: int, threads: int = 1
 ) -> list[Result]:
     """Return ``work(rows)`` for chunks of ``count`` rows that need ``width`` temporaries each."""
-    return map_threads(work, chunks_of(count, width), worthwhile_threads(count * width, threads))
+    threads = worthwhile_threads(count * width, threads)
+    return list(over_threads(work, chunks_of(count, width), threads))
 
 
 def call_beside(work: Callable[[], object], stop: Callable[[], object]) -> None:

@@ -19,7 +19,7 @@ from ..files.formats import GRID_SUFFIXES, is_grid, is_store, mesh_path, reason_
 from ..files.meshes import MESH_SUFFIXES, check_mesh_suffix, has_parts
 from ..labels.files import Names, with_numbers
 from ..options import BATCH_LISTS, GOALS, Options
-from .record import OWN_NAMES, Row
+from .record import Row
 
 LIST_SUFFIXES = (".txt", ".jsonl")
 
@@ -79,9 +79,6 @@ def find_jobs(
                 both = f"{other.source} and {job.source} would both become {job.target}"
                 raise OptionError(f"{both}: rename one, or give 'out' in a .jsonl list")
             check_mesh_suffix(Path(job.mesh), job.options.unit)
-            if PurePath(job.target).parts[0].casefold() in OWN_NAMES:
-                said = f"{job.source} would become {job.target}, but"
-                raise OptionError(f"{said} the first of these names is the batch's own: rename it")
     return list(by_target.values())
 
 

@@ -24,7 +24,6 @@ from ..files.output import naming
 
 NAME, LOCK_NAME, STAGE_NAME = "report.jsonl", ".super-sdf-batch.lock", ".super-sdf-parts"
 KEYS = {"in", "out", "status", "retry", "content", "output", "asked"}  # of every row
-OWN_NAMES = (NAME, LOCK_NAME, STAGE_NAME)
 CHUNK = 1 << 20  # bytes read at a time
 NO_LOCKS = {errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP}  # some network drives
 

@@ -45,7 +45,7 @@ class Batch:
         self.jobs, self.settings, self.record = jobs, settings, Record(settings.folder)
         self.written: dict[str, str] = {}  # in this run: the output of each file
         self.inputs = {os.path.realpath(job.source) for job in jobs}
-        self.has_failed, self.seconds = False, 0.0  # of the run
+        self.seconds = 0.0  # of the run
         chosen = settings.options.network()
         path, turns = find_model(chosen["model"], chosen["precision"])
         self.network = {"version": __version__, "turns": turns, "model": chosen["model"]}
@@ -57,15 +57,14 @@ class Batch:
         """Return the jobs in some states."""
         return [job for job in self.jobs if job.state in states]
 
-    def plan(self) -> dict[str, list[dict[str, Any]]]:
-        """Return the files that are to be done, or were done or failed in earlier runs."""
+    def listed(self, *states: str) -> list[dict[str, Any]]:
+        """Return the grids and the outputs of jobs in some states, and why they failed."""
 
         def known(job: Job) -> dict[str, Any]:
             reason = {"reason": job.row["reason"]} if job.row.get("reason") else {}
             return {"in": os.path.abspath(job.source), "out": job.target, **reason}
 
-        states = "to_do", "done_before", "failed_before", "refused"
-        return {state: [known(job) for job in self.of(state)] for state in states}
+        return [known(job) for job in self.of(*states)]
 
     def run(self, progress: Progress | None = None) -> None:
         """Convert what is to be converted; call ``progress`` after each file is in the report."""
@@ -75,7 +74,7 @@ class Batch:
                 self.record.add(job.row)
         left = sorted(self.of("to_do"), key=size_of, reverse=True)
         total, done, died = len(left), 0, set[str]()  # outputs whose worker died once
-        if not left or (self.settings.fail_fast and self.of("failed_before", "refused")):
+        if not left:
             return
         parts = self.settings.folder / STAGE_NAME
         stage = parts / secrets.token_hex(4)  # orphans on a cluster write into another one
@@ -109,8 +108,7 @@ class Batch:
             memory = max(1, memory_bound(memory) - held_memory()) // count
 
         def take() -> Job | None:
-            is_over = not left or (settings.fail_fast and self.has_failed)
-            return None if is_over else left.pop(0)
+            return left.pop(0) if left else None
 
         work = partial(convert_job, settings=settings, stage=stage, threads=threads, memory=memory)
         if settings.cluster:
@@ -144,7 +142,6 @@ class Batch:
             job.row = job.failed(why, row["content"]) | how
             self.record.add(job.row)
         job.state = "done" if job.row["status"] == "ok" else "failed"
-        self.has_failed |= job.state == "failed"
 
     def _why_not(self, job: Job, names: Iterable[str]) -> str:
         """Return why a job may not write some files, "" if it may."""

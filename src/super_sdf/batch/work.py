@@ -41,7 +41,6 @@ class Settings:
     workers: int = 0
     force: bool = False  # convert everything again; replace files that are not as a batch made them
     retry: bool = False  # try inputs again that failed before
-    fail_fast: bool = False  # start nothing more after the first failure
     check: bool = False  # against the samples; meshes without a certificate are made again
     items: Path | None = None  # the folder for what a page shows of each mesh
     cluster: str | None = None  # "local", or the address of a scheduler: where files are converted
@@ -66,10 +65,9 @@ def convert_job(
         else:
             where = job.source, target, network, options
             made = convert_labels(*where, names=settings.names, force=True)
-            for label in made.labels:
+            for label in made.facts["labels"]:
                 label["output"] = Path(label["output"]).relative_to(stage).as_posix()
-            names = [label["output"] for label in made.labels]
-            row |= {"closed": True, "warnings": list(made.warnings)}
+            names = [label["output"] for label in made.facts["labels"]]
         known = {name: fingerprint(stage / name) for name in names}
         row |= {"output": known if job.has_label_files else known[job.mesh], **made.report()}
         row["stages"] = {name: round(seconds, 4) for name, seconds in made.seconds.items()}

@@ -50,8 +50,6 @@ TAKES = (
         show_default=True, help="Mesh file format."),
     *map(table_option, OPTIONS),
     *(SHARED[name] for name in ("names", "cluster", "jobs")),
-    option("--fail-fast", is_flag=True,
-        help="Start no further file after the first failure."),
     option("--retry", is_flag=True,
         help="Retry inputs that failed before and have not changed."),
     option("--dry-run", is_flag=True, help="Show what would be done; write nothing."),
@@ -119,23 +117,20 @@ def planned(
         sources, meshes = zip(*((job.source, folder / job.target) for job in jobs))
         main.check_page("--report", page, sources, meshes, force=given["force"] or is_page(page))
         items = items_folder(page)
-    some = {name: given[name] for name in ("cluster", "force", "retry", "fail_fast", "check")}
+    some = {name: given[name] for name in ("cluster", "force", "retry", "check")}
     return jobs, Settings(folder, options, given["jobs"], items=items, names=names, **some)
 
 
 def summary(batch: Batch) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
-    plan, rows = batch.plan(), [job.row for job in batch.of("done", "done_before")]
-    failed = [{k: job.row[k] for k in ("in", "out", "reason")} for job in batch.of("failed")]
-    failures = [*plan["failed_before"], *plan["refused"], *failed]
+    rows = [job.row for job in batch.of("done", "done_before")]
+    failures = batch.listed("failed_before", "refused", "failed")
     meshes = [(len(row.get("labels", [row])), bool(row["closed"])) for row in rows]
+    states = ("done", "done_before", "failed_before", "refused")
     return {
-        "done": len(batch.of("done")),
+        **{state: len(batch.of(state)) for state in states},
         "failed": len(failures),
-        "done_before": len(plan["done_before"]),
-        "not_begun": len(plan["to_do"]),
-        "failed_before": len(plan["failed_before"]),
-        "refused": len(plan["refused"]),
+        "not_begun": len(batch.of("to_do")),
         "warned": sum(bool(row["warnings"] or row.get("beside")) for row in rows),
         "closed": sum(count for count, is_closed in meshes if is_closed),
         "open": sum(count for count, is_closed in meshes if not is_closed),
@@ -157,7 +152,8 @@ def sentence(batch: Batch) -> str:
 
 def print_plan(batch: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
-    plan = batch.plan()
+    states = ("to_do", "done_before", "failed_before", "refused")
+    plan = {state: batch.listed(state) for state in states}
     if as_json:
         main.print_stdout(plan)
     for state, rows in plan.items() if not as_json else ():

@@ -26,9 +26,7 @@ COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 OUTPUT = "Output"
-HEADINGS = {"names": VALUES} | dict.fromkeys(
-    ("cluster", "jobs", "fail_fast", "retry", "dry_run"), WORK
-)
+HEADINGS = {"names": VALUES} | dict.fromkeys(("cluster", "jobs", "retry", "dry_run"), WORK)
 """Those of options that are not in the table; the others are about the output."""
 FILE = click.Path(path_type=Path)
 
@@ -69,11 +67,9 @@ class Command(click.Command):
         rows: dict[str, list[Any]] = {name: [] for name in (GRID, VALUES, MESH, WORK, OUTPUT)}
         for param in self.get_params(ctx):
             if isinstance(param, click.Option) and (record := param.get_help_record(ctx)):
-                rows[
-                    getattr(
-                        OPTIONS.get(name := str(param.name)), "group", HEADINGS.get(name, OUTPUT)
-                    )
-                ].append(record)
+                name = str(param.name)
+                group = OPTIONS[name].group if name in OPTIONS else HEADINGS.get(name, OUTPUT)
+                rows[group].append(record)
         headings = [heading for heading, some in rows.items() if some]
         for heading in headings:
             with formatter.section(heading if len(headings) > 1 else "Options"):

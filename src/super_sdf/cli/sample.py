@@ -33,9 +33,6 @@ TAKES = (
         help="World distance between samples, instead of -n."),
     option("--padding", type=click.FloatRange(0), metavar="VOXELS",
         help="Voxels between the bounding box of the mesh and the last samples. Default: 2.37."),
-    option("--frame", type=click.Choice(["world", "unit"]), default="world", show_default=True,
-        help="world keeps the coordinates of the mesh; unit scales its box diagonal to 1 and "
-        "centres it in a unit cube, sampled at n^3 voxel centres."),
     option("--band", type=click.FloatRange(1.5), metavar="VOXELS",
         help="Exact distances up to this many voxels from the surface, clamped beyond. Default: "
         "exact everywhere up to 256^3 samples, within 4 voxels in larger grids."),
@@ -52,23 +49,18 @@ def command(source: Path, target: Path, **given: Any) -> None:
     check_modules("sample", "eval")
     from ..files.grids import check_grid_target, write_grid
     from ..files.output import check_apart
-    from ..truth.sampling import PADDING, fitted_layout, sample_solid, unit_layout
-    from ..truth.solid import Solid, load_solid, normalise
+    from ..truth.sampling import PADDING, fitted_layout, sample_solid
+    from ..truth.solid import load_solid
 
-    start, in_unit = time.perf_counter(), given["frame"] == "unit"
+    start, padding = time.perf_counter(), given["padding"]
     count, spacing = given["samples"], given["spacing"]
     check_grid_target(target, force=given["force"])
     check_apart(target, [source])
-    if in_unit and (count is None or spacing is not None or given["padding"] is not None):
-        raise OptionError("--frame unit has a side of 1: give -n, no --spacing and no --padding")
     if (count is None) == (spacing is None):
         raise OptionError("give either -n (samples along the longest axis) or --spacing")
-    padding = given["padding"] if given["padding"] is not None else PADDING * (not in_unit)
+    padding = PADDING if padding is None else padding
     solid, notes = load_solid(source, allow_open=given["allow_open"])
-    if in_unit:
-        solid, layout = Solid(normalise(solid.mesh)), unit_layout(count)
-    else:
-        layout = fitted_layout(solid.mesh, n=count, spacing=spacing, padding=padding)
+    layout = fitted_layout(solid.mesh, n=count, spacing=spacing, padding=padding)
     with main.progress_bar("sampling", given["quiet"]) as progress:
         grid = sample_solid(solid, layout, band=given["band"], progress=progress)
     write_grid(grid, target, force=given["force"])

@@ -22,7 +22,6 @@ from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError, ch
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import OPTIONS, AxisOrder, Options, Space, Values, check_path
-from ..threads import held_memory, memory_bound
 from .formats import DICOM, check_regular_file, find_format, is_store, split_member
 from .output import check_free, replacing
 from .readers import Names, Request, Volume, axes_direction, find_placement
@@ -89,7 +88,7 @@ def read_array(
 ) -> dict[str, Any]:
     """Return values, place (unless ``given``), hint, space and notes: see ``read_grid``."""
     path, direction = check_path(path, "path"), given["direction"]
-    with open_volume(path, axes, memory_left(max_memory), direction) as (volume, request):
+    with open_volume(path, axes, max_memory, direction) as (volume, request):
         volume = volume.in_space(space, str(path))
         if direction is not None:  # of x, y and z
             volume = replace(volume, direction=axes_direction(volume.axes or request.axes))
@@ -109,13 +108,13 @@ def names_in(path: str | Path) -> Names:
 def open_volume(
     path: Path,
     axes: str | None = None,
-    left: int | None = None,
+    max_memory: int | None = None,
     direction: Any = None,
 ) -> Iterator[tuple[Volume, Request]]:
     """Yield the volume in a file, and what was asked for.
 
     Whatever a library raises in the block becomes a FileError of one line, and what it says
-    meanwhile is dropped. ``left`` is how many bytes of memory it may take, None if unknown.
+    meanwhile is dropped.
     """
     format_, (file, named) = find_format(path), split_member(path)
     if format_ is not DICOM and not is_store(file):
@@ -135,7 +134,7 @@ def open_volume(
             warnings.simplefilter("ignore")
             logging.disable(logging.CRITICAL)  # what matters is raised
             readers = import_module(f".readers.{format_.module}", __package__)
-            request = Request(file, member or None, numbers, order, files, left)
+            request = Request(file, member or None, numbers, order, files, max_memory)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
         if str(file) in error.flagged:
@@ -149,12 +148,6 @@ def open_volume(
         raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
     finally:
         logging.disable(logs)
-
-
-def memory_left(max_memory: int | None = None) -> int | None:
-    """Return how many bytes this process may still take, None if unknown."""
-    bound = memory_bound(max_memory)
-    return None if bound is None else max(bound - (held_memory() or 0), 0)
 
 
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
@@ -198,7 +191,7 @@ def grid_from_image(
     Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image
 
-    request = Request(Path(NAME), scalars, (), "zyx", ExitStack(), memory_left(max_memory))
+    request = Request(Path(NAME), scalars, (), "zyx", ExitStack(), max_memory)
     volume = volume_of_image(image, request)
     return make_grid(**_taken(volume, request, {}), **values)
 

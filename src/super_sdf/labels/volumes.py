@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import CORNERS, Numbers, Vectors, dot, face_normals, length, sums_at
+from ..arrays import CORNERS, IntArray, Numbers, Vectors, dot, face_normals, length, sums_at
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..simplify.walls import Walls, faults, labels_apart
@@ -79,11 +79,10 @@ class _Movement:
         _, ny, nz = (corners.max((0, 1)) + 1).tolist()
         keys, nodes = np.unique(corners @ [ny * nz, nz, 1], return_inverse=True)
         self.count, self.nodes = len(keys), nodes.reshape(-1, 8)
-        mesh, point, first, _ = labels_apart(walls)
-        labels = len(first) - 1
-        label = np.repeat(np.arange(labels), np.diff(first))
-        slopes = face_normals(points[point], mesh.faces).repeat(3, 0) / 6
-        slopes = sums_at(mesh.faces.ravel().astype(np.int64), slopes, len(point))
+        apart = labels_apart(walls)
+        slopes = np.concatenate([_slopes(points[own], mesh.faces) for mesh, own in apart])
+        point, labels = np.concatenate([own for _, own in apart]), len(apart)
+        label = np.repeat(np.arange(labels), [len(own) for _, own in apart])
         pairs = self.nodes[point] * labels + label[:, None]
         pairs, at = np.unique(pairs, return_inverse=True)
         at, shares = at.ravel(), self.weights[point]
@@ -124,3 +123,9 @@ class _Movement:
             distances[free] = np.clip(distances[free] + step, -self.most, self.most)
             points = self.moved(distances)
         return points
+
+
+def _slopes(points: Vectors, faces: IntArray) -> Vectors:
+    """Return by how much the volume of a closed mesh grows as its vertices move, (n, 3)."""
+    each = face_normals(points, faces).repeat(3, 0) / 6
+    return sums_at(faces.ravel().astype(np.int64), each, len(points))

@@ -25,7 +25,6 @@ import numpy as np
 from ..check import FULL, Certificate, check_mesh, read_for_check
 from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
-from ..grid.sdf_grid import cubic_grid
 from ..surface.extract import coarse_surface
 from ..surface.mesh import Mesh
 
@@ -87,13 +86,12 @@ def item_of_files(
     except SuperSdfError as error:
         item = Item(certificate={"error": error.flagged})
     item.show(RESULT, shown, certificate)
-    lattice = cubic_grid(samples, options.offset)
-    known = lattice.field.unseen is None  # beside what is unknown, a coarse surface is made up
-    coarse = coarse_surface(lattice, options.offset) if known else None
+    known = samples.field.unseen is None  # beside what is unknown, a coarse surface is made up
+    coarse = coarse_surface(samples, options.offset) if known else None
     if coarse and len(coarse.faces):
         checked = certificate and check_mesh(coarse, samples, options, intersections=False)
-        title = COARSE + (", made equally spaced" if lattice.shape != samples.shape else "")
-        item.show(title, coarse, checked)
+        as_it_is = samples.is_cubic or samples.field.own_lattice
+        item.show(COARSE + ", made equally spaced" * (not as_it_is), coarse, checked)
     return item
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import CENTRE, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
-from ..threads import check_count, map_threads, worthwhile_threads
+from ..threads import check_count, over_threads, worthwhile_threads
 
 # Half voxels: the value of a node of which only the sign is known, the least of a mask's sample.
 BARELY_INSIDE, BARELY_OUTSIDE = np.float32(-1e-3), np.float32(1e-3)
@@ -151,7 +151,7 @@ def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads:
                 blocks[node, voxel[some]] = mean[some]
 
     shared = [part for part in range(27) if part != CENTRE and SHARING[part][-1] > CENTRE]
-    map_threads(average, shared, worthwhile_threads(blocks.size, threads))
+    list(over_threads(average, shared, worthwhile_threads(blocks.size, threads)))
 
 
 def hold_sides(blocks: FloatArray, factor: int, samples: FloatArray) -> None:

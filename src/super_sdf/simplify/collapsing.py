@@ -13,7 +13,7 @@ neighbours stay neighbours; a mesh is the wall round one label.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from threading import Lock
 from typing import Any
@@ -24,7 +24,7 @@ from ..arrays import BoolArray, face_normals, length
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid, smallest_angles
 from .measuring import Original
-from .walls import Walls, irregular_places, meshes_of
+from .walls import Walls, irregular_places, labels_apart
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])  # a triangle apart from all others
@@ -32,8 +32,7 @@ ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])  # a triangle apart from all
 # of the sum of squares), step by step. The first stage leaves hardly any triangle beyond the error,
 # the second does at some places, and leaves a fifth fewer triangles.
 PLANE_DISTANCES = (1.0, 1.3, 1.3, 1.3), (1.7, 1.7)
-ROUNDS = 30, 3.0  # of the threshold, and its rise; from more rounds, meshes get no smaller
-FEW_ROUNDS, LARGE = (8, 5.0), 1 << 12  # nearly as well, from this many triangles on
+ROUNDS, RISE = 8, 5.0  # of the threshold; from more rounds, meshes get hardly smaller
 FEW_SLIVERS = 0.002  # of the triangles, which stay
 THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
 MOST_REPEATS, HALVINGS = 16, 3  # of a stage, before smaller distances are tried
@@ -48,9 +47,8 @@ MARGIN = 1.03  # over the triangles that are left: near enough
 class Unsimplified:
     """Walls to simplify, and what each of their labels is measured against."""
 
-    def __init__(self, walls: Walls, count_round: Callable[[], None] = lambda: None) -> None:
-        self.walls, self.count_round = walls, count_round
-        self.originals = [Original(mesh) for mesh in meshes_of(walls)]
+    def __init__(self, walls: Walls) -> None:
+        self.walls, self.originals = walls, [Original(mesh) for mesh, _ in labels_apart(walls)]
         self.irregular = irregular_places(walls)
 
 
@@ -109,9 +107,8 @@ def collapsed(
     alone = start is of.walls and len(of.originals) == 1
     solid, places = of.originals[0].solid if alone else Solid(start), np.zeros((0, 3))
     for _ in range(MOST_REPEATS):
-        of.count_round()
         result, held = start, np.zeros(len(start.vertices), bool)
-        held[start.faces[solid.nearest_face(places)]] = True
+        held[start.faces[solid.nearest(places)[1]]] = True
         held[start.faces[held[start.faces].any(1)]] = True
         kept = np.asarray(held[start.faces].all(1))
         for step in steps:
@@ -121,7 +118,7 @@ def collapsed(
         wrong = examine(of, result, error)
         if wrong is None or not len(wrong):
             return result if wrong is not None else None
-        if kept[solid.nearest_face(wrong)].all():
+        if kept[solid.nearest(wrong)[1]].all():
             return None
         places = np.concatenate([places, wrong])
     return None
@@ -134,7 +131,7 @@ def examine(of: Unsimplified, result: Walls, error: float) -> Points | None:
     less of a manifold than it was, without new triangles that intersect, with all components and
     their holes.
     """
-    labels = [Solid(mesh) for mesh in meshes_of(result)]
+    labels = [Solid(mesh) for mesh, _ in labels_apart(result)]
     if len(labels) < len(of.originals) or not all(len(label.mesh.faces) for label in labels):
         return None
     wrong = [faults_made(of, result, labels[0] if len(labels) == 1 else Solid(result))]
@@ -143,7 +140,7 @@ def examine(of: Unsimplified, result: Walls, error: float) -> Points | None:
     if len(far := np.concatenate(wrong)):
         return far
     pairs = [(one, label.mesh) for one, label in zip(of.originals, labels)]
-    others = [pair for pair in pairs if not same_topology(pair[0].mesh, pair[1])]
+    others = [pair for pair in pairs if topology(pair[0].mesh) != topology(pair[1])]
     lost = np.concatenate([far, *(lost_places(*pair) for pair in others)])
     return lost if len(lost) or not others else None
 
@@ -168,25 +165,16 @@ def faults_made(of: Unsimplified, result: Walls, solid: Solid) -> Points:
     return np.concatenate([wrong, corners.reshape(-1, 3), corners.mean(1)])
 
 
-def same_topology(one: Mesh, other: Mesh) -> bool:
-    """Return whether both meshes have as many components with the same Euler characteristics.
-
-    That of the whole mesh alone does not change when a ball and a hole are lost. Open edges count.
-    """
-    numbers = []
-    for mesh in (one, other):
-        _, component = mesh.components()
-        triangles = np.bincount(component[mesh.faces[:, 0]], minlength=len(component))
-        vertices = np.bincount(component[np.unique(mesh.faces)], minlength=len(component))
-        numbers.append(np.sort((2 * vertices - triangles)[triangles > 0]))
-    return np.array_equal(numbers[0], numbers[1])
+def topology(mesh: Mesh) -> tuple[int, int]:
+    """Return the number of components, and twice the Euler characteristic of a closed mesh."""
+    return mesh.components()[0], 2 * len(np.unique(mesh.faces)) - len(mesh.faces)
 
 
 def lost_places(original: Original, mesh: Mesh) -> Points:
     """Return the vertices of those components of a mesh of which nothing is left."""
     component = original.mesh.components()[1][original.mesh.faces[:, 0]]
     roots = np.unique(mesh.components()[1][mesh.faces[:, 0]])
-    found = component[original.solid.nearest_face(mesh.vertices[roots].astype(np.float64))]
+    found = component[original.solid.nearest(mesh.vertices[roots].astype(np.float64))[1]]
     missing = np.unique(original.mesh.faces[~np.isin(component, found)])
     return original.mesh.vertices[missing].astype(np.float64)
 
@@ -223,9 +211,8 @@ def collapse_edges(
     faces = np.concatenate([faces, np.stack([pins, one, other], 1)]).astype(np.int32)
     options: dict[str, Any] = {"target_count": int(triangles) + len(last) + len(pins)}
     if distance:
-        rounds, rise = FEW_ROUNDS if len(walls.faces) > LARGE else ROUNDS
-        options = {"target_count": 0, "max_iterations": rounds}
-        options |= {"alpha": rounds**-rise, "K": 1, "aggressiveness": rise}  # to the distance
+        options = {"target_count": 0, "max_iterations": ROUNDS}
+        options |= {"alpha": ROUNDS**-RISE, "K": 1, "aggressiveness": RISE}  # to the distance
     with ONE_AT_A_TIME:
         library = Simplify()
         library.setMesh(points, faces)

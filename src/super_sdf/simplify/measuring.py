@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import length
-from ..surface.mesh import Mesh, row_keys
+from ..arrays import face_normals, length
+from ..surface.mesh import Mesh
 from ..truth.solid import Points, Solid
 
 BETWEEN = 0.97  # of the error, which no measured point exceeds: others may be a little farther away
@@ -33,26 +33,19 @@ class Deviation(NamedTuple):
 
 
 class Original:
-    """A mesh before it was simplified, to measure simplified ones against.
-
-    A vertex is measured again only if a simplified mesh lacks the triangle that was nearest to it.
-    """
+    """A mesh before it was simplified, to measure simplified ones against."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh, self.solid = mesh, Solid(mesh)
         self.edges = _edges(mesh)
         self.side = float(length(np.subtract(*self.solid.mesh.vertices[self.edges])).mean())
-        self.off = np.full(len(mesh.vertices), np.inf)
-        self.near = np.zeros(len(mesh.vertices), np.uint64)  # keys of triangles
 
     def compare(self, other: Solid, error: float = np.inf) -> tuple[Points, Deviation]:
         """Return points near this mesh, (n, 3), where the two are farther apart than an error."""
         limit, vertices = BETWEEN * error, self.solid.mesh.vertices
-        keys = row_keys(other.mesh.vertices[other.mesh.faces].reshape(-1, 9))
-        stale, off = ~np.isin(self.near, keys) | (self.off > limit), self.off
-        off[stale], face, _ = other.nearest(vertices[stale])
-        self.near[stale], bar = keys[face], min(limit, float(off.max()))
-        low, high = vertices[self.edges[:, np.not_equal(*self.near[self.edges])]]
+        off, near, _ = other.nearest(vertices)
+        bar, ends = min(limit, float(off.max())), near[self.edges]
+        low, high = vertices[self.edges[:, ends[0] != ends[1]]]
         middles = (low + high) / 2
         off_middles = other.distance(middles)
         more = off_middles > SUSPECT * bar
@@ -102,5 +95,5 @@ def _edges(mesh: Mesh) -> NDArray[np.int32]:
 
 def _mean(solid: Solid, values: NDArray[np.float64]) -> float:
     """Return the mean of values of triangles, (m,), over the area."""
-    areas = length(solid.normals())
+    areas = length(face_normals(solid.mesh.vertices, solid.mesh.faces))
     return float(values @ areas / areas.sum())

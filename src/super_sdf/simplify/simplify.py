@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 BYTES_PER_TRIANGLE = 1300
 NONE_SPARED = "the mesh was not simplified: none of its triangles can be spared within the error"
 UNREACHED = "{:,} triangles cannot be reached while the mesh stays a manifold of the same topology"
-LEFT = 0.85  # share of the work that is left after a round: a guess
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +52,6 @@ def simplify_mesh(
     error: float | None = None,
     triangles: int | None = None,
     max_memory: int | None = None,
-    progress: Callable[[float], None] | None = None,
 ) -> Simplified:
     """Simplify a mesh within a distance, or to a number of triangles.
 
@@ -69,8 +66,6 @@ def simplify_mesh(
         Largest number of triangles. If it cannot be reached, a warning says so.
     max_memory : int, optional
         Bytes that the process may hold in all; by default a share of the free memory.
-    progress : callable, optional
-        Called with the estimated share of the work that is done; an exception in it ends the work.
 
     Returns
     -------
@@ -99,15 +94,7 @@ def simplify_mesh(
 
     if not count:
         return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
-    left = 1.0
-
-    def count_round() -> None:  # how many there will be is not known
-        nonlocal left
-        if progress:
-            progress(1 - left)
-        left *= LEFT
-
-    of, warnings = Unsimplified(Walls.of(mesh), count_round), tuple[str, ...]()
+    of, warnings = Unsimplified(Walls.of(mesh)), tuple[str, ...]()
     if triangles is None:
         found = within(of, error or 0.0)
         warnings = () if found else (NONE_SPARED,)
@@ -117,6 +104,4 @@ def simplify_mesh(
             warnings = (f"{UNREACHED.format(triangles)}: it has {few:,}",)
     result = Mesh(found.vertices, found.faces) if found else mesh
     deviation = of.originals[0].compare(Solid(result), error or np.inf)[1]
-    if progress:
-        progress(1.0)
     return Simplified(result, count, deviation, warnings)

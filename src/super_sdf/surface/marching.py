@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, part_of_node
-from ..threads import map_chunks, map_threads, rows_in_chunk, worthwhile_threads
+from ..threads import map_chunks, over_threads, rows_in_chunk, worthwhile_threads
 from .mesh import CLEARANCE
 
 # Nodes beyond the grid's border (of a cap, see ``cap.close``) are placed this far outside it,
@@ -259,7 +259,7 @@ def connect(field: FineField, crossings: Crossings, threads: int = 1) -> IntArra
         vertex_at.take(corners, out=faces[begin : begin + len(corners)], mode="clip")
 
     runs = list(zip(cuts[:-1].tolist(), cuts[1:].tolist()))
-    map_threads(fill, runs, worthwhile_threads(12 * len(faces), threads))
+    list(over_threads(fill, runs, worthwhile_threads(12 * len(faces), threads)))
     return faces
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import warnings
-import zipfile
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,10 +16,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import FileError, MeshError, OutOfMemoryError
+from ..errors import FileError, MeshError
 from ..files.formats import check_regular_file
 from ..surface.mesh import Mesh
-from ..threads import check_bound
 
 if TYPE_CHECKING:
     import igl
@@ -31,23 +29,16 @@ Distances = NDArray[np.float64]
 LARGEST_COORDINATE = 1e30  # products and squares of larger ones overflow
 MERGE_DISTANCE = 1e-8  # vertices closer than this are merged
 SMALLEST_STEP = 1e-18  # of the largest coordinate, so that multiples of it fit in 64 bits
-XML_BYTES = 20  # of memory that trimesh takes for each byte of XML in a .3mf
 SIDE_STEP = 1e-5  # from a face to where the winding number is taken, over the box diagonal
 
 
-def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
+def read_mesh(path: str | Path) -> Mesh:
     """Read any mesh file that trimesh reads, with merged float64 vertices.
 
-    ``max_memory`` is how many bytes this process may hold, by default a share of the free memory.
-    FileError if no mesh can be read; OutOfMemoryError if the file is an archive, such as ``.3mf``,
-    that unpacks to more than fits in memory; MeshError if what it holds is no finite surface.
+    FileError if no mesh can be read, MeshError if what the file holds is no finite surface.
     """
     path = check_regular_file(path)
     try:
-        if zipfile.is_zipfile(path):
-            with zipfile.ZipFile(path) as archive:
-                need = XML_BYTES * sum(info.file_size for info in archive.infolist())
-            check_bound(need, str(path), max_memory, "save it as .ply or .stl, or ")
         import trimesh
 
         logging.getLogger("trimesh").addHandler(logging.NullHandler())  # else Python prints them
@@ -57,8 +48,6 @@ def read_mesh(path: str | Path, max_memory: int | None = None) -> Mesh:
             found = trimesh.load_mesh(path, process=False, skip_materials=True)
             vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
             faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
-    except OutOfMemoryError:
-        raise
     except Exception as error:  # the readers of trimesh raise all kinds of errors
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
         raise FileError(f"{path} cannot be read as a mesh: {reason}") from error
@@ -154,10 +143,6 @@ class Solid:
         """Return the unsigned distance, (n,), to the nearest triangle."""
         return self.nearest(points)[0]
 
-    def nearest_face(self, points: Points) -> NDArray[np.int64]:
-        """Return the index of the nearest triangle, (n,)."""
-        return self.nearest(points)[1]
-
     def is_inside(self, points: Points) -> NDArray[np.bool_]:
         """Return a mask, (n,), of the points inside the solid."""
         inside: NDArray[np.bool_] = np.zeros(len(points), bool)
@@ -167,11 +152,6 @@ class Solid:
         """Return the signed distance, (n,), negative inside."""
         found = self.distance(points)
         return np.where(self.is_inside(points), -found, found)
-
-    def normals(self) -> Points:
-        """Return normals of the triangles, (m, 3), as long as twice their areas."""
-        a, b, c = self.mesh.vertices[self.mesh.faces.T]
-        return np.cross(b - a, c - a)
 
     def intersecting(self) -> NDArray[np.int64]:
         """Return the pairs of triangles, (k, 2), that meet off a common vertex or edge.
@@ -186,14 +166,14 @@ class Solid:
 
     def count_overlapping(self) -> int:
         """Count the faces with a winding number of 2 or more, or below 0, on one side."""
-        normals, centres = self.normals(), self.mesh.vertices[self.mesh.faces].mean(1)
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        size = np.linalg.norm(np.ptp(self.mesh.vertices, axis=0))
-        step = SIDE_STEP * size * normals / np.where(lengths > 0, lengths, 1)
+        a, b, c = self.mesh.vertices[self.mesh.faces.T]
+        centres, normals = (a + b + c) / 3, np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        step = SIDE_STEP * np.linalg.norm(np.ptp(self.mesh.vertices, axis=0)) * normals
         winding = self._winding.winding_number(np.concatenate([centres + step, centres - step]))
         winding = winding * (np.sign(self.mesh.volume()) or 1)
         wrong = ((winding > 1.5) | (winding < -0.5)).reshape(2, -1).any(0)
-        return int(np.count_nonzero(wrong & (lengths[:, 0] > 0)))
+        return int(np.count_nonzero(wrong & normals.any(1)))
 
 
 def smallest_angles(corners: Points) -> Distances:

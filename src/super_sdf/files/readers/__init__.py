@@ -14,21 +14,22 @@ from dataclasses import dataclass, field, replace
 from itertools import permutations
 from math import prod
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Triple
-from ...errors import FileError, GridError, OptionError, OutOfMemoryError
-from ...grid.samples import as_direction, as_triple, check_direction
-from ...threads import in_words
+from ...errors import FileError, GridError, OptionError
+from ...grid.samples import UNNAMED, as_direction, as_triple, check_direction, even_steps
+from ...threads import check_bound
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
 MOST_NAMED = 10  # arrays that an error lists
 COPIES = 2  # of an array that is loaded, while its axes are put in order
 PLACE = ("spacing", "origin", "direction")
 XYZ = np.eye(3)
+SPACE = ("x", "y", "z")
 LABELS, DENSITY, DISTANCE = "labels", "density", "distance"  # what a file says its values are
 
 Index: TypeAlias = tuple[slice | int, ...]
@@ -46,17 +47,13 @@ class Request:
     numbers: tuple[int, ...]  # along the axes that are not in space, of which one is read
     axes: str  # the order in a file that does not state one: "xyz" or "zyx"
     files: ExitStack  # closes what the reader opens, once the samples are read
-    left: int | None = None  # bytes of memory that the process may still take, if that is known
+    max_memory: int | None = None  # bytes that the process may hold; default: a share of the free
 
     def check_fits(self, shape: Sequence[int], dtype: np.dtype[Any]) -> None:
         """Raise OutOfMemoryError if an array that is loaded whole does not fit."""
+        what = f"{self.path}, {' x '.join(map(str, shape))} {dtype}, loaded whole,"
         need = COPIES * prod(map(int, shape)) * dtype.itemsize
-        if self.left is not None and need > self.left:
-            raise OutOfMemoryError(
-                f"{self.path}, {' x '.join(map(str, shape))} {dtype}, is loaded whole, which takes "
-                f"{in_words(need)} of memory, {in_words(self.left)} are left; allow more "
-                "(--max-memory), or save it as .npy in C order"
-            )
+        check_bound(need, what, self.max_memory, "save it as .npy in C order, or ")
 
     def choose(self, names: Sequence[str], what: str) -> str:
         """Return the name of the array to read: the one asked for, else the only one."""
@@ -206,24 +203,126 @@ def find_placement(
     """
     direction = XYZ if volume.direction is None else np.asarray(volume.direction, np.float64)
     check_direction(direction)
-
-    def nearness(order: tuple[int, ...]) -> float:
-        return float(np.abs(direction[(0, 1, 2), order]).sum())
-
-    order = max(permutations(range(3)), key=nearness)
+    orders = permutations(range(3))  # of which the axes are taken in the nearest
+    order = max(orders, key=lambda axes: float(np.abs(direction[(0, 1, 2), axes]).sum()))
     is_back = direction[(0, 1, 2), order] < 0
     turned = direction[:, order] * np.where(is_back, -1, 1)
-    is_straight = np.abs(turned - XYZ).max() <= STRAIGHT
     place = {k: volume.place.get(k) if given.get(k) is None else given[k] for k in PLACE}
-    spacing, origin, _ = place.values()
+    if place["direction"] is None and np.abs(turned - XYZ).max() > STRAIGHT:
+        place["direction"] = as_direction(turned)
+    spacing, origin, frame = place.values()
     if spacing is None and volume.spacing is not None:
         spacing = tuple(volume.spacing[axis] for axis in order)
     origin = volume.origin if origin is None else origin
     if origin is not None and is_back.any():  # to the sample that comes first now
         ends = np.array([volume.shape[axis] - 1 for axis in order]) * is_back
         steps = np.broadcast_to(np.asarray(spacing, np.float64), 3)
-        origin = np.asarray(origin, np.float64) - (XYZ if is_straight else turned) @ (ends * steps)
-    if place["direction"] is None:
-        place["direction"] = None if is_straight else as_direction(turned)
+        frame = XYZ if frame is None else np.reshape(frame, (3, 3))
+        origin = np.asarray(origin, np.float64) - frame @ (ends * steps)
     forwards = tuple(slice(None, None, -1 if is_back[order.index(n)] else 1) for n in range(3))
     return order, forwards, {**place, "spacing": spacing, "origin": origin}
+
+
+# What HDF5, Zarr, NetCDF, MATLAB and TIFF files say of the axes of an array, and of its values
+
+
+class Axis(NamedTuple):
+    """What a file says of an axis, "" or None where it does not."""
+
+    name: str = ""
+    unit: str = ""
+    step: float | None = None  # from a sample to the next, below 0 along a falling axis
+    start: float | None = None  # position of the first sample
+
+
+def one_unit(units: Sequence[str]) -> tuple[bool, tuple[str, ...]]:
+    """Return whether x, y and z have the same unit of length, or none; and a note that names it."""
+    listed = ", ".join(dict.fromkeys(filter(None, units)))
+    if ", " in listed:
+        said = f"its axes have different units ({listed})"
+        return False, (f"{said}: spacing and origin are not taken from it (give --spacing)",)
+    return True, (f"lengths are in the unit that it states, {listed}",) * bool(listed)
+
+
+def measured(name: str, count: int, scale: Any, about: Mapping[str, Any]) -> Axis:
+    """Return an axis by its name and a scale, if there is one of its length, with attributes.
+
+    The scale has the coordinates, which must be evenly spaced, or all the same, if none are known.
+    By the conventions for climate and forecast data an axis may be ``positive: down``, and ``axis``
+    may name it.
+    """
+    places = np.asarray(scale[:] if getattr(scale, "shape", ()) == (count,) else [0])
+    if places[0] == places[-1]:
+        return Axis(name)
+    start, step = even_steps(name, places)
+    unit, alias, positive = (
+        said.decode() if isinstance(said, bytes) else str(said)
+        for said in (about.get(key, "") for key in ("units", "axis", "positive"))
+    )
+    sign = -1 if positive.lower() == "down" else 1
+    is_named = name.lower() in SPACE or alias.lower() not in SPACE
+    return Axis(name if is_named else alias, unit, sign * step, sign * start)
+
+
+def placed(
+    request: Request,
+    axes: Sequence[Axis],
+    attributes: Mapping[str, Any],
+    shape: Sequence[int],
+    order: str = "",
+) -> dict[str, Any]:
+    """Return what a ``Volume`` says of the place of an array: which axes are kept, and where.
+
+    Attributes replace what ``axes`` says: ``element_size_um``, of ImageJ's HDF5 plugin, has the
+    order of the array's axes; ``spacing``, ``origin`` and the columns of ``direction`` are x, y, z.
+    ``order`` is that of axes without names.
+    """
+    names = ["" if axis.name in UNNAMED else axis.name.strip().lower() for axis in axes]
+    in_space = [n for n, name in enumerate(names) if name in SPACE]
+    is_named = sorted(names[n] for n in in_space) == list(SPACE)
+    index = request.pick(shape, in_space if is_named else None, names)
+    kept, order = kept_of(index), order or request.axes
+    notes = tuple[str, ...]()
+    if is_named and order == "zyx":
+        order = "".join(names[n] for n in kept)
+    elif not is_named and any(names[n] for n in kept):
+        called = ", ".join(names[n] or "?" for n in kept)
+        notes = (f"its axes are named {called}: taken as {', '.join(order)}",)
+    world = [axes[kept[order.index(name)]] for name in SPACE]
+    is_one, told = one_unit([axis.unit for axis in world])
+    spacing = origin = None
+    if is_one and all(axis.step for axis in world):
+        spacing = triple(abs(axes[n].step or 0) for n in kept)
+        starts = [axis.start for axis in world]
+        origin = None if None in starts else triple(starts)
+    if "element_size_um" in attributes:
+        spacing = as_triple(attributes["element_size_um"], "element_size_um")
+    signs = [-1 if (axes[n].step or 0) < 0 else 1 for n in kept]
+    place = {"spacing": spacing, "origin": origin, "direction": axes_direction(order) * signs}
+    stated = {"place": stated_place(attributes), "notes": notes + told}
+    return {**place, **stated, "index": index, "axes": order}
+
+
+def stored(values: Any, attributes: Mapping[str, Any], none: Any = None) -> Loading:
+    """Return how a ``Volume`` loads an array of a file.
+
+    By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
+    plus ``add_offset``; ``none``, or ``_FillValue``, is no value.
+    """
+    dtype = np.dtype(values.dtype)
+    is_packed = "scale_factor" in attributes or "add_offset" in attributes
+    is_packed |= dtype.kind == "f" and "_FillValue" in attributes
+    if not is_packed:
+        return of_array(values)
+    factor = float(np.ravel(attributes.get("scale_factor", 1))[0])
+    offset = float(np.ravel(attributes.get("add_offset", 0))[0])
+    missing = np.ravel(attributes.get("_FillValue", none))
+    kind = np.result_type(dtype, np.float32)
+
+    def load(index: Index) -> Any:
+        numbers = np.asarray(values[index])
+        unpacked = (numbers * factor + offset).astype(kind)
+        unpacked[np.isin(numbers, missing)] = np.nan
+        return unpacked
+
+    return load, tuple(values.shape), kind

@@ -10,10 +10,8 @@ from typing import Any
 
 from ...errors import FileError
 from ...options import LPS
-from . import PLACE, Request, Volume, of_array, triple
-from .axes import Axis, measured, placed, stored
+from . import PLACE, Axis, Request, Volume, measured, of_array, placed, stored, triple
 
-NO_COORDINATES = b"This is a netCDF dimension but not a netCDF variable"
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
 ORDER = "its axes are taken as x, y, z, the order of ndgrid; of meshgrid save permute(V, [2 1 3])"
@@ -21,27 +19,31 @@ ORDER = "its axes are taken as x, y, z, the order of ndgrid; of meshgrid save pe
 
 def read_hdf5(request: Request) -> Volume:
     """Read ``FILE.h5:/DATASET``; without a name the only dataset of three axes."""
+    datasets = _datasets_in(request)
+    if "/ITKImage/0/VoxelData" in datasets:  # in LPS, with a direction a row
+        spacing, origin, directions, values = (
+            datasets[f"/ITKImage/0/{name}"]
+            for name in ("Spacing", "Origin", "Directions", "VoxelData")
+        )
+        place = {"spacing": triple(spacing[:][::-1]), "origin": triple(origin), "space": LPS}
+        return _volume_of(values, {**place, "direction": directions[:].T[:, ::-1]})
+    shapes = {name: values.shape or () for name, values in datasets.items()}
+    values = datasets[request.choose_array(shapes, "3D dataset")]
+    return _volume_of(values, placed(request, _axes(values), values.attrs, values.shape))
+
+
+def _datasets_in(request: Request) -> dict[str, Any]:
+    """Return the datasets of a file by their paths, without links to other files."""
     import h5py
 
-    file = request.files.enter_context(h5py.File(request.path, "r"))
-    shapes: dict[str, tuple[int, ...]] = {}
+    file, found = request.files.enter_context(h5py.File(request.path, "r")), dict[str, Any]()
 
     def note(name: str, entry: Any) -> None:
         if isinstance(entry, h5py.Dataset):
-            shapes[f"/{name}"] = entry.shape or ()
+            found[f"/{name}"] = entry
 
     file.visititems(note)
-    if "ITKImage" in file:  # in LPS, with a direction a row
-        image = file["ITKImage/0"]
-        place: dict[str, Any] = {
-            "spacing": triple(image["Spacing"][:][::-1]),
-            "origin": triple(image["Origin"]),
-            "direction": image["Directions"][:].T[:, ::-1],
-            "space": LPS,
-        }
-        return _volume_of(image["VoxelData"], place)
-    values = file[request.choose_array(shapes, "3D dataset")]
-    return _volume_of(values, placed(request, _axes(values), values.attrs, values.shape))
+    return found
 
 
 def _axes(values: Any) -> list[Axis]:
@@ -52,16 +54,9 @@ def _axes(values: Any) -> list[Axis]:
         return [Axis(str(tag.get("key", "")), step=step) for tag, step in zip(tags, steps)]
     axes = []
     for dim, count in zip(values.dims, values.shape):
-        scale = dim[0] if len(dim) else None
-        name = dim.label or ("" if scale is None else (scale.name or "").rsplit("/", 1)[-1])
-        if (
-            scale is None
-            or scale.shape != (count,)
-            or NO_COORDINATES in bytes(scale.attrs.get("NAME", b""))
-        ):
-            axes.append(Axis(name))
-        else:
-            axes.append(measured(name, _check_own(scale)[:], scale.attrs))
+        scale = _check_own(dim[0]) if len(dim) else None
+        name = dim.label or str(getattr(scale, "name", "")).rsplit("/", 1)[-1]
+        axes.append(measured(name, count, scale, getattr(scale, "attrs", {})))
     return axes
 
 
@@ -88,11 +83,10 @@ def read_netcdf(request: Request) -> Volume:
     variables = file.variables
     shapes = {f"/{name}": values.shape for name, values in variables.items()}
     values = variables[request.choose_array(shapes, "variable of three axes")[1:]]
-    scales = [variables.get(name) for name in values.dimensions]
-    axes = [
-        Axis(name) if scale is None else measured(name, scale.data, scale._attributes)
-        for name, scale in zip(values.dimensions, scales)
-    ]
+    axes = []
+    for name, count in zip(values.dimensions, values.shape):
+        scale = variables.get(name)
+        axes.append(measured(name, count, scale, getattr(scale, "_attributes", {})))
     place = placed(request, axes, values._attributes, values.shape)
     return Volume(*stored(values.data, values._attributes), **place)
 
@@ -108,11 +102,12 @@ def read_mat(request: Request) -> Volume:
 
     is_hdf5 = h5py.is_hdf5(request.path)
     if is_hdf5:
-        file = request.files.enter_context(h5py.File(request.path, "r"))
-        kinds = {key: str(file[key].attrs.get("MATLAB_class", b""), "ascii") for key in file}
-        shapes = {key: file[key].shape or () for key, kind in kinds.items() if kind in NUMBERS}
-        values = file[request.choose_array(shapes)]
-        stated = {key: _check_own(file[key])[()].T for key in PLACE if key in file}
+        datasets = {name[1:]: values for name, values in _datasets_in(request).items()}
+        kinds = {name: each.attrs.get("MATLAB_class", b"") for name, each in datasets.items()}
+        numeric = [name for name, kind in kinds.items() if str(kind, "ascii") in NUMBERS]
+        shapes = {name: datasets[name].shape or () for name in numeric if "/" not in name}
+        values = datasets[request.choose_array(shapes)]
+        stated = {key: _check_own(datasets[key])[()].T for key in PLACE if key in datasets}
     else:
         shapes = {name: shape for name, shape, kind in whosmat(request.path) if kind in NUMBERS}
         name = request.choose_array(shapes)

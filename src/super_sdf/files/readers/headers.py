@@ -18,10 +18,8 @@ import numpy as np
 from ...errors import FileError, GridError
 from ...options import LPS, RAS
 from ..formats import check_beside, split_header
-from . import LABELS, Index, Names, Request, Volume, from_affine, kept_of, triple
-from .axes import one_unit
+from . import LABELS, Index, Names, Request, Volume, from_affine, kept_of, one_unit, triple
 
-IN_SPACE = ("domain", "space", "???", "none")  # kinds of axes; others are lists, vectors, time
 SPACES = {"right-anterior-superior": RAS, "ras": RAS, "left-posterior-superior": LPS, "lps": LPS}
 # Fields in one spelling of those that the format allows
 SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
@@ -68,11 +66,10 @@ def _segments(raw: dict[str, Any], layer: int) -> Names:
 
 def _axes_in_space(header: dict[str, Any]) -> list[int] | None:
     """Return the axes that the header says are in space, None if these are not three."""
-    is_in_space = [kind in IN_SPACE for kind in header.get("kinds", ["???"] * len(header["sizes"]))]
-    if header.get("space directions") is not None:
-        along = np.nan_to_num(np.asarray(header["space directions"], np.float64)[:, :3])
-        is_in_space = (along != 0).any(1).tolist()
-    axes = np.flatnonzero(is_in_space).tolist()
+    if (directions := header.get("space directions")) is None:
+        return None
+    along = np.nan_to_num(np.asarray(directions, np.float64)[:, :3])
+    axes = np.flatnonzero((along != 0).any(1)).tolist()
     return axes if len(axes) == 3 else None
 
 

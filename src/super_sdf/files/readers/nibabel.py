@@ -12,8 +12,7 @@ import numpy as np
 
 from ...options import RAS
 from ..formats import check_beside
-from . import LABELS, XYZ, Request, Volume, from_affine, triple
-from .axes import one_unit
+from . import LABELS, XYZ, Request, Volume, from_affine, one_unit, triple
 
 PAIRS = (".img", ".IMG", ".img.gz")
 UNITS = {1: "metre", 3: "micrometre"}  # of lengths, but for millimetres

@@ -43,7 +43,7 @@ def read_npz(request: Request) -> Volume:
     archive = request.files.enter_context(np.load(request.path, allow_pickle=False))
     keys = set(archive.files)
     if set(OPEN3D) <= keys:
-        return _blocks_of_open3d(archive)
+        return _blocks_of_open3d(request, archive)
     if {"voxels", "factor"} <= keys:
         way_out = "mesh it with extract_mesh(read_field(path))"
         raise FileError(f"{request.path} is a refined field, no grid: {way_out}")
@@ -61,7 +61,7 @@ def read_npz(request: Request) -> Volume:
     return Volume(lambda at: archive[name][at], shapes[name], dtypes[name], index=index, **place)
 
 
-def _blocks_of_open3d(archive: Any) -> Volume:
+def _blocks_of_open3d(request: Request, archive: Any) -> Volume:
     """Return the truncated distances in cubes of voxels: without weight, they are unknown."""
     keys, step, resolution, *numbers = (archive[name] for name in OPEN3D)
     values, weights = (archive[f"value_{int(number.item()):03d}"] for number in numbers)
@@ -69,14 +69,11 @@ def _blocks_of_open3d(archive: Any) -> Volume:
     starts = (keys - low) * side
     shape = tuple((starts.max(0) + side).tolist())
     samples = np.where(weights > 0, values, np.nan)[..., 0].transpose(0, 3, 2, 1)  # block, x, y, z
-
-    def load(index: Any) -> Any:
-        whole = np.full(shape, np.nan, samples.dtype)
-        for (x, y, z), block in zip(starts, samples):
-            whole[x : x + side, y : y + side, z : z + side] = block
-        return whole
-
-    return Volume(load, shape, samples.dtype, (step,) * 3, triple(step * side * low))
+    request.check_fits(shape, samples.dtype)
+    whole = np.full(shape, np.nan, samples.dtype)
+    for (x, y, z), block in zip(starts, samples):
+        whole[x : x + side, y : y + side, z : z + side] = block
+    return Volume(*of_array(whole), (step,) * 3, triple(step * side * low))
 
 
 def read_sdf(request: Request) -> Volume:

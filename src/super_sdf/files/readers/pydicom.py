@@ -6,7 +6,7 @@ a place, and takes missing slices for evenly spaced ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +27,12 @@ PREAMBLE = 128  # bytes before the mark DICM
 BEYOND = 2  # empty slices on both sides of those that a segmentation stores
 BITS, LABEL_MAP = "1.2.840.10008.5.1.4.1.1.66.4", "1.2.840.10008.5.1.4.1.1.66.7"
 """The two classes of segmentations: a frame is of one segment, or holds the numbers of all."""
+STATED = (
+    *("ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"),
+    *("RescaleSlope", "RescaleIntercept"),
+    *("ReferencedSegmentNumber", "SpacingBetweenSlices", "SliceThickness"),
+)
+"""Of a frame, or of all, in the header or in groups."""
 Image = tuple[Path, Any]  # a file and its header
 
 
@@ -40,7 +46,9 @@ class _Frame(NamedTuple):
     across: NDArray[np.float64]  # world directions along a row and down a column
     spacing: NDArray[np.float64]  # of rows and of columns
     scale: tuple[float, float]
-    segment: int
+    segment: float  # its number, 0 if none is stated, as the next two
+    between: float  # spacing between slices
+    thickness: float
 
 
 Use = Callable[[NDArray[Any], _Frame, NDArray[Any]], None]
@@ -99,30 +107,22 @@ def _frames(images: list[Image]) -> Iterator[_Frame]:
         frames = header.get("PerFrameFunctionalGroupsSequence") or [header]
         if len(frames) != int(header.get("NumberOfFrames") or 1):
             raise GridError(f"{path.name} has frames without a place each: save it as NIfTI")
-        shared = _items(header.get("SharedFunctionalGroupsSequence"))
+        shared = _elements(header.get("SharedFunctionalGroupsSequence") or ())
         for number, frame in enumerate(frames):
-            groups = [*_items([frame] if frame is not header else ()), *shared, header]
-            names = "ImagePositionPatient", "ImageOrientationPatient", "PixelSpacing"
-            place = [_stated(groups, name) for name in names]
-            if not all(place):
+            stated = {} if frame is header else {**shared, **_elements([frame])}
+            values = [stated.get(name, header.get(name)) for name in STATED]
+            if not all(values[:3]):
                 raise GridError(f"{path.name} states no place: it is no slice of a volume")
-            corner, across, steps = (np.array(numbers, np.float64) for numbers in place)
-            slope, intercept = _stated(groups, "RescaleSlope"), _stated(groups, "RescaleIntercept")
-            scale = 1.0 if slope is None else float(slope), float(intercept or 0)
-            segment = int(_stated(groups, "ReferencedSegmentNumber") or 0)
-            about = corner, across.reshape(2, 3), steps, scale, segment
+            corner, across, steps = (np.array(numbers, np.float64) for numbers in values[:3])
+            slope, intercept, *others = (float(number or 0) for number in values[3:])
+            scale = slope if values[3] is not None else 1.0, intercept
+            about: Any = corner, across.reshape(2, 3), steps, scale, *others
             yield _Frame(path, number, (header.Rows, header.Columns), *about)
 
 
-def _items(groups: Sequence[Any] | None) -> list[Any]:
-    """Return what the sequences of functional groups hold."""
-    each_of = (each for group in groups or () for each in group if each.VR == "SQ")
-    return [item for each in each_of for item in each.value or ()]
-
-
-def _stated(groups: list[Any], name: str) -> Any:
-    """Return an element of the first group that has it, else None."""
-    return next((group[name].value for group in groups if name in group), None)
+def _elements(groups: Iterable[Any]) -> dict[str, Any]:
+    """Return the elements in functional groups, and in the sequences in them, by keyword."""
+    return {each.keyword: each.value for group in groups for each in group.iterall()}
 
 
 def _pixels(frame: _Frame) -> NDArray[Any]:
@@ -206,10 +206,8 @@ def _of_segments(
     Of fractions, what is over a half is inside.
     """
     heights = _heights(frames)
-    groups = [*_items(header.SharedFunctionalGroupsSequence), header]
-    between, thick = (_stated(groups, n) for n in ("SpacingBetweenSlices", "SliceThickness"))
     gaps = np.diff(np.unique(heights.round(4)))
-    step = float(between or (gaps.min() if len(gaps) else thick) or 0)
+    step = frames[0].between or (float(gaps.min()) if len(gaps) else frames[0].thickness)
     if not step > 0:
         raise GridError("it states neither the spacing between slices nor their thickness")
     planes = np.rint((heights - heights.min()) / step).astype(int) + BEYOND
@@ -221,7 +219,7 @@ def _of_segments(
         elif not chosen or frame.segment in chosen:
             inside = values > most / 2
             if plane[inside].any():
-                said = f"{frame.path}:{labels[frame.segment]}"
+                said = f"{frame.path}:{labels[int(frame.segment)]}"
                 raise GridError(f"its segments overlap: give one of them, {said}")
             plane[inside] = 1 if chosen else frame.segment
 

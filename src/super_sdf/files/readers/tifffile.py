@@ -11,8 +11,7 @@ from xml.etree import ElementTree
 
 from ...errors import GridError
 from ..formats import check_beside
-from . import Request, Volume
-from .axes import Axis, placed
+from . import Axis, Request, Volume, placed
 
 
 def read_tiff(request: Request) -> Volume:
@@ -36,7 +35,6 @@ def read_tiff(request: Request) -> Volume:
         )
     if request.axes != "zyx" or not {*"xyz"} <= {*names}:  # pages are z, whatever they are called
         names = names[:-3] + request.axes
-    request.check_fits(shape, series.dtype)
     stated = _imagej_axes(file) if ome is None else _ome_axes(ome)
     axes, order = [stated.get(name, Axis(name)) for name in names], [n for n in names if n in "xyz"]
     place = placed(request, axes, {}, shape, "".join(order))
@@ -49,17 +47,16 @@ def _imagej_axes(file: Any) -> dict[str, Axis]:
     tags = {tag.name: tag.value for tag in file.pages[0].tags}
     resolution = [tags.get(name, (0, 1)) for name in ("XResolution", "YResolution")]
     # ImageJ writes letters beyond ASCII by their numbers
-    units = [str(metadata.get(f"{a}unit") or metadata.get("unit") or "pixel") for a in "xyz"]
-    units = [each.encode("ascii", "backslashreplace").decode("unicode_escape") for each in units]
-    is_stated = "spacing" in metadata or not units[0].startswith("pixel")
+    unit = str(metadata.get("unit") or "").encode("ascii", "backslashreplace")
+    is_stated = "spacing" in metadata or (unit and not unit.startswith(b"pixel"))
     if not is_stated or not all(pixels for pixels, _ in resolution):
         return {}
     steps = [count / pixels for pixels, count in resolution]
     steps.append(abs(float(metadata.get("spacing") or 1)))
     starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]  # in pixels
     places = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
-    units = units if "unit" in metadata else [""] * 3
-    return {each[0]: Axis(*each) for each in zip("xyz", units, steps, places)}
+    stated = zip("xyz", [unit.decode("unicode_escape")] * 3, steps, places)
+    return {name: Axis(name, *others) for name, *others in stated}
 
 
 def _ome_axes(ome: ElementTree.Element) -> dict[str, Axis]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...arrays import CENTRE, STRIDES, Index, IntArray, Numbers, Vectors, dot, inner, unit
 from ...refine.field import FineField
 from ...refine.nodes import block_ijk
-from ...threads import chunks_of, map_chunks, map_threads, worthwhile_threads
+from ...threads import chunks_of, map_chunks, over_threads, worthwhile_threads
 from ..marching import Crossings, edge_ends, lattice_positions, values_at
 from .patches import Patches
 
@@ -176,7 +176,7 @@ def settle_planes(patches: Patches, own: Planes, threads: int = 1) -> Planes:
     placed = start.copy()
     threads = worthwhile_threads(PAIR_TEMPORARIES * len(crossing), threads)
     for _ in range(ROUNDS):
-        sums = np.concatenate(map_threads(partial(_sums_in_loops, table), work, threads), 1)
+        sums = np.concatenate(list(over_threads(partial(_sums_in_loops, table), work, threads)), 1)
         total, off, passed_on, *mean = (
             np.bincount(crossing, each, len(trust)).take(rows) for each in sums
         )
