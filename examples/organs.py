@@ -36,6 +36,6 @@ with tempfile.TemporaryDirectory() as folder:
     target = sys.argv[1] if len(sys.argv) > 1 else "organs.glb"
     made = convert_labels(image, target, load_network(), names=read_names(table), force=True)
 
-for row in made.labels:
+for row in made.facts["labels"]:
     ml, counted = row["volume"] / 1000, row["sample_volume"] / 1000
     print(f"{row['name']}: {ml:.1f} ml, {counted:.1f} ml by its voxels, closed: {row['closed']}")

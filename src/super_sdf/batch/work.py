@@ -65,10 +65,9 @@ def convert_job(
         else:
             where = job.source, target, network, options
             made = convert_labels(*where, names=settings.names, force=True)
-            for label in made.labels:
+            for label in made.facts["labels"]:
                 label["output"] = Path(label["output"]).relative_to(stage).as_posix()
-            names = [label["output"] for label in made.labels]
-            row |= {"closed": True, "warnings": list(made.warnings)}
+            names = [label["output"] for label in made.facts["labels"]]
         known = {name: fingerprint(stage / name) for name in names}
         row |= {"output": known if job.has_label_files else known[job.mesh], **made.report()}
         row["stages"] = {name: round(seconds, 4) for name, seconds in made.seconds.items()}

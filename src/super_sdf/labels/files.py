@@ -14,7 +14,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,25 +48,16 @@ class LabelName(NamedTuple):
 Names = dict[int, LabelName]
 
 
-@dataclass(frozen=True, eq=False)
-class LabelConversion:
-    """What a conversion of a label image has made, as ``convert.Conversion`` says it of one mesh.
-
-    In ``labels``, the volume of a mesh stands beside that of its samples, taken as boxes.
-    """
+class LabelConversion(NamedTuple):
+    """The result of a conversion of a label image, as ``convert.Conversion`` of one mesh."""
 
     grid: SdfGrid
-    labels: list[dict[str, Any]]
-    missing: list[dict[str, Any]]  # labels that were asked for, and that no sample has
-    notes: tuple[str, ...]
-    seconds: dict[str, float]
-    warnings: tuple[str, ...]
-    closed: bool = True
+    facts: dict[str, Any]  # as ``--json`` has them
+    seconds: dict[str, float]  # per stage
 
     def report(self) -> dict[str, Any]:
         """Return the result as a dictionary that can be written as JSON."""
-        made = {"labels": self.labels, "missing": self.missing, "inferred": list(self.notes)}
-        return {**describe_place(self.grid), **made}
+        return self.facts
 
 
 def convert_labels(
@@ -121,9 +112,15 @@ def convert_labels(
     if lacking:
         listed = ", ".join(entry.name for entry in lacking.values())
         notes.append(f"no sample has a label that was asked for: {listed}")
-    missing = [{"label": label, "name": entry.name} for label, entry in lacking.items()]
-    said = (*image.grid.notes, *notes)
-    return LabelConversion(image.grid, rows, missing, said, watch.seconds, tuple(warnings))
+    facts = {
+        **describe_place(image.grid),
+        "labels": rows,
+        "missing": [{"label": n, "name": entry.name} for n, entry in lacking.items()],
+        "closed": True,
+        "inferred": [*image.grid.notes, *notes],
+        "warnings": warnings,
+    }
+    return LabelConversion(image.grid, facts, watch.seconds)
 
 
 def paths_of(target: Path, called: Names, known: Names) -> list[Path]:

@@ -65,8 +65,8 @@ def reconstruct_labels(
     labels : "all" or sequence of ints
         The labels to mesh; all are those of the image but 0. Others count as 0.
     network, factor, max_memory, progress
-        As in ``reconstruct``; in place of a shipped network, that for masks is used. The factor
-        is 2 by default.
+        As in ``reconstruct``; of shipped networks that for masks is used. The factor is 2 by
+        default.
     spacing, origin, direction, axes
         Where the samples lie in the world, as in ``read_grid``; by default as the file says.
     keep_volume : bool
@@ -80,11 +80,8 @@ def reconstruct_labels(
     dict of int to Mesh
         The meshes by label, in ascending order, in world units.
 
-    Raises
-    ------
-    SuperSdfError
-        If a value is no whole number, a label is missing, there is no surface, an argument is
-        invalid, or the image does not fit in memory.
+    SuperSdfError if a value is no whole number, a label is missing, there is no surface, an
+    argument is invalid, or the image does not fit in memory.
     """
     place = {"spacing": spacing, "origin": origin, "direction": direction}
     wanted = in_order(labels)

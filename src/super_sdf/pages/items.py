@@ -25,7 +25,6 @@ import numpy as np
 from ..check import FULL, Certificate, check_mesh, read_for_check
 from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
-from ..grid.sdf_grid import cubic_grid
 from ..surface.extract import coarse_surface
 from ..surface.mesh import Mesh
 
@@ -35,11 +34,10 @@ if TYPE_CHECKING:
 MOST_TRIANGLES = 500_000  # of a mesh in a page: 3 to 5 MB
 STEPS = 65535  # along the longest side of the box
 RESULT, COARSE = "super-sdf", "marching cubes of the samples"
-LONGEST_HEAD = 1 << 20  # bytes of a file's first line
 COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
 LISTS = ("facts", "certificate", "stages", "faults", "notes", "warnings", "remarks")
-COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "tiles")
+COUNTED = ("vertices", "triangles", "band_voxels", "noisy_voxels", "tiles")
 NOT_DRAWN = "not drawn: run the command again for its meshes"
 
 Entry = dict[str, Any]
@@ -87,13 +85,12 @@ def item_of_files(
     except SuperSdfError as error:
         item = Item(certificate={"error": error.flagged})
     item.show(RESULT, shown, certificate)
-    lattice = cubic_grid(samples, options.offset)
-    known = lattice.field.unseen is None  # beside what is unknown, a coarse surface is made up
-    coarse = coarse_surface(lattice, options.offset) if known else None
+    known = samples.field.unseen is None  # beside what is unknown, a coarse surface is made up
+    coarse = coarse_surface(samples, options.offset) if known else None
     if coarse and len(coarse.faces):
         checked = certificate and check_mesh(coarse, samples, options, intersections=False)
-        title = COARSE + (", made equally spaced" if lattice.shape != samples.shape else "")
-        item.show(title, coarse, checked)
+        as_it_is = samples.is_cubic or samples.field.own_lattice
+        item.show(COARSE + ", made equally spaced" * (not as_it_is), coarse, checked)
     return item
 
 
@@ -150,7 +147,7 @@ def find_item(folder: Path, target: str, sha256: str) -> Item | None:
     """Return the item of an output without its meshes; None if there is none of this mesh."""
     try:
         with item_path(folder, target).open("rb") as file:
-            line = file.readline(LONGEST_HEAD)
+            line = file.readline()
         item = Item(**json.loads(line.removeprefix(COMMENT)))
     except (OSError, ValueError, TypeError):  # missing, or damaged
         return None

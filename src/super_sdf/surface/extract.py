@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import CORNERS, IntArray, Vectors
-from ..grid.sdf_grid import SdfGrid, with_fields
+from ..grid.sdf_grid import SdfGrid, cubic_grid, with_fields
 from ..refine.band import neighbour_table, rescale
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, share_parts
@@ -124,8 +124,8 @@ def keys_of(node_ijk: IntArray, shape: NDArray[Any], factor: int) -> NDArray[np.
 
 
 def coarse_surface(grid: SdfGrid, offset: float = 0.0) -> Mesh:
-    """Return marching cubes of a grid's samples: every cell is a block of factor 1."""
-    values = rescale(grid, offset)
+    """Return marching cubes of a grid's samples, made cubic: every cell is a block of factor 1."""
+    values = rescale(grid := cubic_grid(grid, offset), offset)
     some = every = values <= 0
     for axis in range(3):
         low, high = (slice(None),) * axis + (slice(-1),), (slice(None),) * axis + (slice(1, None),)

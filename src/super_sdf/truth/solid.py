@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import face_normals, unit
 from ..errors import FileError, MeshError
 from ..files.formats import check_regular_file
 from ..surface.mesh import Mesh
@@ -167,8 +166,9 @@ class Solid:
 
     def count_overlapping(self) -> int:
         """Count the faces with a winding number of 2 or more, or below 0, on one side."""
-        centres = self.mesh.vertices[self.mesh.faces].mean(1)
-        normals = unit(face_normals(self.mesh.vertices, self.mesh.faces))
+        a, b, c = self.mesh.vertices[self.mesh.faces.T]
+        centres, normals = (a + b + c) / 3, np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
         step = SIDE_STEP * np.linalg.norm(np.ptp(self.mesh.vertices, axis=0)) * normals
         winding = self._winding.winding_number(np.concatenate([centres + step, centres - step]))
         winding = winding * (np.sign(self.mesh.volume()) or 1)
