@@ -52,7 +52,9 @@ def test_distances_on_a_sheared_grid_are_refused(name):
     shear = np.eye(3)
     shear[:, 1] = [0.6, 0.8, 0]
     save(name, affine_of(shear))
-    assert "its axes are not at right angles" in refusal(GridError, read_grid, name, field="distance")
+    assert "its axes are not at right angles" in refusal(
+        GridError, read_grid, name, field="distance"
+    )
 
 
 def test_a_direction_is_given_where_the_file_has_none():
