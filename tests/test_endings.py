@@ -135,7 +135,7 @@ def test_streams_that_are_closed_or_full_cost_no_mesh():
     mesh = Path("out.ply").read_bytes()
     assert run(*QUICK, "--force", shell="2>/dev/full") == (0, "", "")
     assert Path("out.ply").read_bytes() == mesh and trimesh.load("out.ply").is_watertight
-    want = "Error: No space left on device\n"
+    want = "Error: [Errno 28] No space left on device\n"
     assert run(*QUICK, "--force", "--json", "--quiet", shell=">/dev/full") == (1, "", want)
 
 

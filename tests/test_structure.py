@@ -39,15 +39,15 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     TOP: 1419,  # 1,250
     "grid": 2529,  # 1,800
     "network": 500,
-    "refine": 1339,  # 1,300
+    "refine": 1303,  # 1,300
     "surface": 2186,
     "tiles": 300,
-    "files": 2839,  # 2,700: readers of twelve libraries
+    "files": 2814,  # 2,700: readers of twelve libraries
     "functions": 700,  # 600
     "labels": 1059,  # 900
     "simplify check truth": 1235,  # 1,100: with the walls between labels
-    "batch": 910,  # 900
-    "pages": 409,  # 400
+    "batch": 900,
+    "pages": 400,
     "cli": 880,  # 800
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 48, 110  # 95, 45, 110 in the design

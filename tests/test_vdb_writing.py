@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ball, cut_ball, trilinear
-from test_fields import TURNED, tip
+from test_fields import tip
 from test_vdb import text
 
 from super_sdf import SdfGrid, fine_grid, make_grid, upsample, write_field
 from super_sdf.files.grids import open_volume
 
 PAD = 8  # voxels that are looked at beyond the lattice
+TURNED = [[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]
 
 pytestmark = pytest.mark.usefixtures("folder")
 

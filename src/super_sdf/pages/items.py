@@ -34,11 +34,10 @@ if TYPE_CHECKING:
 MOST_TRIANGLES = 500_000  # of a mesh in a page: 3 to 5 MB
 STEPS = 65535  # along the longest side of the box
 RESULT, COARSE = "super-sdf", "marching cubes of the samples"
-LONGEST_HEAD = 1 << 20  # bytes of a file's first line
 COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
 LISTS = ("facts", "certificate", "stages", "faults", "notes", "warnings", "remarks")
-COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "tiles")
+COUNTED = ("vertices", "triangles", "band_voxels", "noisy_voxels", "tiles")
 NOT_DRAWN = "not drawn: run the command again for its meshes"
 
 Entry = dict[str, Any]
@@ -148,7 +147,7 @@ def find_item(folder: Path, target: str, sha256: str) -> Item | None:
     """Return the item of an output without its meshes; None if there is none of this mesh."""
     try:
         with item_path(folder, target).open("rb") as file:
-            line = file.readline(LONGEST_HEAD)
+            line = file.readline()
         item = Item(**json.loads(line.removeprefix(COMMENT)))
     except (OSError, ValueError, TypeError):  # missing, or damaged
         return None

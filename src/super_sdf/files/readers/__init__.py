@@ -153,12 +153,8 @@ class Volume:
         return replace(self, origin=origin, direction=turned, space=space)
 
 
-Loading: TypeAlias = tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]
-"""How a ``Volume`` loads an array, the shape, and the type of the values."""
-
-
-def of_array(values: Any) -> Loading:
-    """Return how a ``Volume`` loads an array that is at hand."""
+def of_array(values: Any) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
+    """Return how a ``Volume`` loads an array that is at hand, its shape and its type."""
     return lambda index: values[index], tuple(values.shape), np.dtype(values.dtype)
 
 
@@ -207,18 +203,18 @@ def find_placement(
     order = max(orders, key=lambda axes: float(np.abs(direction[(0, 1, 2), axes]).sum()))
     is_back = direction[(0, 1, 2), order] < 0
     turned = direction[:, order] * np.where(is_back, -1, 1)
-    is_straight = np.abs(turned - XYZ).max() <= STRAIGHT
     place = {k: volume.place.get(k) if given.get(k) is None else given[k] for k in PLACE}
-    spacing, origin, _ = place.values()
+    if place["direction"] is None and np.abs(turned - XYZ).max() > STRAIGHT:
+        place["direction"] = as_direction(turned)
+    spacing, origin, frame = place.values()
     if spacing is None and volume.spacing is not None:
         spacing = tuple(volume.spacing[axis] for axis in order)
     origin = volume.origin if origin is None else origin
     if origin is not None and is_back.any():  # to the sample that comes first now
         ends = np.array([volume.shape[axis] - 1 for axis in order]) * is_back
         steps = np.broadcast_to(np.asarray(spacing, np.float64), 3)
-        origin = np.asarray(origin, np.float64) - (XYZ if is_straight else turned) @ (ends * steps)
-    if place["direction"] is None:
-        place["direction"] = None if is_straight else as_direction(turned)
+        frame = XYZ if frame is None else np.reshape(frame, (3, 3))
+        origin = np.asarray(origin, np.float64) - frame @ (ends * steps)
     forwards = tuple(slice(None, None, -1 if is_back[order.index(n)] else 1) for n in range(3))
     return order, forwards, {**place, "spacing": spacing, "origin": origin}
 
@@ -303,8 +299,8 @@ def placed(
     return {**place, **stated, "index": index, "axes": order}
 
 
-def stored(values: Any, attributes: Mapping[str, Any], none: Any = None) -> Loading:
-    """Return how a ``Volume`` loads an array of a file.
+def stored(values: Any, attributes: Mapping[str, Any], none: Any = None) -> tuple[Any, Any, Any]:
+    """Return how a ``Volume`` loads an array of a file, as ``of_array``.
 
     By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
     plus ``add_offset``; ``none``, or ``_FillValue``, is no value.

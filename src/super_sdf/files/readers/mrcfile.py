@@ -37,9 +37,7 @@ def read_mrc(request: Request) -> Volume:
     if header.ispg >= VOLUME_STACKS and header.mz != header.nz:
         raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
     if angles.any() and np.abs(angles - 90).max() > RIGHT:
-        listed = ", ".join(f"{angle:g}" for angle in angles)
-        said = f"the angles of its unit cell are {listed} degrees, not 90"
-        raise GridError(f"{said}: resample it on a grid with right angles")
+        raise GridError(f"the angles of its cell are {angles.tolist()} degrees: resample it to 90")
     counts = np.array([int(header[name]) for name in ("mx", "my", "mz")])
     steps = cell / np.maximum(counts, 1)
     is_stated = bool((cell > 0).all() and (counts > 0).all())

@@ -47,17 +47,16 @@ def _imagej_axes(file: Any) -> dict[str, Axis]:
     tags = {tag.name: tag.value for tag in file.pages[0].tags}
     resolution = [tags.get(name, (0, 1)) for name in ("XResolution", "YResolution")]
     # ImageJ writes letters beyond ASCII by their numbers
-    units = [str(metadata.get(f"{a}unit") or metadata.get("unit") or "pixel") for a in "xyz"]
-    units = [each.encode("ascii", "backslashreplace").decode("unicode_escape") for each in units]
-    is_stated = "spacing" in metadata or not units[0].startswith("pixel")
+    unit = str(metadata.get("unit") or "").encode("ascii", "backslashreplace")
+    is_stated = "spacing" in metadata or (unit and not unit.startswith(b"pixel"))
     if not is_stated or not all(pixels for pixels, _ in resolution):
         return {}
     steps = [count / pixels for pixels, count in resolution]
     steps.append(abs(float(metadata.get("spacing") or 1)))
     starts = [float(metadata.get(f"{axis}origin") or 0) for axis in "xyz"]  # in pixels
     places = [-start * step if any(starts) else None for start, step in zip(starts, steps)]
-    units = units if "unit" in metadata else [""] * 3
-    return {each[0]: Axis(*each) for each in zip("xyz", units, steps, places)}
+    stated = zip("xyz", [unit.decode("unicode_escape")] * 3, steps, places)
+    return {name: Axis(name, *others) for name, *others in stated}
 
 
 def _ome_axes(ome: ElementTree.Element) -> dict[str, Axis]:

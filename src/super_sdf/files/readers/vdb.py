@@ -49,8 +49,8 @@ F4, F8 = np.dtype("<f4"), np.dtype("<f8")
 TYPES: dict[str, np.dtype[Any]] = {"Tree_float_5_4_3": F4, "Tree_double_5_4_3": F8}
 HALF = "_HalfFloat"  # ends the type of a grid whose values are stored in 16 bits
 NUMBERS = {"float": "f", "double": "d", "int64": "q"}  # of metadata
-# How many vectors a map has, and which are the translation and the scale.
-MAPS = {"TranslationMap": (1, 0, None), "ScaleMap": (5, None, 0), "ScaleTranslateMap": (6, 0, 1)}
+# How many vectors a map has: the translation, and five of the scale
+MAPS = {"TranslationMap": 1, "ScaleMap": 5, "ScaleTranslateMap": 6}
 PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in millimetres
 MARGIN = 2  # voxels of background around the others, so that the border is outside
 OUTSIDE, INSIDE, MIXED = 0, 1, 2  # a cube of voxels: all background, all minus that, or neither
@@ -126,9 +126,8 @@ class _Bytes:
         return self.take(*self.numbers("I")).decode("utf-8", "replace")
 
     def array(self, dtype: Any, *shape: int) -> NDArray[Any]:
-        return np.frombuffer(self.take(np.dtype(dtype).itemsize * prod(shape)), dtype).reshape(
-            shape
-        )
+        data = self.take(np.dtype(dtype).itemsize * prod(shape))
+        return np.frombuffer(data, dtype).reshape(shape)
 
     def mask(self, count: int) -> BoolArray:
         return np.unpackbits(self.array("u1", count // 8), bitorder="little").astype(bool)
@@ -151,10 +150,10 @@ def _transform(file: _Bytes) -> NDArray[np.float64]:
     kind = kind.removeprefix("Uniform")
     if kind not in MAPS:
         raise GridError(f"its transform is a {kind}: resample the grid to a linear transform")
-    count, translation, scale = MAPS[kind]
-    vectors = file.array(F8, count, 3)
-    moved = np.zeros(3) if translation is None else vectors[translation]
-    return np.column_stack([np.diag(np.ones(3) if scale is None else vectors[scale]), moved])
+    vectors = file.array(F8, MAPS[kind], 3)
+    moved = vectors[0] if "Translat" in kind else np.zeros(3)
+    scale = vectors[-5] if "Scale" in kind else np.ones(3)
+    return np.column_stack([np.diag(scale), moved])
 
 
 class _Tree:

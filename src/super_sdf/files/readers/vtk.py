@@ -61,7 +61,7 @@ def read_vtk(request: Request) -> Volume:
         or (array.GetNumberOfComponents() == 1 and name.removeprefix("CellData/") not in MARKS)
     ]
     name = request.choose(plain or list(arrays), "array of points or cells")
-    return _volume_of(image, *arrays[name], f"its array {name!r}", *request.numbers)
+    return _volume_of(image, name, *arrays[name], *request.numbers)
 
 
 def volume_of_image(image: Any, request: Request) -> Volume:
@@ -72,7 +72,7 @@ def volume_of_image(image: Any, request: Request) -> Volume:
     active = [data.GetScalars() for data in (image.GetPointData(), image.GetCellData())]
     named = [str(each.GetName()) for each in active if each and request.member is None]
     name = request.choose(named[:1] or list(arrays), "array of points or cells")
-    return _volume_of(image, *arrays[name], f"its array {name!r}")
+    return _volume_of(image, name, *arrays[name])
 
 
 def _arrays(image: Any) -> dict[str, tuple[Any, bool]]:
@@ -86,7 +86,7 @@ def _arrays(image: Any) -> dict[str, tuple[Any, bool]]:
     return arrays
 
 
-def _volume_of(image: Any, array: Any, of_points: bool, what: str, *numbers: int) -> Volume:
+def _volume_of(image: Any, name: str, array: Any, of_points: bool, *numbers: int) -> Volume:
     """Return an array at the points of an image, or at the centres of its cells."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
@@ -106,10 +106,10 @@ def _volume_of(image: Any, array: Any, of_points: bool, what: str, *numbers: int
     shape = tuple(int(n) for n in extent[1::2] - extent[::2] + of_points)
     components, length = array.GetNumberOfComponents(), array.GetNumberOfTuples()
     if components != 1 and not (len(numbers) == 1 and numbers[0] < components):
-        said = f"{what} has {components} numbers per sample"
+        said = f"its array {name!r} has {components} numbers per sample"
         raise GridError(f"{said}: give an array of one, or NAME[0]")
     if length != prod(shape):
-        raise GridError(f"{what} has {length:,} values for {prod(shape):,} samples")
+        raise GridError(f"its array {name!r} has {length:,} values for {prod(shape):,} samples")
     start = direction @ (np.array(spacing) * (first + (0 if of_points else 0.5)))
     values = vtk_to_numpy(array).reshape(*shape[::-1], -1)[..., numbers[0] if numbers else 0].T
     return Volume(*of_array(values), triple(spacing), triple(np.array(origin) + start), direction)

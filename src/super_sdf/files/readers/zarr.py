@@ -13,7 +13,6 @@ import os
 import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
-from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
@@ -88,19 +87,21 @@ def _codecs_in(metadata: Any) -> Iterator[str]:
     """Yield the names of all codecs in metadata, those within a codec, too."""
     for key, value in metadata.items() if isinstance(metadata, dict) else ():
         inner = value if isinstance(value, list) else [value]
-        for codec in inner if key in CODECS_IN else ():
+        for codec in inner if key in CODECS_IN and value is not None else ():
             named = codec if isinstance(codec, dict) else {"id": codec}
-            if codec is not None:
-                yield str(named.get("id", named.get("name"))).removeprefix("numcodecs.")
+            names = {named[key] for key in ("id", "name") if key in named} or {None}
+            yield from (str(name).removeprefix("numcodecs.") for name in names)
         for each in inner:
             yield from _codecs_in(each)
 
 
-def _images(nodes: dict[str, Any], path: str) -> list[dict[str, Any]]:
-    """Return the images that the metadata of a group describes, as OME-NGFF has it."""
-    attributes = nodes[path].attrs.asdict() if path in nodes else {}
-    images: list[dict[str, Any]] = attributes.get("ome", attributes).get("multiscales") or []
-    return images
+def _levels(nodes: dict[str, Any]) -> Iterator[tuple[str, str, Any, Any]]:
+    """Yield group and array of each level of OME-NGFF's images, and metadata of image and level."""
+    for group, node in nodes.items():
+        attributes = node.attrs.asdict()
+        for image in attributes.get("ome", attributes).get("multiscales") or ():
+            for level in image["datasets"]:
+                yield group, f"{group}/{str(level['path']).strip('/')}".strip("/"), image, level
 
 
 def _choose(nodes: dict[str, Any], request: Request) -> str:
@@ -111,9 +112,10 @@ def _choose(nodes: dict[str, Any], request: Request) -> str:
     named = (request.member or "").strip("/")
     is_group = bool(named) and any(name.startswith(f"/{named}/") for name in shapes)
     before = f"/{named}/" if is_group else "/"
-    images = _images(nodes, before.strip("/"))
-    if images and (is_group or request.member is None):
-        return (before + str(images[0]["datasets"][0]["path"]).strip("/"))[1:]
+    if is_group or request.member is None:
+        for group, name, *_ in _levels(nodes):
+            if group == before.strip("/"):
+                return name
     inner = {name: shape for name, shape in shapes.items() if name.startswith(before)}
     asked = replace(request, member=None) if is_group else request
     return asked.choose_array(inner, "3D array").strip("/")
@@ -132,17 +134,10 @@ def _named_axes(nodes: dict[str, Any], name: str) -> list[Axis]:
 
 def _image_axes(nodes: dict[str, Any], name: str) -> list[Axis] | None:
     """Return the axes of an array that is a level of an image of OME, None if it is of none."""
-    groups = ["", *accumulate(name.split("/")[:-1], "{}/{}".format)]
-    levels = (
-        (image, level)
-        for group in groups
-        for image in _images(nodes, group)
-        for level in image["datasets"]
-        if f"{group}/{str(level['path']).strip('/')}".strip("/") == name
-    )
-    if not (found := next(levels, None)):
+    found = [(image, level) for _, path, image, level in _levels(nodes) if path == name]
+    if not found:
         return None
-    image, level = found
+    image, level = found[0]
     axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", "zyx")]
     steps = [*level.get(TRANSFORMS, ()), *image.get(TRANSFORMS, ())]  # in this order
     scale, shift = np.ones(len(axes)), np.zeros(len(axes))
