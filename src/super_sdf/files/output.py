@@ -1,7 +1,7 @@
 """Output files: checked before the work starts, and either complete or absent afterwards.
 
-Process 123 writes ``.part.ply.123.part`` beside ``part.ply``. What a killed process left is removed
-when the same file is written again.
+Thread 4 of process 123 writes ``.part.ply.123.4.part`` beside ``part.ply``. What a killed process
+left is removed when the same file is written again.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import get_native_id
 
 import psutil
 
@@ -79,10 +80,10 @@ def replacing(path: Path, *, force: bool = True) -> Iterator[Path]:
     """
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
     start = f".{target.name[-LONGEST:]}."
-    part = target.with_name(f"{start}{os.getpid()}.part")
+    part = target.with_name(f"{start}{os.getpid()}.{get_native_id()}.part")
     with naming(path):
         for left in target.parent.glob(f"{glob.escape(start)}*.part"):
-            number = left.name[len(start) : -len(".part")]
+            number = left.name[len(start) :].split(".")[0]
             with suppress(OSError, OverflowError):  # of another user, gone, no number of a process
                 if number.isdigit() and not psutil.pid_exists(int(number)):
                     left.unlink()

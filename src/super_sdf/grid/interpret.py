@@ -164,7 +164,7 @@ def interpret(
     answer = Answer(wanted.field, "", {"cut": cut_values(look), "spacing": steps_given})
     if wanted.field == AUTO:
         answer = recognise(samples, look, steps_given, hint)
-    elif len(look.few) == 2:
+    elif look.is_two:
         answer = Answer(MASK, "there are two values", answer.facts)
     if answer.refusal and not (
         answer.kind == DISTANCE and wanted.inside != AUTO and look.is_one_sided
@@ -261,12 +261,12 @@ def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
 def _of_sides(case: Case, facts: dict[str, Any], given: SampleArray) -> dict[str, Any]:
     """Return the mask that the sides of values make; 0 is on the side ``zeros``, else inside."""
     look, wanted, samples = case.look, case.wanted, case.samples
-    if len(look.few) == 2 and 0 in look.few and wanted.inside == AUTO:
+    if look.is_two and 0 in (look.low, look.high) and wanted.inside == AUTO:
         # the other value is inside, wherever it is
         case = replace(case, wanted=replace(wanted, inside="positive"))
         return _of_mask(case, changed(samples, partial(np.not_equal, 0), np.bool_), facts)
-    if len(look.few) == 2:
-        return _of_mask(case, changed(samples, partial(np.less, min(look.few)), np.bool_), facts)
+    if look.is_two:
+        return _of_mask(case, changed(samples, partial(np.less, look.low), np.bool_), facts)
     if look.low > 0 or look.high < 0:
         raise GridError(
             f"every value is {'above' if look.low > 0 else 'below'} 0 (they go from {look.low:.6g} "
@@ -323,7 +323,7 @@ def _of_level(case: Case, given: SampleArray) -> dict[str, Any]:
             f"no value is {'above' if look.high <= 0 else 'below'} the level {wanted.level:g} "
             f"(they go from {before.low:.6g} to {before.high:.6g}): {which_level(before)}"
         )
-    if len(look.few) == 2 or wanted.field == MASK:
+    if look.is_two or wanted.field == MASK:
         return _of_mask(case, changed(case.samples, partial(np.less, 0), np.bool_))
     if not look.is_finite:
         case = _with_known(case)

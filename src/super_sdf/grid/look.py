@@ -7,7 +7,7 @@ spread evenly. Of that part seeded samples are kept: what is asked are shares, f
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeAlias
 
@@ -25,7 +25,7 @@ WHOLE = 1 << 18  # samples of a grid that is a part as it is
 SLABS, CLOSER = (4, 8), 1 << 20  # how many planes, least and most; samples of all of them, about
 BOXES, LINES, PAIRS = 3000, 8000, 5300  # that are kept
 FREQUENT = 0.01  # share of the samples, amid equal ones, that have one value
-MOST_LABELS, FEW = 1000, 3  # different values that are listed; that are looked for first
+MOST_LABELS = 1000  # different values that are listed
 ENOUGH = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
 AS_GOOD = 0.9  # of the largest mean step of neighbours over a level
@@ -50,7 +50,7 @@ class Look:
     high: float
     unknown: int  # samples that are NaN
     infinite: int
-    few: list[Any]  # different finite values, up to ``FEW`` of them, as found
+    is_two: bool  # whether the finite samples have two values
     faces: NDArray[Any]  # all samples on the border of the grid
     # samples that are asked, (p, ny, nz); a plane of NaN is between planes that are not neighbours
     part: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0)))
@@ -82,7 +82,6 @@ class Look:
 def look_at(samples: SampleArray) -> Look:
     """Look at the samples of a grid, (nx, ny, nz)."""
     low, high, unknown, infinite = np.inf, -np.inf, 0, 0
-    few: list[Any] = []
     faces: list[NDArray[Any]] = []
     changes, former = np.zeros(len(samples), np.int64), None
     for i, plane in enumerate(samples):
@@ -98,31 +97,23 @@ def look_at(samples: SampleArray) -> Look:
         sides += [] if former is None else [(inside, former)]
         changes[i] = sum(int(np.count_nonzero(a != b)) for a, b in sides)
         former = inside
-        for rows in (plane[:1], plane):
-            few = few if len(few) >= FEW else _more_values(rows, few)
         faces += [plane.ravel()] if i in (0, len(samples) - 1) else []
         faces += [plane[0], plane[-1], plane[:, 0], plane[:, -1]]
         if i % 16 == 0:
             let_go(samples)
     shape, together = tuple(map(int, samples.shape)), np.concatenate(faces)
-    look = Look(shape, low, high, unknown, infinite, few, together)
+    look = Look(shape, low, high, unknown, infinite, False, together)
     if not low < high:
         return look
     if high <= 0:
         changes = np.array([np.count_nonzero(plane < 0) for plane in samples])
-    return _closer(look, *_part_of(samples, changes))
+    part, own = _part_of(samples, changes)
+    is_two = _has_two([part], low, high) and _has_two(samples, low, high)
+    return _closer(replace(look, is_two=is_two), part, own)
 
 
-def _more_values(part: NDArray[Any], few: list[Any]) -> list[Any]:
-    """Return the different finite values known so far with those of a part, ``FEW`` at most."""
-    rest = part
-    for value in few:
-        rest = rest[rest != value]
-    rest = rest[np.isfinite(rest)]
-    while rest.size and len(few) < FEW:
-        few = [*few, rest.flat[0].item()]
-        rest = rest[rest != rest.flat[0]]
-    return few
+def _has_two(values: Iterable[NDArray[Any]], low: float, high: float) -> bool:
+    return all(((x == low) | (x == high) | ~np.isfinite(x)).all() for x in values)
 
 
 def _part_of(samples: SampleArray, changes: NDArray[np.int64]) -> tuple[NDArray[Any], BoolArray]:

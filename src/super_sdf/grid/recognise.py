@@ -112,7 +112,7 @@ def recognise(
 ) -> Answer:
     """Return what samples are; ``given`` is the spacing (3,), ``hint`` what a file says of them."""
     facts: dict[str, Any] = {"cut": cut_values(look)}
-    if len(look.few) == 2 and hint != "labels":
+    if look.is_two and hint != "labels":
         return Answer("mask", "there are two values", facts)
     if hint == "labels" or (not hint and _are_labels(samples, look, facts)):
         return Answer("labels", "", facts, which_label(samples))

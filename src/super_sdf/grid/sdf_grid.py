@@ -106,9 +106,9 @@ class SdfGrid:
         look = _checked(samples)
         if look.low == look.high:
             raise GridError(f"every value is {look.low:.6g}: a constant field has no surface")
-        if len(look.few) == 2 and min(look.shape) > 2:
-            low, high = sorted(look.few)
-            raise GridError(f"the only values are {low:.6g} and {high:.6g}: {MASK_HINT}")
+        if look.is_two and min(look.shape) > 2:
+            values = f"{look.low:.6g} and {look.high:.6g}"
+            raise GridError(f"the only values are {values}: {MASK_HINT}")
         below = border_share(look, lambda x: x < 0)
         if below > 0.5:
             raise GridError(
