@@ -87,10 +87,10 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
     if given["as_json"]:
         main.print_stdout(facts)
     lines = [f"Failed: {job.failure()}" for job in batch.of("failed_before", "refused", "failed")]
-    more, failed = len(lines) - MOST_FAILURES, bool(lines)
+    more = len(lines) - MOST_FAILURES
     lines[MOST_FAILURES:] = [f"and {more} more, see {batch.record.path}"] * (more > 0)
     main.print_stderr(*lines, *[sentence(facts)] * (not quiet))
-    if failed:
+    if lines:
         sys.exit(1)
 
 
@@ -159,7 +159,7 @@ def print_plan(batch: Batch, as_json: bool) -> None:
     for state, rows in plan.items() if not as_json else ():
         for row in rows:
             end = row.get("reason") or f"-> {batch.settings.folder / row['out']}"
-            line = f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}"
-            main.print_stdout(main.printable(line))
+            said = f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}"
+            main.print_stdout(main.printable(said))
     counts = [f"{len(rows)} {kind.replace('_', ' ')}" for kind, rows in plan.items() if rows]
     main.print_stderr(", ".join(counts) or "nothing to do")
