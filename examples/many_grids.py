@@ -28,6 +28,4 @@ for offset in (0, 1, 2, 3, 99):
         continue
     mesh = extract_mesh(field, grid)
     write_mesh(mesh, out / f"part+{offset}.ply", force=True)
-    print(
-        f"offset {offset}: {field.count()['band_voxels']:,} voxels -> {len(mesh.faces):,} triangles"
-    )
+    print(f"offset {offset}: {len(field.voxel_ijk):,} voxels -> {len(mesh.faces):,} triangles")

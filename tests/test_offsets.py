@@ -45,9 +45,9 @@ def test_an_offset_grows_the_solid_whichever_sign_its_inside_has(network, offset
 @pytest.mark.parametrize(
     "sign, offset, reason",
     [
-        (1, 1.51, "they end at 3: the largest that works is 1.5"),
-        (-1, 4.0, "they end at 3: the largest that works is 1.5"),
-        (1, -2.9, "they end at -3: the smallest that works is -1.5"),
+        (1, 1.51, "they end at 3: the farthest that works is 1.5"),
+        (-1, 4.0, "they end at 3: the farthest that works is 1.5"),
+        (1, -2.9, "they end at -3: the farthest that works is -1.5"),
     ],
 )
 def test_an_offset_near_the_truncation_is_refused_with_one_that_works(
@@ -74,7 +74,7 @@ def test_truncated_distances_are_filled_in_for_an_offset(network):
     for offset in (-0.3, 0.4, 0.8):
         mesh = reconstruct(grid, network, 2, offset=offset)
         assert mesh.volume() == pytest.approx(cube_volume(offset), rel=0.01)
-    with pytest.raises(GridError, match=r"but they end at 2\.6: the largest that works is 1\.1$"):
+    with pytest.raises(GridError, match=r"but they end at 2\.6: the farthest that works is 1\.1$"):
         reconstruct(grid, network, 2, offset=1.2)
 
 
@@ -91,7 +91,7 @@ def test_an_offset_beyond_all_values_has_no_surface(network, fill):
 def test_the_command_refuses_an_offset_near_the_truncation(command, folder, tmp_path):
     message = (
         "Error: offset 5.5 needs distances 1.5 spacings (2.25) to either side of it, but they end "
-        "at 6: the largest that works is 3.75\n"
+        "at 6: the farthest that works is 3.75\n"
     )
     assert command("upsample", PART, "a.ply", "--offset", 5.5) == (1, "", message)
     assert not list(tmp_path.iterdir())

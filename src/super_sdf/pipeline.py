@@ -35,7 +35,7 @@ from .refine.band import (
     survey,
 )
 from .refine.bounds import SampleSpheres, keep_within_bounds
-from .refine.field import COUNTS, FineField
+from .refine.field import FineField
 from .refine.prediction import interpolate, predict
 from .refine.spheres import fit_to_spheres
 from .surface.cap import check_can_close, seen_octants
@@ -93,7 +93,6 @@ def refine_band(
         SampleSpheres(grid.shape, number, patches[exact, CENTRE]),
         band.whole.leaves,
         octants=None if unseen is None else seen_octants(unseen, own_ijk),
-        found=(len(patches), int(np.count_nonzero(band.sampled & ~band.lipschitz))),
     )
 
 
@@ -246,7 +245,8 @@ class Result:
     mesh: Mesh
     lattice: SdfGrid  # the grid, made cubic
     open_edges: int
-    counts: dict[str, int]  # see ``FineField``
+    # ``band_voxels``, and ``noisy_voxels``, whose samples differ by more than distances can
+    counts: dict[str, int]
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
     seconds: dict[str, float]  # by step
     tiles: int
@@ -296,7 +296,7 @@ def mesh_grid(
     bands = [survey(lattice, chosen.offset, threads=threads, most=most)]
     steps.finish("band")
     whole = bands[0].whole
-    if whole.count() <= most:
+    if whole.count <= most:
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:
         raise OutOfMemoryError(
@@ -316,8 +316,7 @@ def mesh_grid(
         parts.sort(key=lambda part: part.tile.low)
     count = len(parts)
     leaves = any(part.leaves for part in parts)
-    counts = {name: sum(part.counts.get(name, 0) for part in parts) for name in COUNTS}
-    counts.update(band_voxels=whole.count(), noisy_voxels=whole.noisy)
+    counts = {"band_voxels": whole.count, "noisy_voxels": whole.noisy}
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, chosen.offset)
@@ -345,7 +344,6 @@ def make_tile(
         save_field(field)
     how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
-    counts = field.count(tile.owns(field.voxel_ijk + np.array(tile.low)))
     leaves = field.leaves
     del field
-    return own_part(mesh, keys, tile, task.shape, factor, counts=counts, leaves=leaves)
+    return own_part(mesh, keys, tile, task.shape, factor, leaves)

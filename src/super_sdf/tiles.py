@@ -62,7 +62,6 @@ class Part:
     mesh: Mesh
     keys: NDArray[np.int64]  # (n,), of its vertices
     mine: NDArray[np.bool_]  # (n,), which of these it owns
-    counts: dict[str, int]  # see ``FineField``
     leaves: bool  # whether the solid leaves the whole grid
     worker: str = ""  # the process that made it, if that was another one
 
@@ -70,7 +69,7 @@ class Part:
     def without_surface(cls, tile: Tile) -> Part:
         """Return the part of a tile in which no surface is."""
         mesh = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
-        return cls(tile, mesh, np.empty(0, np.int64), np.empty(0, bool), {}, False)
+        return cls(tile, mesh, np.empty(0, np.int64), np.empty(0, bool), False)
 
     def __str__(self) -> str:
         return str(self.tile) + f" ({self.worker})" * bool(self.worker)
@@ -106,12 +105,12 @@ class Room:
 
     def beside(self, whole: BandSummary) -> float:
         """Return the voxels that a tile may have beside the meshes of the others."""
-        mesh = self.factor**2 * float(whole.cells.sum())  # bytes: 21 of its parts, 42 joined
+        mesh = self.factor**2 * whole.count  # bytes: 21 of its parts, 42 joined
         return self.voxels(21 * mesh) if self.bound - self.held > 42 * mesh else -1.0
 
     def refusal(self, whole: BandSummary) -> OutOfMemoryError:
         """Return the error for a grid of which not even the smallest tiles fit."""
-        count = int(whole.cells.sum())
+        count = whole.count
         return OutOfMemoryError(
             f"factor {self.factor} on {count:,} voxels near the surface does not fit in the "
             f"{in_words(self.bound)} of memory that may be used, not even in small tiles: use a "
@@ -210,14 +209,11 @@ def own_part(
     tile: Tile,
     shape: Index,
     factor: int,
-    **known: Any,
+    leaves: bool,
 ) -> Part:
-    """Return what belongs to a tile of the mesh that it makes, which has the margin, too.
-
-    ``known`` are counts and flags of the part.
-    """
+    """Return what belongs to a tile of the mesh that it makes, which has the margin, too."""
     if tile.inner_low == (0, 0, 0) and tile.inner_high == shape:
-        return Part(tile, mesh, keys, np.ones(len(keys), bool), **known)
+        return Part(tile, mesh, keys, np.ones(len(keys), bool), leaves)
     mine = tile.owns(voxels_of(keys, shape, factor))
     of_corner = keys[mesh.faces]
     first = np.take_along_axis(mesh.faces, of_corner.argmin(1)[:, None], 1)[:, 0]
@@ -226,7 +222,7 @@ def own_part(
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
     part = Mesh(mesh.vertices[used], number[faces])
-    return Part(tile, part, keys[used], mine[used], **known)
+    return Part(tile, part, keys[used], mine[used], leaves)
 
 
 def join(parts: list[Part]) -> tuple[Mesh, list[tuple[str, int]]]:

@@ -37,7 +37,7 @@ RESULT, COARSE = "super-sdf", "marching cubes of the samples"
 COMMENT = b"// "
 CALL = "superSdfMeshes"  # the function of ``page.js``
 LISTS = ("facts", "certificate", "stages", "faults", "notes", "warnings", "remarks")
-COUNTED = ("vertices", "triangles", "band_voxels", "decoded_voxels", "noisy_voxels", "tiles")
+COUNTED = ("vertices", "triangles", "band_voxels", "noisy_voxels", "tiles")
 NOT_DRAWN = "not drawn: run the command again for its meshes"
 
 Entry = dict[str, Any]

@@ -52,19 +52,17 @@ class BandSummary:
 
     side: int  # samples along the edge of each cube, of those into which the grid is cut
     cells: NDArray[np.int64]  # (a, b, c), voxels of the band in each cube
-    told: int = 0  # voxels whose samples tell whether the field is noisy
+    count: int = 0  # voxels of the band
+    told: int = 0  # of them, those whose samples tell whether the field is noisy
     noisy: int = 0  # those of them round which samples differ by more than distances can
     low: float = np.inf  # the lowest and the highest sample, in half voxels
     high: float = -np.inf
     leaves: bool = False  # whether a sample on the border is inside: the solid leaves the grid
 
-    def count(self) -> int:
-        """Return the number of voxels of the band."""
-        return int(self.cells.sum())
-
     def add(self, found: tuple[NDArray[Any], ...]) -> None:
         """Count what ``_find`` found in some planes."""
         voxel_ijk, patches, lipschitz, sampled, *_, leaves = found
+        self.count += len(voxel_ijk)
         np.add.at(self.cells, tuple((voxel_ijk // self.side).T), 1)
         self.told += int(np.count_nonzero(sampled))
         self.noisy += int(np.count_nonzero(sampled & ~lipschitz))
@@ -106,11 +104,11 @@ def survey(
     """
     side = -(-max(grid.shape) // CELLS)
     summary = BandSummary(side, np.zeros([-(-n // side) for n in grid.shape], np.int64))
-    parts, count, limits = list[tuple[NDArray[Any], ...]](), 0, (0.0, 0.0)
-    low, high = ((limit - offset) * 2 / grid.voxel_size for limit in grid.field.exact)
+    parts, limits = list[tuple[NDArray[Any], ...]](), (0.0, 0.0)
+    ends = np.array([*grid.field.exact, grid.low, grid.high])
+    ends = np.clip((ends - offset) * 2 / grid.voxel_size, -FAR, FAR).astype(np.float32)
+    low, high, lowest, highest = ends.tolist()
     if grid.on_sample is None:  # what is interpolated beyond the band promises little
-        ends = [(end - offset) * 2 / grid.voxel_size for end in (grid.low, grid.high)]
-        lowest, highest = map(float, np.clip(ends, -FAR, FAR).astype(np.float32))
         limits = max(low, lowest), min(high, highest)  # at its ends a field may be cut off
     step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), planes_at_once(grid.samples))
     blocks = [(at, min(at + step, grid.shape[0])) for at in range(0, grid.shape[0], step)]
@@ -118,9 +116,8 @@ def survey(
         if offset and not whole:  # distances must not be cut off near it; at 0 none is better
             _check_offset(grid, offset, found[1])
         summary.add(found)
-        count += len(found[0])
         parts.append(found)
-        if count > most:
+        if summary.count > most:
             parts = [tuple(each[:0] for each in found)]
     whole = whole or summary
     ijk, patches, lipschitz, sampled, decoded, number, value, _ = map(np.concatenate, zip(*parts))
@@ -139,9 +136,8 @@ def survey(
 
 def no_surface(grid: SdfGrid, offset: float) -> NoSurfaceError:
     """Return the error for a grid without a surface at an offset."""
-    return NoSurfaceError(
-        f"no surface at {offset:g}: the values go from {grid.low:.6g} to {grid.high:.6g}"
-    )
+    ends = f"the values go from {grid.low:.6g} to {grid.high:.6g}"
+    return NoSurfaceError(f"no surface at {offset:g}: {ends}")
 
 
 def _find(
@@ -163,9 +159,8 @@ def _find(
     patches = gather_patches(rescaled, ijk + np.array([own.start, 0, 0], np.int32))
     ijk[:, 0] += first
 
-    # Samples of a resampled grid are judged by samples alone: interpolated values do not tell
-    # whether these are noisy. Interpolated values that contradict no others count as exact,
-    # since thin parts need them (docs/guides/formats.md).
+    # Samples of a resampled grid are judged by samples alone. Interpolated values that contradict
+    # no others count as exact, since thin parts need them (docs/guides/formats.md).
     lipschitz, sampled = is_lipschitz(patches), on_samples(grid, ijk)
     if grid.on_sample is not None:
         lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
@@ -191,10 +186,8 @@ def _exact(patches: FloatArray, lipschitz: BoolArray, whole: BandSummary) -> Boo
     A truncated sample is the lowest or the highest of the ``whole`` band, and has no neighbour
     towards which the field is as steep as a distance.
     """
-    sample = patches[:, CENTRE]
-    if not whole.told or whole.noisy / whole.told > MAX_NOISY_SHARE:
-        return np.zeros(len(sample), bool)
-    exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE)
+    sample, is_noisy = patches[:, CENTRE], whole.noisy >= MAX_NOISY_SHARE * whole.told
+    exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE) & (not is_noisy)
     ends = np.where(sample > 0, np.float32(whole.high), np.float32(whole.low))
     at_limit = np.flatnonzero(exact & (sample == ends))
     slope = np.abs(patches[at_limit] - sample[at_limit, None]) / np.maximum(MAX_DIFFERENCE, 1)
@@ -215,8 +208,7 @@ def _check_offset(grid: SdfGrid, offset: float, patches: FloatArray) -> None:
         limit = np.copysign(max(abs(end) - room, 0), end)
         raise GridError(
             f"offset {offset:g} needs distances {HALF_BAND / 2:g} spacings ({room:.6g}) to either "
-            f"side of it, but they end at {end:.6g}: the {'largest' if end > 0 else 'smallest'} "
-            f"that works is {limit:.6g}"
+            f"side of it, but they end at {end:.6g}: the farthest that works is {limit:.6g}"
         )
 
 
@@ -228,9 +220,8 @@ def rescale(
     They are ``(values - offset) * 2 / h`` (Eq. 4). The surface at the distance ``offset``, in world
     units, positive outwards, becomes the zero level (Sec. 5.3).
     """
-    planes = grid.planes(first, grid.shape[0] if last is None else last)
+    planes, scale = grid.planes(first, grid.shape[0] if last is None else last), 2 / grid.voxel_size
     rescaled = np.empty(planes.shape, np.float32)
-    scale = 2.0 / grid.voxel_size
     limit = float(np.finfo(np.float32).max) / 4 / scale
     for plane, out in zip(planes, rescaled):  # plane by plane: in cache, and no second copy
         shifted = np.clip(plane.astype(np.float64) - offset, -limit, limit)

@@ -52,12 +52,12 @@ class SampleSpheres:
 
         Across, they reach ``REACH_OF_SAMPLES`` beyond the grid on either side.
         """
-        ny, nz = self.shape[1:]
-        planes = np.full((last - first, ny * nz), np.nan, np.float32)
+        (ny, nz), beyond = self.shape[1:], REACH_OF_SAMPLES
+        planes = np.full((last - first, ny + 2 * beyond, nz + 2 * beyond), np.nan, np.float32)
         rows = slice(*np.searchsorted(self.number, np.array([first, last]) * (ny * nz)))
-        planes.ravel()[self.number[rows] - first * (ny * nz)] = self.distance[rows]
-        widths = (0, 0), (REACH_OF_SAMPLES,) * 2, (REACH_OF_SAMPLES,) * 2
-        return np.pad(planes.reshape(-1, ny, nz), widths, constant_values=np.nan)
+        i, j, k = np.unravel_index(self.number[rows] - first * ny * nz, (last - first, ny, nz))
+        planes[i, j + beyond, k + beyond] = self.distance[rows]
+        return planes
 
 
 NO_SPHERES = SampleSpheres((0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float32))

@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray
+from ..arrays import FloatArray, IntArray
 from ..grid.interpret import NONE_EXACT, Field
 from ..grid.samples import SamplePlanes
 from ..grid.sdf_grid import SdfGrid
@@ -26,8 +26,6 @@ from .nodes import (
     nodes_of_part,
     number_parts,
 )
-
-COUNTS = ("band_voxels", "noisy_voxels", "decoded_voxels", "nodes")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -70,26 +68,14 @@ class FineField:
     # (D,), a bit for each octant of each voxel: whether all eight samples round it are known. Where
     # one is not, the surface ends. None if all are known
     octants: NDArray[np.uint8] | None = None
-    found: tuple[int, int] = (0, 0)  # ``band_voxels`` and ``noisy_voxels`` of ``count``
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
         return f"FineField(factor {self.factor}, {len(self.voxel_ijk):,} voxels of {shape})"
 
-    def count(self, own: slice | BoolArray = slice(None)) -> dict[str, int]:
-        """Return how many voxels and nodes there are, by name; of decoded ones, those of ``own``.
-
-        ``noisy_voxels`` are those of the band whose samples differ by more than distances can.
-        """
-        nodes = self.parts.count_nodes(self.factor, own)
-        return dict(zip(COUNTS, (*self.found, len(self.voxel_ijk[own]), nodes)))
-
     @cached_property
     def numbers(self) -> IntArray:
-        """The nodes of each voxel's block as indices of ``values``, (D, Q); computed when read.
-
-        OptionError if there are more nodes than 32-bit numbers.
-        """
+        """The nodes of each voxel's block as indices of ``values``, (D, Q); computed when read."""
         numbers = np.empty(self.blocks.shape[::-1], np.int32)
         starts, _ = number_parts(self.parts, self.factor)
         for first, nodes in zip(starts, nodes_of_part(self.factor)):
@@ -136,13 +122,11 @@ class FineLattice(SamplePlanes):
 
     def __init__(self, field: FineField) -> None:
         self.field, self.beside = field, field.factor
-        self.shape = lattice_shape(field.shape, field.factor)
+        self.shape = tuple(field.factor * samples + 1 for samples in field.shape)
 
     def read(self, first: int, last: int) -> FloatArray:
         """Return planes ``first`` to before ``last`` of nodes, (last - first, ny, nz) float32."""
         field, factor, grid = self.field, self.field.factor, self.field.grid
-        if first == last:
-            return np.empty((0, *self.shape[1:]), np.float32)
         start = max((first - 1) // factor - 1, 0)  # coarse planes on which those of nodes depend
         planes = rescale(grid, field.offset, start, min((last - 1) // factor + 2, grid.shape[0]))
         outside = planes > 0
@@ -171,21 +155,14 @@ class FineLattice(SamplePlanes):
         return np.multiply(planes, scale, out=planes, dtype=np.float64, casting="same_kind")
 
 
-def lattice_shape(shape: tuple[int, int, int], factor: int) -> tuple[int, int, int]:
-    """Return the number of nodes of the fine lattice along each axis, ``K n + 1``."""
-    nx, ny, nz = (factor * samples + 1 for samples in shape)
-    return nx, ny, nz
-
-
 def fine_grid(field: FineField) -> SdfGrid:
     """Return the fine lattice of a field, from ``upsample``, as a grid of spacing h/K.
 
-    It can be refined again. Its samples are not stored: planes of them are made from the field, and
-    from the coarse grid away from the surface, when they are needed. They are relative to the
-    surface at the field's offset.
+    It can be refined again. Its samples, relative to the surface at the field's offset, are not
+    stored: planes of them are made of the field and the coarse grid when they are needed.
     """
     grid, blocks = field.grid, field.blocks
-    ends = np.array([blocks.min(initial=np.inf), blocks.max(initial=-np.inf)], np.float32)
+    ends = np.array([blocks.min(initial=np.inf), blocks.max(initial=-np.inf)])
     lowest, highest = field.in_world_units(ends).tolist()
     kind = Field() if grid.field.exact == (-np.inf, np.inf) else Field("noisy", True, NONE_EXACT)
     return SdfGrid.trusted(

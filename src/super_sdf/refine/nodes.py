@@ -91,9 +91,9 @@ class SharedParts:
     table: IntArray  # (27, D), neighbour table of the D voxels, -1 where there is no neighbour
     owner: NDArray[np.int8]  # (27, D), of each part, as a place: ``CENTRE`` is the voxel itself
 
-    def count_nodes(self, factor: int, rows: slice | BoolArray = slice(None)) -> int:
-        """Return the number of nodes that voxels own."""
-        owned = np.count_nonzero(self.owner[:, rows] == CENTRE, axis=1).tolist()
+    def count_nodes(self, factor: int) -> int:
+        """Return the number of nodes of all blocks, each once."""
+        owned = np.count_nonzero(self.owner == CENTRE, axis=1).tolist()
         return sum(count * len(nodes) for count, nodes in zip(owned, nodes_of_part(factor)))
 
 
@@ -157,10 +157,9 @@ def average_shared(blocks: FloatArray, parts: SharedParts, factor: int, threads:
 def hold_sides(blocks: FloatArray, factor: int, samples: FloatArray) -> None:
     """Give every sample of a mask its side, whatever the network says, in ``blocks`` (Q, D).
 
-    A block's value at its sample, of ``samples`` (D,), is raised by adding a pyramid that is 0 on
-    the faces of the block, so that neighbouring blocks still agree. Lines between samples are the
-    network's: it joins slices of a thin vessel or plate across the line between two samples
-    outside.
+    To a block whose sample, of ``samples`` (D,), has the wrong sign, a pyramid is added that is 0
+    on the faces, so that neighbouring blocks still agree. Lines between samples are the network's:
+    it joins slices of a thin vessel or plate across the line between two samples outside.
     """
     sign = np.where(samples > 0, np.float32(1), np.float32(-1))
     missing = np.maximum(LEAST_OF_MASK - sign * blocks[len(blocks) // 2], 0)

@@ -45,15 +45,13 @@ def predict(
 
     A large band is worked on in runs of planes, with the planes beside them that values depend on.
     """
-    plane, offsets = band.voxel_ijk[:, 0], block_offsets(factor)
-    count = len(plane)
-    parts = -(-count // AT_ONCE)
-    if parts == 1 or network.receptive_field is None:
+    plane, offsets, reach = band.voxel_ijk[:, 0], block_offsets(factor), network.receptive_field
+    parts = -(-len(plane) // AT_ONCE)
+    if parts == 1 or reach is None:
         return decode(network, (band.patches, table, voxels), offsets, threads)
     blocks = np.zeros((len(offsets), len(voxels) + 1), np.float32)
-    ends = [-1, *plane[np.arange(1, parts) * count // parts].tolist(), band.grid.shape[0]]
-    for first, last in pairwise(sorted(set(ends))):  # the planes after the first, to the last
-        reach = network.receptive_field
+    ends = {-1, *plane[np.arange(1, parts) * len(plane) // parts].tolist(), band.grid.shape[0]}
+    for first, last in pairwise(sorted(ends)):  # the planes after the first, to the last
         start, stop = np.searchsorted(plane, [first + 1 - reach, last + 1 + reach])
         own = np.flatnonzero((plane[voxels] > first) & (plane[voxels] <= last))
         if not len(own):

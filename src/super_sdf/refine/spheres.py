@@ -54,7 +54,6 @@ CELLS = 1, 2, 2  # along a block, of the lattice on which errors are averaged, e
 SAMPLE_TO_FOOT = 2  # (MAX_DISTANCE + BEYOND) / 2, rounded
 REACH_IN_VOXELS = len(CELLS) + 2 * SAMPLE_TO_FOOT + 1
 
-
 Spheres: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
 """Samples (3, n), their signed distances (n,), and directions, about the gradients there (3, n)."""
 
