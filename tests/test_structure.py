@@ -36,7 +36,7 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together: they may shrink only; the design's figure beside
-    TOP: 1416,  # 1,250
+    TOP: 1415,  # 1,250
     "grid": 2542,  # 1,800
     "network": 499,
     "refine": 1303,  # 1,300
