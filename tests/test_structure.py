@@ -50,7 +50,7 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     "pages": 400,
     "cli": 880,  # 800
 }
-MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 48, 110  # 95, 45, 110 in the design
+MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 47, 110  # 95, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 18_288, 37_300  # 17,800 and 36,000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {
