@@ -39,7 +39,7 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     TOP: 1419,  # 1,250
     "grid": 2529,  # 1,800
     "network": 500,
-    "refine": 1303,  # 1,300
+    "refine": 1300,  # 1,300
     "surface": 2186,
     "tiles": 300,
     "files": 2830,  # 2,700: readers of twelve libraries
