@@ -15,6 +15,7 @@ from test_anisotropic import pear as to_pear
 
 from super_sdf import make_grid, read_grid, reconstruct
 from super_sdf.errors import GridError, OptionError
+from super_sdf.grid.sdf_grid import volume_of_samples
 
 MIRROR = np.diag([1.0, -1.0, 1.0])
 ORIGIN = np.array([10.0, -20.0, 5.0])
@@ -44,12 +45,14 @@ def test_the_mesh_of_a_turned_grid_is_the_turned_mesh(angles, mirrored, mesher):
     assert np.array_equal(mesh.faces, faces)
 
 
-RIGHT = "give unit vectors at right angles, or resample a sheared grid"
+UNIT = "give a unit vector of each axis"
 NO_DIRECTION = {
     "(1, 0, 0): give nine numbers, row by row, or a 3 x 3 matrix": (1, 0, 0),
-    f"1, 0, 0; 0, 1, 0; 0, 0, 2: column 3 has length 2; {RIGHT}": np.diag([1, 1, 2]),
-    f"1, 0.6, 0; 0, 0.8, 0; 0, 0, 1: columns 1 and 2 are not at right angles; {RIGHT}": (
-        [[1, 0.6, 0], [0, 0.8, 0], [0, 0, 1]]
+    f"1, 0, 0; 0, 1, 0; 0, 0, 2: its columns have the lengths 1, 1, 2, not 1; {UNIT}": (
+        np.diag([1, 1, 2])
+    ),
+    f"1, 1, 0; 0, 0, 0; 0, 0, 1: its columns lie in a plane; {UNIT}": (
+        [[1, 1, 0], [0, 0, 0], [0, 0, 1]]
     ),
     f"{[np.nan] * 9}: it must be finite": [np.nan] * 9,
 }
@@ -150,3 +153,48 @@ def test_what_states_no_space_has_none(here, command):
         assert refusal(OptionError, read_grid, name, space="LPS") == said
         code, _, err = command("upsample", name, "a.ply", "--space", "LPS")
         assert code == 2 and err.endswith(f"{said}\n")
+
+
+LEANING = np.array([[1, 0.3, 0], [0, np.sqrt(1 - 0.09), 0.2], [0, 0, np.sqrt(1 - 0.04)]])
+LEAN = {"spacing": (0.5, 0.5, 1.0), "origin": (3, 4, 5), "direction": LEANING}
+
+
+def leaning_ball() -> np.ndarray:
+    """Return distances to a ball of radius 5 at samples whose axes are not at right angles."""
+    steps = np.moveaxis(np.indices((36, 34, 18)), 0, -1) * LEAN["spacing"]
+    return np.linalg.norm((steps - (9, 8.5, 8.5)) @ LEANING.T, axis=-1) - 5
+
+
+LEANING_KINDS = {
+    "mask": (leaning_ball() < 0, {}, 0.5),
+    "density": (1 / (1 + np.exp(leaning_ball())), {"level": 0.5}, 0.03),
+    "smooth": (leaning_ball(), {}, 0.03),
+}
+
+
+@pytest.mark.parametrize("kind", LEANING_KINDS)
+def test_what_is_no_distance_is_meshed_on_axes_that_lean(kind):
+    values, options, limit = LEANING_KINDS[kind]
+    grid = make_grid(values, **LEAN, **options)
+    mesh = reconstruct(grid, trilinear)
+    centre = np.array(LEAN["origin"]) + LEANING @ (9, 8.5, 8.5)
+    off = np.linalg.norm(mesh.vertices - centre, axis=1) - 5
+    assert grid.field.kind == kind and mesh.is_closed() and np.abs(off).max() < limit
+    assert mesh.volume() == pytest.approx(4 / 3 * np.pi * 125, rel=0.03)
+    assert volume_of_samples(grid) == pytest.approx(4 / 3 * np.pi * 125, rel=0.03)
+
+
+def test_labels_are_meshed_on_axes_that_lean(folder, command):
+    affine = np.eye(4)
+    affine[:3, :3], affine[:3, 3] = LEANING * LEAN["spacing"], LEAN["origin"]
+    labels = np.where(leaning_ball() < 0, 4, 0).astype(np.uint8)
+    nibabel.save(nibabel.Nifti1Image(labels, affine), "a.nii.gz")
+    code, out, err = command("upsample", "a.nii.gz", "a.ply", "--labels", "all", "--json")
+    (row,) = json.loads(out)["labels"]
+    assert code == 0 and row["volume"] == pytest.approx(4 / 3 * np.pi * 125, rel=0.03), err
+
+
+def test_the_network_takes_no_distances_on_axes_that_lean():
+    said = refusal(GridError, make_grid, leaning_ball(), **LEAN, field="distance")
+    assert said.startswith("direction is 1, 0.3, 0; 0, 0.9539, 0.2; 0, 0, 0.9798: its axes are not")
+    assert said.endswith("mesh the spline of the values (field='smooth')")

@@ -148,6 +148,7 @@ PICKLE_AT = {
     "compressor": lambda about: about.update(compressor={"id": "pickle"}),
     "filters": lambda about: about.update(filters=[{"id": "pickle"}]),
     "codecs": lambda about: about["codecs"].append(PICKLE),
+    "beside an id": lambda about: about["codecs"].append({"id": "blosc", **PICKLE}),
     "a bare name": lambda about: about["codecs"].append("pickle"),
     "within a shard": lambda about: about["codecs"][0]["configuration"]["codecs"].append(PICKLE),
     "index of a shard": (

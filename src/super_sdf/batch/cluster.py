@@ -74,10 +74,8 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
                 asyncio.run(asyncio.wait_for(comm.connect(address, **known), CONNECT_SECONDS))
             client = Client(**server, timeout=CONNECT_SECONDS, set_as_default=False)
         except Exception as error:  # of many kinds: a bad address, a refused or silent port, TLS
-            is_silent = isinstance(error, (OSError, *TIMEOUTS)) or not str(error)
-            why = "" if is_silent else f" ({' '.join(str(error).split())})"
             start = "start one with 'dask scheduler' and workers with 'dask worker ADDRESS'"
-            said = f"no Dask scheduler answers at {address}{why}: {start}, or give 'local'"
+            said = f"no Dask scheduler answers at {address}: {start}, or give 'local'"
             raise ClusterError(said) from error
         stack.callback(client.close, timeout=CONNECT_SECONDS)
         with suppress(*TIMEOUTS):

@@ -56,8 +56,7 @@ class Job:
     def failure(self) -> str:
         """Return which file failed and why, in one line."""
         source, reason = str(self.source), str(self.row["reason"])
-        said = reason if source in reason else f"{source}: {reason}"
-        return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in said)
+        return reason if source in reason else f"{source}: {reason}"
 
 
 def find_jobs(

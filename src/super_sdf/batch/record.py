@@ -60,17 +60,13 @@ class Record:
 
         After an error, of a full disk, say, the file holds the lines that it held before.
         """
-        line = memoryview(f"{json.dumps(row)}\n".encode())
+        line = f"{json.dumps(row)}\n".encode()
         with naming(self.path), self.path.open("ab", buffering=0) as file:
             self.size = min(self.size, file.seek(0, os.SEEK_END))
             file.truncate(self.size)
-            try:
-                written = 0
-                while written < len(line):  # a full disk may take a part of it
-                    written += file.write(line[written:])
-            except OSError:
+            if file.write(line) < len(line):  # a full disk may take a part of it
                 file.truncate(self.size)
-                raise
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self.size += len(line)
         self._take(row)
 

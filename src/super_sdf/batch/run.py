@@ -45,7 +45,6 @@ class Batch:
         self.jobs, self.settings, self.record = jobs, settings, Record(settings.folder)
         self.written: dict[str, str] = {}  # in this run: the output of each file
         self.inputs = {os.path.realpath(job.source) for job in jobs}
-        self.seconds = 0.0  # of the run
         chosen = settings.options.network()
         path, turns = find_model(chosen["model"], chosen["precision"])
         self.network = {"version": __version__, "turns": turns, "model": chosen["model"]}
@@ -187,10 +186,7 @@ class Batch:
         return dict(json.loads(json.dumps({**self.network, "asked": asked})))
 
     def write_page(self, path: Path, lead: str) -> None:
-        """Write the page of the batch, also of other runs' rows, but not of labels.
-
-        ``lead`` is its first sentence.
-        """
+        """Write the page of the batch, ``lead`` first; also of other runs' rows, not of labels."""
         from ..pages import html, items
 
         folder, jobs = self.settings.folder, {job.target: job for job in self.jobs}

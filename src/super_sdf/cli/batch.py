@@ -78,19 +78,19 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
         try:
             with main.progress_bar("converting", quiet or not total) as progress:
                 batch.run(progress)
-            batch.seconds = time.perf_counter() - start
+            facts = summary(batch, time.perf_counter() - start)
             if page:
-                batch.write_page(page, sentence(batch))
+                batch.write_page(page, sentence(facts))
         except KeyboardInterrupt:
             done = f"{len(batch.of('done'))} of {total} are done and kept"
             raise KeyboardInterrupt(f"{done}; run it again to go on") from None
     if given["as_json"]:
-        main.print_stdout(summary(batch))
+        main.print_stdout(facts)
     lines = [f"Failed: {job.failure()}" for job in batch.of("failed_before", "refused", "failed")]
-    more, failed = len(lines) - MOST_FAILURES, bool(lines)
+    more = len(lines) - MOST_FAILURES
     lines[MOST_FAILURES:] = [f"and {more} more, see {batch.record.path}"] * (more > 0)
-    main.print_stderr(*lines, *[sentence(batch)] * (not quiet))
-    if failed:
+    main.print_stderr(*lines, *[sentence(facts)] * (not quiet))
+    if lines:
         sys.exit(1)
 
 
@@ -121,7 +121,7 @@ def planned(
     return jobs, Settings(folder, options, given["jobs"], items=items, names=names, **some)
 
 
-def summary(batch: Batch) -> dict[str, Any]:
+def summary(batch: Batch, seconds: float) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
     rows = [job.row for job in batch.of("done", "done_before")]
     failures = batch.listed("failed_before", "refused", "failed")
@@ -134,15 +134,15 @@ def summary(batch: Batch) -> dict[str, Any]:
         "warned": sum(bool(row["warnings"] or row.get("beside")) for row in rows),
         "closed": sum(count for count, is_closed in meshes if is_closed),
         "open": sum(count for count, is_closed in meshes if not is_closed),
-        "seconds": round(batch.seconds, 3),
+        "seconds": round(seconds, 3),
         "failures": failures,
         "report": str(batch.record.path),
     }
 
 
-def sentence(batch: Batch) -> str:
+def sentence(facts: dict[str, Any]) -> str:
     """Return in one line what was done."""
-    facts, always = summary(batch), ("done", "failed")
+    always = ("done", "failed")
     words = {key: key.replace("_", " ") for key in (*always, "done_before", "not_begun")}
     words |= {"failed_before": "failed before (--retry tries again)", "warned": "with warnings"}
     counts = [f"{facts[key]} {said}" for key, said in words.items() if facts[key] or key in always]
@@ -159,7 +159,7 @@ def print_plan(batch: Batch, as_json: bool) -> None:
     for state, rows in plan.items() if not as_json else ():
         for row in rows:
             end = row.get("reason") or f"-> {batch.settings.folder / row['out']}"
-            line = f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}"
-            main.print_stdout("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line))
+            said = f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}"
+            main.print_stdout(main.printable(said))
     counts = [f"{len(rows)} {kind.replace('_', ' ')}" for kind, rows in plan.items() if rows]
     main.print_stderr(", ".join(counts) or "nothing to do")

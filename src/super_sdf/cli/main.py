@@ -171,11 +171,16 @@ def progress_bar(
         yield show
 
 
+def printable(line: str) -> str:
+    """Return a line with escapes in place of what names of files may hold, such as line breaks."""
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
 def print_stderr(*lines: str) -> None:
-    """Print lines to stderr, if that can be written; line breaks of file names become spaces."""
+    """Print lines to stderr, if that can be written."""
     with suppress(OSError):
         for line in lines:
-            click.echo(line.replace("\n", " "), err=True)
+            click.echo(printable(line), err=True)
 
 
 def print_stdout(text: str | dict[str, Any]) -> None:
@@ -234,6 +239,5 @@ def _fault(error: BaseException, heard: list[int]) -> tuple[str, int]:
     if isinstance(error, (SuperSdfError, MemoryError)):
         return in_a_line(error), 1 + isinstance(error, OptionError)
     if isinstance(error, OSError):  # the system refused something, such as a file handle
-        named = f"{error.filename}: " if error.filename else ""
-        return f"{named}{error.strerror or error}", 1
+        return str(error), 1
     raise error

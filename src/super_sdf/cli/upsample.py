@@ -125,12 +125,9 @@ def lines_of(report: dict[str, Any], notes: list[str]) -> list[str]:
     lines += [f"Warning: {warning}" for warning in report.get("warnings", ())]
     seconds = f"{sum(report['seconds'].values()):.1f} s"
     for row in report.get("labels", ()):
-        plural = "s" * (row["components"] != 1)
-        lines.append(
-            f"{row['output']}: {row['name']}, {row['triangles']:,} triangles, "
-            f"{row['components']:,} closed component{plural}, volume {row['volume']:.6g}, of its "
-            f"samples {row['sample_volume']:.6g}"
-        )
+        volumes = f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
+        named = f"{row['output']}: {row['name']}"
+        lines.append(f"{named}, {row['triangles']:,} triangles, {volumes}")
     if "labels" in report:
         return [*lines, f"{len(report['labels'])} labels, {seconds}"]
     few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]

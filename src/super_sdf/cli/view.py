@@ -51,5 +51,4 @@ def command(sources: tuple[str, ...], out: Path | None, **given: Any) -> None:
     if not given["no_browser"]:
         import webbrowser
 
-        if not webbrowser.open(address):
-            main.print_stderr("Note: no browser can be started here: open that address in yours")
+        webbrowser.open(address)

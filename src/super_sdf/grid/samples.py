@@ -37,7 +37,8 @@ Direction: TypeAlias = tuple[Triple, Triple, Triple]
 """A matrix, row by row; its columns are the world directions of the array's axes."""
 
 STRAIGHT: Direction = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-SKEW = 1e-3  # largest error of a product of two columns: files hold few digits
+SKEW = 1e-3  # largest error of a length or a product of two columns: files hold few digits
+FLAT = 0.1  # volume of the box of three axes, below which they nearly lie in a plane
 DIGITS = 1e-9  # a matrix this near to the identity is it
 
 AXES = ("x", "y", "z")
@@ -284,18 +285,19 @@ def check_direction(direction: ArrayLike | None) -> Direction:
     if np.size(np.asarray(direction, object)) == 1:
         raise GridError(f"direction is {seen(direction)}: give {what}")
     matrix = as_numbers(direction, "direction", 9, what).reshape(3, 3)
-    products = matrix.T @ matrix
-    off = np.abs(products - np.eye(3))
-    if off.max() > SKEW:
-        a, b = (int(n) for n in np.unravel_index(off.argmax(), (3, 3)))
-        fault = f"column {a + 1} has length {np.sqrt(products[a, a]):.4g}"
-        if a != b:
-            fault = f"columns {a + 1} and {b + 1} are not at right angles"
-        raise GridError(
-            f"direction is {in_rows(matrix)}: {fault}; give unit vectors at right angles, or "
-            "resample a sheared grid"
-        )
+    lengths = np.sqrt((matrix**2).sum(0))
+    fault = f"its columns have the lengths {', '.join(f'{x:.4g}' for x in lengths)}, not 1"
+    if np.abs(lengths - 1).max() <= SKEW:
+        fault = "its columns lie in a plane" if abs(np.linalg.det(matrix)) < FLAT else ""
+    if fault:
+        raise GridError(f"direction is {in_rows(matrix)}: {fault}; give a unit vector of each axis")
     return STRAIGHT if np.abs(matrix - np.eye(3)).max() <= DIGITS else as_direction(matrix)
+
+
+def is_sheared(direction: Direction) -> bool:
+    """Return whether axes are not at right angles, as of a scanner whose gantry is tilted."""
+    products = np.transpose(direction) @ np.array(direction)
+    return bool(np.abs(products - np.eye(3)).max() > 2 * SKEW)
 
 
 def as_direction(matrix: Any) -> Direction:

@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
-from ..options import AUTO, FieldKind, Inside, Options
+from ..options import AUTO, DISTANCE, NOISY, FieldKind, Inside, Options
 from .derived import Resampled
-from .interpret import Field, interpret
+from .interpret import NONE_EXACT, Field, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
 from .samples import (
     EQUAL_SPACING,
@@ -30,6 +30,7 @@ from .samples import (
     cropped,
     in_rows,
     is_cubic,
+    is_sheared,
     placed,
 )
 
@@ -56,8 +57,8 @@ class SdfGrid:
         World position of sample (0, 0, 0). Default: 0, 0, 0, or the lowest coordinates of a
         ``DataArray``.
     direction : (3, 3) array_like or nine numbers, optional
-        The columns are the world directions of the array's axes: unit vectors at right angles,
-        mirrored or not. Default: i runs along x, j along y, k along z.
+        The columns are the world directions of the array's axes: unit vectors, mirrored or not, of
+        distances at right angles. Default: i runs along x, j along y, k along z.
 
     Attributes
     ----------
@@ -148,17 +149,26 @@ class SdfGrid:
             look = _checked(samples)
             extremes = look.low, look.high
         low, high = extremes
+        axes, field = check_direction(direction), field or Field()
+        if is_sheared(axes) and not field.own_lattice:
+            if field.network in (DISTANCE, NOISY):
+                raise GridError(
+                    f"direction is {in_rows(axes)}: its axes are not at right angles, and there "
+                    "distances are not refined; resample the grid, or mesh the spline of the "
+                    "values (--field smooth)"
+                )
+            field = replace(field, own_lattice=True, exact=NONE_EXACT)
         grid = object.__new__(cls)
         vars(grid).update(
             samples=samples,
             spacing=check_spacing(spacing),
             origin=as_triple(0.0 if origin is None else origin, "origin"),
-            direction=check_direction(direction),
+            direction=axes,
             notes=notes,
             positive_inside=positive_inside,
             low=-high if positive_inside else low,
             high=-low if positive_inside else high,
-            field=field or Field(),
+            field=field,
             space=None,
             on_sample=None,
         )
@@ -380,12 +390,13 @@ def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
     """Return the volume of the samples inside, each of which counts as a box."""
     planes = (grid.planes(nth, nth + 1) for nth in range(grid.shape[0]))
     inside = sum(int(np.count_nonzero(plane <= offset)) for plane in planes)
-    return inside * float(np.prod(grid.spacing))
+    return inside * mean_spacing(grid) ** 3
 
 
 def mean_spacing(grid: SdfGrid) -> float:
     """Return the edge of a cube with the volume of a box round a sample."""
-    return float(np.prod(grid.spacing) ** (1 / 3))
+    volume = np.prod(grid.spacing) * abs(np.linalg.det(grid.direction))
+    return float(volume ** (1 / 3))
 
 
 def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
@@ -399,9 +410,7 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     Other samples are made when they are read. Only values near the offset of the surface are as
     accurate as they can be. GridError if there is an offset, and the values are no distances.
     """
-    if grid.is_cubic or grid.field.own_lattice:
-        if not offset or grid.is_cubic:
-            return grid
+    if offset and grid.field.own_lattice:
         each = ", ".join(f"{h:g}" for h in grid.spacing)
         raise GridError(
             f"offset {offset:g}: the values are taken as {grid.field.kind}, and with the spacing "
@@ -409,6 +418,8 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
             "solid itself (--offset 0), sample the mesh (super-sdf sample), and mesh that grid "
             "with the offset"
         )
+    if grid.is_cubic or grid.field.own_lattice:
+        return grid
     if grid.field.unseen is not None:
         raise GridError(
             "samples beside the surface are unknown, and the spacing differs between axes: mesh "

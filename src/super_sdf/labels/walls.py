@@ -13,7 +13,6 @@ fine spacing; further points in a cell have that of its middle, and a number abo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,31 +91,23 @@ def extract_walls(field: Labelled) -> Walls:
     edge = np.repeat(np.arange(12), [len(some) for some in edges])[one]
     places = _on_edges(field, low, label, np.concatenate(edges)[one], edge)
 
-    # on a face the mean of those on its edges, in a cell of those that are joined to it
-    used = np.unique(faces[(table[:, :3] >= FACE_POINTS) & (table[:, :3] < CELL_POINTS)])
-    odd = np.stack([used // along[0], used // nz % ny, used % nz], 1) % 2 == 1
-    sums, beside = np.zeros((len(used), 3)), np.zeros(len(used))
-    for axis, step in product(range(3), (-1, 1)):
-        near = used + step * along[axis]
-        at = np.searchsorted(keys, near).clip(max=len(keys) - 1)
-        there = np.flatnonzero(odd[:, axis] & (keys[at] == near))
-        sums[there] += places[at[there]]
-        beside[there] += 1
-    keys, places = np.append(keys, used), np.concatenate([places, sums / beside[:, None]])
-    order = np.argsort(keys)
-    keys, places = keys[order], places[order]
-    joined = table[:, 2] >= CELL_POINTS
-    inner, of_inner = np.unique(faces[joined, 2], return_inverse=True)
-    sums, beside = np.zeros((len(inner), 3)), np.zeros(len(inner))
-    for corner in (0, 1):
-        some = np.flatnonzero(table[joined, corner] < CELL_POINTS)
-        at = np.searchsorted(keys, faces[joined, corner][some])
-        sums += sums_at(of_inner[some], places[at], len(inner))
-        beside += np.bincount(of_inner[some], minlength=len(inner))
-    keys, places = np.append(keys, inner), np.concatenate([places, sums / beside[:, None]])
-    order = np.argsort(keys)
-    numbers = np.searchsorted(keys[order], faces).astype(np.int32)
-    return Walls(places[order], numbers, sides)
+    # on a face the mean of the points that it is joined to on edges; then so in a cell, which is
+    # the last of its triangle
+    kind = table[:, :3]
+    on_face = (kind >= FACE_POINTS) & (kind < CELL_POINTS)
+    in_cell = (kind >= CELL_POINTS) & [False, False, True]
+    for least, which in ((FACE_POINTS, on_face), (CELL_POINTS, in_cell)):
+        row, corner = np.nonzero(which)
+        named, of = np.unique(faces[row, corner], return_inverse=True)
+        sums = np.zeros((len(named), 4))  # and how many they are
+        for other in ((corner + 1) % 3, (corner + 2) % 3):
+            some = np.flatnonzero(kind[row, other] < least)
+            at = np.searchsorted(keys, faces[row, other][some])
+            sums += sums_at(of[some], np.insert(places[at], 3, 1, axis=1), len(named))
+        order = np.argsort(np.append(keys, named))
+        keys = np.append(keys, named)[order]
+        places = np.concatenate([places, sums[:, :3] / sums[:, 3:]])[order]
+    return Walls(places, np.searchsorted(keys, faces).astype(np.int32), sides)
 
 
 def _crossed_cells(field: Labelled) -> tuple[Keys, Labels]:

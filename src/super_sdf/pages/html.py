@@ -34,7 +34,6 @@ HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")
 GENERATOR = "super-sdf"
 EMPTY = {"lead": "", "alert": "", "summary": [], "notes": []}
-HEAD_BYTES = 4096  # of a page, in which its generator is looked for
 MARKUP = {ord(c): f"\\u{ord(c):04x}" for c in "<>&"}  # of JSON in which a tag could be read
 
 
@@ -85,7 +84,7 @@ def write_page(text: str, path: Path, *, force: bool = False) -> None:
 def is_page(path: Path) -> bool:
     """Return whether a file is a page that super-sdf has written."""
     with suppress(OSError), path.open("rb") as file:
-        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(HEAD_BYTES)
+        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(4096)
     return False
 
 
@@ -98,10 +97,7 @@ def page_of_conversion(
     """Return the page of a conversion by what ``upsample --json`` says; see ``item_of_files``."""
     item = item_of_files(report["output"], report["input"], options, made, certificate)
     entry = entry_of_report(name := Path(report["output"]).name, report, item)
-    shown = [row for row in entry["certificate"] if row[0] in ("mean residual", "largest residual")]
-    faults = [["faults", str(len(entry["faults"]) or "none")]] if shown else []
-    summary = [["result", entry["line"]], ["time", f"{entry['seconds']:.1f} s"], *shown, *faults]
-    return _whole_page(name, [(entry, item)], summary)
+    return _whole_page(name, [(entry, item)])
 
 
 def viewed_page(sources: Sequence[str], options: Options) -> str:
@@ -169,12 +165,9 @@ def write_batch_page(
     write_page(page, path, force=force or is_page(path))
 
 
-def _whole_page(
-    title: str, shown: Sequence[tuple[Entry, Item]], summary: Sequence[Sequence[str]] = ()
-) -> str:
-    """Return a page with the meshes of its entries; ``summary`` are rows of label and text."""
+def _whole_page(title: str, shown: Sequence[tuple[Entry, Item]]) -> str:
+    """Return a page with the meshes of its entries."""
     for number, (entry, item) in enumerate(shown):
         entry |= {"id": str(number), "meshes": "page" if item.meshes else None}
     meshes = {entry["id"]: item.meshes for entry, item in shown}
-    facts = {"title": title, "summary": summary, "files": [entry for entry, _ in shown]}
-    return make_page(facts, meshes)
+    return make_page({"title": title, "files": [entry for entry, _ in shown]}, meshes)

@@ -57,8 +57,7 @@ def within(of: Unsimplified, error: float) -> Walls | None:
     for halving in range(HALVINGS):
         unit, result = error / 2**halving, of.walls
         for shares in PLANE_DISTANCES:
-            steps = [{"distance": unit * share} for share in shares]
-            result = collapsed(of, result, steps, error) or result
+            result = collapsed(of, result, [unit * share for share in shares], error) or result
         if len(result.faces) < len(of.walls.faces):
             return result
     return None
@@ -70,19 +69,16 @@ def down_to(of: Unsimplified, triangles: int) -> Walls:
     The error is sought that leaves hardly fewer. Each error that is tried is a whole
     simplification, so that the mesh is as good as that of the error.
     """
-    most, reached, least = len(of.walls.faces), None, of.walls
+    most, found = len(of.walls.faces), [of.walls]
     farthest = FARTHEST * float(np.linalg.norm(np.ptp(of.walls.vertices, axis=0)))
     error = min(FIRST_ERROR * of.originals[0].side * most / triangles, farthest)
     low, high = 0.0, farthest  # errors that leave too many triangles, and few enough
     for _ in range(MOST_ERRORS * (most > triangles)):
-        result = within(of, error) or of.walls
-        left = len(result.faces)
-        least = min(least, result, key=lambda one: len(one.faces))
-        if left <= triangles:
-            reached, high = result, error
-        elif left < most or not low:
+        found.append(within(of, error) or of.walls)
+        left = len(found[-1].faces)
+        if triangles < left and (left < most or not low):
             low = error
-        else:  # an error so large that nothing is found within it
+        else:  # few enough; or an error so large that nothing is found within it
             high = error
         if triangles < MARGIN * left <= MARGIN * triangles or high < CLOSE * low:
             break
@@ -90,19 +86,16 @@ def down_to(of: Unsimplified, triangles: int) -> Walls:
         error *= float(np.clip(left / triangles, 1 / STRIDE, STRIDE))
         if not CLOSE * low < error < high / CLOSE:
             error = (low * high) ** 0.5 if low else high / STRIDE
-    if reached or most <= triangles:
-        return reached or of.walls
-    steps = [{"triangles": float(triangles)}] * 5  # whatever the distance
-    exact = collapsed(of, least, steps, np.inf)
-    return exact if exact and len(exact.faces) <= triangles else least
+    few = [walls for walls in found if len(walls.faces) <= triangles]
+    return few[-1] if few else min(found, key=lambda walls: len(walls.faces))
 
 
 def collapsed(
-    of: Unsimplified, start: Walls, steps: Sequence[dict[str, float]], error: float
+    of: Unsimplified, start: Walls, distances: Sequence[float], error: float
 ) -> Walls | None:
-    """Return what steps of ``collapse_edges`` make of walls once nothing is wrong with it.
+    """Return what is left of walls when edges are collapsed, within one distance after the other.
 
-    None if that fails.
+    Nothing is wrong with it, see ``examine``; None if that fails.
     """
     alone = start is of.walls and len(of.originals) == 1
     solid, places = of.originals[0].solid if alone else Solid(start), np.zeros((0, 3))
@@ -111,14 +104,13 @@ def collapsed(
         held[start.faces[solid.nearest(places)[1]]] = True
         held[start.faces[held[start.faces].any(1)]] = True
         kept = np.asarray(held[start.faces].all(1))
-        for step in steps:
-            result, held = collapse_edges(result, held, **step)
-        if error < np.inf:
-            result = turn_edges(result, held, LOW * error)
+        for distance in distances:
+            result, held = collapse_edges(result, held, distance=distance)
+        result = turn_edges(result, held, LOW * error)
         wrong = examine(of, result, error)
-        if wrong is None or not len(wrong):
-            return result if wrong is not None else None
-        if kept[solid.nearest(wrong)[1]].all():
+        if wrong is not None and not len(wrong):
+            return result
+        if wrong is None or kept[solid.nearest(wrong)[1]].all():
             return None
         places = np.concatenate([places, wrong])
     return None
@@ -135,8 +127,7 @@ def examine(of: Unsimplified, result: Walls, error: float) -> Points | None:
     if len(labels) < len(of.originals) or not all(len(label.mesh.faces) for label in labels):
         return None
     wrong = [faults_made(of, result, labels[0] if len(labels) == 1 else Solid(result))]
-    for original, label in zip(of.originals, labels) if error < np.inf else ():
-        wrong.append(original.compare(label, error)[0])
+    wrong += [one.compare(label, error)[0] for one, label in zip(of.originals, labels)]
     if len(far := np.concatenate(wrong)):
         return far
     pairs = [(one, label.mesh) for one, label in zip(of.originals, labels)]

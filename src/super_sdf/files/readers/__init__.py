@@ -153,12 +153,8 @@ class Volume:
         return replace(self, origin=origin, direction=turned, space=space)
 
 
-Loading: TypeAlias = tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]
-"""How a ``Volume`` loads an array, the shape, and the type of the values."""
-
-
-def of_array(values: Any) -> Loading:
-    """Return how a ``Volume`` loads an array that is at hand."""
+def of_array(values: Any) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
+    """Return how a ``Volume`` loads an array that is at hand, its shape and its type."""
     return lambda index: values[index], tuple(values.shape), np.dtype(values.dtype)
 
 
@@ -303,8 +299,8 @@ def placed(
     return {**place, **stated, "index": index, "axes": order}
 
 
-def stored(values: Any, attributes: Mapping[str, Any], none: Any = None) -> Loading:
-    """Return how a ``Volume`` loads an array of a file.
+def stored(values: Any, attributes: Mapping[str, Any], none: Any = None) -> tuple[Any, Any, Any]:
+    """Return how a ``Volume`` loads an array of a file, as ``of_array``.
 
     By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
     plus ``add_offset``; ``none``, or ``_FillValue``, is no value.

@@ -38,7 +38,10 @@ def read_nrrd(request: Request) -> Volume:
         check_beside(path, raw[field])
     header = {SPELT.get(name, name): value for name, value in raw.items()}
     sizes = tuple(int(size) for size in header["sizes"])
-    index = request.pick(sizes, _axes_in_space(header))
+    directions = header.get("space directions")
+    along = np.nan_to_num(np.empty((0, 3)) if directions is None else np.asarray(directions, float))
+    axes = np.flatnonzero((along != 0).any(1))
+    index = request.pick(sizes, axes.tolist() if len(axes) == 3 else None)
     layer = next((at for at in index if not isinstance(at, slice)), 0)
     return Volume(
         *(lambda at: nrrd.read(str(path))[0][at], sizes, nrrd.reader._determine_datatype(raw)),
@@ -62,15 +65,6 @@ def _segments(raw: dict[str, Any], layer: int) -> Names:
             rgb = [round(255 * float(share)) for share in colour.split()]
             names[int(label)] = name, (rgb[0], rgb[1], rgb[2]) if len(rgb) == 3 else None
     return names
-
-
-def _axes_in_space(header: dict[str, Any]) -> list[int] | None:
-    """Return the axes that the header says are in space, None if these are not three."""
-    if (directions := header.get("space directions")) is None:
-        return None
-    along = np.nan_to_num(np.asarray(directions, np.float64)[:, :3])
-    axes = np.flatnonzero((along != 0).any(1)).tolist()
-    return axes if len(axes) == 3 else None
 
 
 def _place(header: dict[str, Any], space: list[int]) -> dict[str, Any]:

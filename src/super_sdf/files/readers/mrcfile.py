@@ -9,12 +9,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from . import DENSITY, XYZ, Request, Volume, triple
+from . import DENSITY, Request, Volume, triple
 
 VOLUME_STACKS = 401  # space groups from here on are of stacks of volumes
-RIGHT = 0.01  # degrees
 
 
 def read_mrc(request: Request) -> Volume:
@@ -36,14 +36,13 @@ def read_mrc(request: Request) -> Volume:
     )
     if header.ispg >= VOLUME_STACKS and header.mz != header.nz:
         raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
-    if angles.any() and np.abs(angles - 90).max() > RIGHT:
-        raise GridError(f"the angles of its cell are {angles.tolist()} degrees: resample it to 90")
+    directions = axes_of_cell(angles if angles.all() else np.full(3, 90.0))
     counts = np.array([int(header[name]) for name in ("mx", "my", "mz")])
     steps = cell / np.maximum(counts, 1)
     is_stated = bool((cell > 0).all() and (counts > 0).all())
     if not origin.any():
         origin[order] = [int(header[f"n{axis}start"]) for axis in "zyx"]
-        origin *= steps
+        origin = directions @ (origin * steps)
 
     def load(index: Any) -> Any:
         with mrcfile.open(request.path, permissive=True) as opened:
@@ -51,5 +50,17 @@ def read_mrc(request: Request) -> Volume:
                 raise FileError("it is truncated")
             return opened.data
 
-    place = triple(steps[order]) if is_stated else None, triple(origin), XYZ[:, order]
+    place = triple(steps[order]) if is_stated else None, triple(origin), directions[:, order]
     return Volume(load, sizes, data_dtype_from_header(header), *place, hint=DENSITY)
+
+
+def axes_of_cell(angles: Any) -> NDArray[np.float64]:
+    """Return unit vectors along the axes a, b and c of a cell, in columns, of angles in degrees.
+
+    As in the Protein Data Bank, a is along x, and b in the plane of x and y.
+    """
+    alpha, beta, gamma = np.cos(np.radians(angles)).round(12)
+    height = np.sqrt(1 - gamma**2)
+    c = np.array([beta, (alpha - beta * gamma) / height, 0])
+    c[2] = np.sqrt(1 - c[0] ** 2 - c[1] ** 2)
+    return np.array([[1, 0, 0], [gamma, height, 0], c]).T

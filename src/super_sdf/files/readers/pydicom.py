@@ -91,9 +91,8 @@ def _images_in(path: Path) -> dict[str, list[Image]]:
         if start[PREAMBLE:] == b"DICM":
             header = pydicom.dcmread(file, stop_before_pixels=True)
             if "Rows" in header:  # a folder may hold other documents, too
-                series.setdefault(str(header.get("SeriesInstanceUID", "")), []).append(
-                    (file, header)
-                )
+                uid = str(header.get("SeriesInstanceUID", ""))
+                series.setdefault(uid, []).append((file, header))
         elif file.suffix.lower() == ".dcm" or not any(start):
             raise FileError(f"{file} is damaged, or no DICOM file: replace it, or remove it")
     return series
@@ -147,24 +146,24 @@ def _heights(frames: list[_Frame]) -> NDArray[np.float64]:
 
 
 def _volume(
-    frames: list[_Frame], planes: NDArray[Any], step: float, even: float, use: Use, **more: Any
+    frames: list[_Frame], planes: NDArray[Any], step: float, use: Use, dtype: Any, **more: Any
 ) -> Volume:
     """Return the volume whose planes frames fill, as many empty ones beyond the last as before.
 
-    Frames may be off from even steps by a share, and planes may lean.
+    Frames of segments may be off from even steps by more than slices; planes may lean.
     """
     first, last = frames[int(planes.argmin())], frames[int(planes.argmax())]
     normal, lean = np.cross(*first.across), last.corner - first.corner
     shift = step * (normal if first is last else lean / (lean @ normal))  # to the next plane
     origin = first.corner - planes.min() * shift
     off = [float(np.linalg.norm(f.corner - origin - n * shift)) for f, n in zip(frames, planes)]
-    if not max(off) < even * step:
+    if not max(off) < (EVEN_FRAMES if more else EVEN) * step:
         raise GridError(
             f"{frames[int(np.argmax(off))].path.name} is {max(off):.4g} mm off from even steps of "
             f"{step:.6g}: put all slices of one volume (one time, one echo) into a folder, or "
             "resample the series"
         )
-    shape, dtype = (int(planes.max() + planes.min()) + 1, *first.shape), more["dtype"]
+    shape = int(planes.max() + planes.min()) + 1, *first.shape
 
     def load(index: Index) -> NDArray[Any]:
         whole, pixels = np.zeros(shape, dtype), dict[Path, NDArray[Any]]()
@@ -177,9 +176,7 @@ def _volume(
     length = float(np.linalg.norm(shift))
     direction = np.column_stack([*first.across, shift / length])
     place = triple((*first.spacing[::-1], length)), triple(origin), direction
-    return Volume(
-        load, shape[::-1], spacing=place[0], origin=place[1], direction=place[2], space=LPS, **more
-    )
+    return Volume(load, shape[::-1], dtype, *place, space=LPS, **more)
 
 
 def _of_images(frames: list[_Frame]) -> Volume:
@@ -195,7 +192,7 @@ def _of_images(frames: list[_Frame]) -> Volume:
         plane[:] = values if is_plain else values * frame.scale[0] + frame.scale[1]
 
     step = float(np.ptp(heights)) / (count - 1)
-    return _volume(frames, heights.argsort().argsort(), step, EVEN, use, dtype=dtype)
+    return _volume(frames, heights.argsort().argsort(), step, use, dtype)
 
 
 def _of_segments(
@@ -224,9 +221,6 @@ def _of_segments(
             plane[inside] = 1 if chosen else frame.segment
 
     names: Names = {number: (label, None) for number, label in labels.items()}
-    about = {
-        "dtype": np.dtype(np.uint8 if chosen or max(labels) < 256 else np.uint16),
-        "hint": "" if chosen else LABELS,
-        "names": {1: names[chosen[0]]} if chosen else names,
-    }
-    return _volume(frames, planes, step, EVEN_FRAMES, use, **about)
+    names = {1: names[chosen[0]]} if chosen else names
+    dtype = np.dtype(np.uint8 if chosen or max(labels) < 256 else np.uint16)
+    return _volume(frames, planes, step, use, dtype, hint="" if chosen else LABELS, names=names)

@@ -87,10 +87,10 @@ def _codecs_in(metadata: Any) -> Iterator[str]:
     """Yield the names of all codecs in metadata, those within a codec, too."""
     for key, value in metadata.items() if isinstance(metadata, dict) else ():
         inner = value if isinstance(value, list) else [value]
-        for codec in inner if key in CODECS_IN else ():
+        for codec in inner if key in CODECS_IN and value is not None else ():
             named = codec if isinstance(codec, dict) else {"id": codec}
-            if codec is not None:
-                yield str(named.get("id", named.get("name"))).removeprefix("numcodecs.")
+            names = {named[key] for key in ("id", "name") if key in named} or {None}
+            yield from (str(name).removeprefix("numcodecs.") for name in names)
         for each in inner:
             yield from _codecs_in(each)
 
