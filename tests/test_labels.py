@@ -83,7 +83,7 @@ def test_meshes_are_closed_and_share_their_walls(name, factor, more):
     triangles = {label: corners_of(mesh) for label, mesh in meshes.items()}
     seen = sum(triangles.values(), Counter())
     for label, mesh in meshes.items():
-        assert examine_surface(mesh, len(Solid(mesh).intersecting())).faults() == []
+        assert examine_surface(mesh).faults() == []
         assert set(triangles[label].values()) == {1}
     for a, b, c in seen:  # no two labels are on the same side of a triangle, nor three beside it
         assert seen[a, b, c] == 1
@@ -98,7 +98,7 @@ def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, network):
         made = reconstruct_labels(labels, "all", network, spacing=1.0, **more)
         for label, mesh in made.items():
             for some in (mesh, plain[label]):
-                assert examine_surface(some, len(Solid(some).intersecting())).faults() == []
+                assert examine_surface(some).faults() == []
             if "tolerance" in more:
                 assert len(mesh.faces) < 0.95 * len(plain[label].faces)
                 assert max(farthest(mesh, plain[label]), farthest(plain[label], mesh)) <= 0.05

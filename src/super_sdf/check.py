@@ -49,7 +49,7 @@ class Surface:
     triangles: int
     pinched_vertices: int  # at which several fans of triangles meet: not manifold
     components: int  # that share no vertex
-    self_intersections: int | None  # pairs that meet off a common vertex or edge; None: not counted
+    self_intersections: int  # pairs of triangles that meet off a common vertex or edge
     volume: float  # in cubic world units, negative if the triangles face inward
     area: float
     slivers: int  # triangles with an angle under half a degree
@@ -62,7 +62,7 @@ class Surface:
             "edges of more than two triangles": self.crowded_edges,
             "edges between triangles of opposite orientation": self.flipped_edges,
             "vertices where several fans of triangles meet": self.pinched_vertices,
-            "pairs of triangles that intersect": self.self_intersections or 0,
+            "pairs of triangles that intersect": self.self_intersections,
         }
         found = [f"{count:,} {what}" for what, count in counts.items() if count]
         return found + ["triangles that face inward"] * (self.volume <= 0)
@@ -158,7 +158,6 @@ class Certificate:
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
             largest = figures["largest"] * self.grid.voxel_size
             lines.append(f"largest residual: {largest:.4g} in world units, at ({at})")
-        lines += ["self-intersections: not counted"] * (of.self_intersections is None)
         lines += [f"{self.beyond:,} vertices lie beyond the grid, unchecked"] * (self.beyond > 0)
         return [*lines, self.summary()]
 
@@ -224,15 +223,12 @@ def read_for_check(
     return read, samples
 
 
-def check_mesh(
-    mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN, *, intersections: bool = True
-) -> Certificate:
+def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certificate:
     """Check a mesh against the grid that it was made from.
 
     Vertices at the same position must be one vertex, as ``read_mesh`` returns them. Of the options
-    the offset, the unit and the memory bound count. To count self-intersections takes up to half of
-    the time. GridError if the grid has no surface at the offset; OutOfMemoryError if the search
-    trees would not fit in memory.
+    the offset, the unit and the memory bound count. GridError if the grid has no surface at the
+    offset; OutOfMemoryError if the search trees would not fit in memory.
     """
     offset, lattice = options.offset, cubic_grid(grid, options.offset)
     band = survey(lattice, offset, threads=useful_threads(0))
@@ -240,9 +236,7 @@ def check_mesh(
         raise no_surface(grid, offset)
     need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
     check_bound(need, f"checking {len(mesh.faces):,} triangles", options.max_memory)
-    solid = Solid(mesh)
-    surface = examine_surface(mesh, len(solid.intersecting()) if intersections else None)
-    found = touch(solid, band, lattice)
+    surface, found = examine_surface(mesh), touch(Solid(mesh), band, lattice)
     is_mask, nearest = lattice.field.sides_only, np.rint(lattice.to_index(mesh.vertices))
     beyond = ((nearest < 0) | (nearest >= lattice.shape)).any(1)
     away = VoxelIndex(band.voxel_ijk, lattice.shape).find(nearest.astype(np.int64)) < 0
@@ -259,7 +253,7 @@ def check_mesh(
     )
 
 
-def examine_surface(mesh: Mesh, crossing: int | None = None) -> Surface:
+def examine_surface(mesh: Mesh) -> Surface:
     """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
     whole = Mesh(mesh.vertices, mesh.faces[(mesh.faces != np.roll(mesh.faces, 1, 1)).all(1)])
     opposite, uses, flipped = whole.pair_edges()
@@ -278,7 +272,7 @@ def examine_surface(mesh: Mesh, crossing: int | None = None) -> Surface:
         triangles=len(whole.faces),
         pinched_vertices=int(np.count_nonzero(fans > 1)),
         components=whole.components()[0],
-        self_intersections=crossing,
+        self_intersections=len(Solid(mesh).intersecting()),
         volume=whole.volume(),
         area=whole.area(),
         slivers=int(np.count_nonzero(smallest_angles(corners) < SLIVER)),

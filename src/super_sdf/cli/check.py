@@ -41,8 +41,6 @@ TAKES = (
     option("--no-faults", is_flag=True,
         help="Fail if the mesh is open, not manifold, not oriented outward, intersects itself, has "
         "samples on the wrong side, or vertices where the grid has no surface."),
-    option("--skip-intersections", is_flag=True,
-        help="Do not count self-intersections, which takes up to half of the time."),
     *map(table_option, READ),
     table_option("offset", "The --offset that the mesh was made with."),
     table_option("unit", "The unit of the mesh: of a .glb, and for volumes in ml."),
@@ -60,8 +58,7 @@ def command(mesh: Path, grid: Path, **given: Any) -> None:
     from ..check import check_mesh, read_for_check
 
     options = Options(**{name: given[name] for name in (*READ, "offset", "max_memory", "unit")})
-    both, crossing = read_for_check(mesh, grid, options), not given["skip_intersections"]
-    found = check_mesh(*both, options, intersections=crossing)
+    found = check_mesh(*read_for_check(mesh, grid, options), options)
     faults = found.faults() if given["no_faults"] else []
     failed = found.exceeded(given["tolerance"], given["max_mean"])
     failed += [f"the mesh has {fault}" for fault in faults]

@@ -121,6 +121,6 @@ class ImageAccessor:
             from ..check import check_mesh
 
             options = Options(offset=offset, max_memory=max_memory)
-            found = check_mesh(mesh, grid, options, intersections=False)
+            found = check_mesh(mesh, grid, options)
             surface.point_data["residual"] = found.residuals_at(found.mesh.vertices)
         return surface

@@ -88,7 +88,7 @@ def item_of_files(
     known = samples.field.unseen is None  # beside what is unknown, a coarse surface is made up
     coarse = coarse_surface(samples, options.offset) if known else None
     if coarse and len(coarse.faces):
-        checked = certificate and check_mesh(coarse, samples, options, intersections=False)
+        checked = certificate and check_mesh(coarse, samples, options)
         as_it_is = samples.is_cubic or samples.field.own_lattice
         item.show(COARSE + ", made equally spaced" * (not as_it_is), coarse, checked)
     return item
@@ -203,7 +203,7 @@ def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
     if "error" in found or not found:
         return [["not checked", why] for why in found.values()]
     surface, residual = found["surface"], found["residual"]
-    kinds, pairs = ("closed", "oriented", "manifold"), surface["self_intersections"]
+    kinds = "closed", "oriented", "manifold"
     facts = {"checked": f"{found['samples']['exact']:,} exact samples near the surface"}
     if residual:
         facts["mean residual"] = f"{residual['mean']:.4f} voxels"
@@ -214,7 +214,7 @@ def certificate_facts(found: Mapping[str, Any]) -> list[list[str]]:
         facts["residual"] = "unknown, since no sample is exact"
     facts |= {
         "surface": ", ".join(("" if surface[kind] else "not ") + kind for kind in kinds),
-        "self-intersections": "not counted" if pairs is None else f"{pairs:,}",
+        "self-intersections": f"{surface['self_intersections']:,}",
         "components": f"{surface['components']:,}",
         "volume, area": f"{surface['volume']:.6g}, {surface['area']:.6g}",
     }

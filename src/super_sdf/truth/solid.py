@@ -29,7 +29,6 @@ Distances = NDArray[np.float64]
 LARGEST_COORDINATE = 1e30  # products and squares of larger ones overflow
 MERGE_DISTANCE = 1e-8  # vertices closer than this are merged
 SMALLEST_STEP = 1e-18  # of the largest coordinate, so that multiples of it fit in 64 bits
-SIDE_STEP = 1e-5  # from a face to where the winding number is taken, over the box diagonal
 
 
 def read_mesh(path: str | Path) -> Mesh:
@@ -164,17 +163,6 @@ class Solid:
         whole = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(1))
         return whole[igl.predicates.find_self_intersections(self.mesh.vertices, faces[whole])[1]]
 
-    def count_overlapping(self) -> int:
-        """Count the faces with a winding number of 2 or more, or below 0, on one side."""
-        a, b, c = self.mesh.vertices[self.mesh.faces.T]
-        centres, normals = (a + b + c) / 3, np.cross(b - a, c - a)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        step = SIDE_STEP * np.linalg.norm(np.ptp(self.mesh.vertices, axis=0)) * normals
-        winding = self._winding.winding_number(np.concatenate([centres + step, centres - step]))
-        winding = winding * (np.sign(self.mesh.volume()) or 1)
-        wrong = ((winding > 1.5) | (winding < -0.5)).reshape(2, -1).any(0)
-        return int(np.count_nonzero(wrong & normals.any(1)))
-
 
 def smallest_angles(corners: Points) -> Distances:
     """Return the smallest angle of each triangle, (m,), in degrees; corners are (m, 3, 3)."""
@@ -189,7 +177,7 @@ def smallest_angles(corners: Points) -> Distances:
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:
     """Read a mesh file as a solid; return it with notes on its faults.
 
-    An inverted mesh is reversed; overlapping pieces are united. FileError or MeshError if it cannot
+    An inverted mesh is reversed. FileError or MeshError if it cannot
     be read, is flat, or is open and ``allow_open`` is not set. With ``allow_open`` the sign comes
     from the generalised winding number, a guess near the holes.
     """
@@ -207,9 +195,4 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
     if volume < 0:
         notes.append("inverted: its faces point inward; they were reversed")
         solid = Solid(Mesh(mesh.vertices, np.ascontiguousarray(mesh.faces[:, ::-1])))
-    if overlapping := solid.count_overlapping():
-        notes.append(
-            f"pieces overlap, fold over or are inverted at {overlapping:,} of {len(mesh.faces):,} "
-            "faces: inside is by winding number, and distances are to inner walls, too"
-        )
     return solid, notes
