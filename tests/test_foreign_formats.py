@@ -243,3 +243,23 @@ def test_blocks_that_open3d_saved():
     found = stored[tuple(np.rint(index).astype(int).T)]
     assert np.array_equal(found, np.where(said["weight"] > 0, said["tsdf"], np.nan), equal_nan=True)
     assert stored.shape == grid.shape and "samples are unknown" in grid.notes[0]
+
+
+@pytest.mark.parametrize("entry", ["LIST\n{}", "p%02d.raw 0 16 1\n"])
+def test_headers_name_a_data_file_for_each_plane(entry):
+    planes = [f"p{k:02d}.raw" for k in range(17)]
+    values = np.arange(24 * 20 * 17, dtype=np.float32).reshape(17, 20, 24)
+    for name, plane in zip(planes, values):
+        plane.tofile(name)
+    entry = entry.format("\n".join(planes))
+    Path("a.nhdr").write_text(
+        "NRRD0004\ntype: float\ndimension: 3\nsizes: 24 20 17\nencoding: raw\nendian: little\n"
+        f"data file: {entry}\n"
+    )
+    Path("a.mhd").write_text(
+        f"NDims = 3\nDimSize = 24 20 17\nElementType = MET_FLOAT\nElementDataFile = {entry}\n"
+    )
+    for name in ("a.nhdr", "a.mhd"):
+        found = read_grid(name, level=4000.5, spacing=1).values + 0.0
+        assert found.shape == (24, 20, 17)
+        np.testing.assert_array_equal(np.sign(found), np.sign(4000.5 - values.T))

@@ -157,10 +157,11 @@ def test_a_nrrd_file_names_its_data_once_and_beside_it(entry, tmp_path):
     assert said_of("a.nhdr").endswith(APART)
 
 
-@pytest.mark.parametrize("entry", ["LIST\np003.raw\n", "p%03d.raw 3 19 1\n"])
-def test_metaimages_of_several_data_files_are_refused(entry):
+@pytest.mark.parametrize("entry", ["LIST\n../p003.raw\n", "../p%03d.raw 3 19 1\n"])
+def test_lists_of_data_files_name_them_beside_the_header(entry):
     write("list.mhd", MHA, f"ElementDataFile = {entry}")
-    assert "names no single file: save it as one .mha" in said_of("list.mhd")
+    write("list.nhdr", DETACHED["a.nhdr"].replace("data file: ", ""), f"data file: {entry}")
+    assert said_of("list.mhd").endswith(APART) and said_of("list.nhdr").endswith(APART)
 
 
 def test_numbers_of_hdf5_in_other_files_are_refused():

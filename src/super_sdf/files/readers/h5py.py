@@ -6,6 +6,7 @@ Axes are (z, y, x) unless dimension labels, scales, ``axistags`` or ``--axes`` s
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 from ...errors import FileError
@@ -14,6 +15,8 @@ from . import PLACE, Axis, Request, Volume, measured, of_array, placed, stored, 
 
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
+IMARIS = "DataSetInfo/Image"  # where Imaris states sizes
+SIZES = re.compile("resolution|offset|voxel|pixel|extent|ext(min|max)[0-9]|size", re.I)
 ORDER = "its axes are taken as x, y, z, the order of ndgrid; of meshgrid save permute(V, [2 1 3])"
 
 
@@ -25,11 +28,23 @@ def read_hdf5(request: Request) -> Volume:
             datasets[f"/ITKImage/0/{name}"]
             for name in ("Spacing", "Origin", "Directions", "VoxelData")
         )
-        place = {"spacing": triple(spacing[:][::-1]), "origin": triple(origin), "space": LPS}
+        place: dict[str, Any] = {
+            "spacing": triple(spacing[:][::-1]),
+            "origin": triple(origin),
+            "space": LPS,
+        }
         return _volume_of(values, {**place, "direction": directions[:].T[:, ::-1]})
     shapes = {name: values.shape or () for name, values in datasets.items()}
     values = datasets[request.choose_array(shapes, "3D dataset")]
-    return _volume_of(values, placed(request, _axes(values), values.attrs, values.shape))
+    axes, beside = _axes(values), values.file.get(IMARIS, values).attrs
+    place = placed(request, axes, values.attrs, values.shape)
+    if not any(axis.name for axis in axes):
+        order = ", ".join(place["axes"])
+        place["notes"] += (f"its axes have no names: taken as {order} (--axes is another order)",)
+    listed = ", ".join(sorted(str(name) for name in beside if SIZES.search(name)))
+    if place["spacing"] is None and listed:
+        place["notes"] += (f"{listed}: not read (give --spacing and --origin)",)
+    return _volume_of(values, place)
 
 
 def _datasets_in(request: Request) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 import zlib
 from math import prod
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,13 +30,13 @@ TRUE = re.compile(rb"^ *(CompressedData|\w+ByteOrderMSB) *[=:] *[Tt1]", re.M)
 
 
 def read_nrrd(request: Request) -> Volume:
-    """Read a ``.nrrd`` file, or a ``.nhdr`` file and the data file that it names."""
+    """Read a ``.nrrd`` file, or a ``.nhdr`` file and the data files that it names."""
     import nrrd
 
-    path = request.path
-    raw = nrrd.read_header(str(path))
-    for field in {"data file", "datafile"} & raw.keys():
-        check_beside(path, raw[field])
+    path, (text, entry, start) = request.path, split_header(request.path)
+    files = [check_beside(path, name) for name in _names_of(path, entry, start)]
+    # pynrrd reads no lists: of several files it gets the header without them
+    raw = nrrd.read_header(text.splitlines(True) if len(files) > 1 else str(path))
     header = {SPELT.get(name, name): value for name, value in raw.items()}
     sizes = tuple(int(size) for size in header["sizes"])
     directions = header.get("space directions")
@@ -43,14 +44,35 @@ def read_nrrd(request: Request) -> Volume:
     axes = np.flatnonzero((along != 0).any(1))
     index = request.pick(sizes, axes.tolist() if len(axes) == 3 else None)
     layer = next((at for at in index if not isinstance(at, slice)), 0)
+
+    def load(index: Index) -> Any:
+        if len(files) < 2:
+            return nrrd.read(str(path))[0][index]
+        each = {**raw, "sizes": np.array([*sizes[:-1], sizes[-1] // len(files)])}
+        named = ({**each, "data file": str(file.absolute())} for file in files)
+        parts = [nrrd.read_data(part, None, str(path)) for part in named]
+        return np.concatenate(parts, axis=-1)[index]
+
     return Volume(
-        *(lambda at: nrrd.read(str(path))[0][at], sizes, nrrd.reader._determine_datatype(raw)),
+        *(load, sizes, nrrd.reader._determine_datatype(raw)),
         **_place(header, kept_of(index)),
         index=index,
         space=SPACES.get(str(header.get("space", "")).lower()),
         hint=LABELS if "Segment0_LabelValue" in raw else "",
         names=_segments(raw, layer),
     )
+
+
+def _names_of(path: Path, entry: str, start: int) -> list[str]:
+    """Return the data files that a header names: one, ``NAME%03d.raw 1 20 1``, or a list."""
+    if entry.upper().startswith("LIST"):
+        lines = path.read_bytes()[start:].decode(errors="surrogateescape").splitlines()
+        return [line.strip() for line in lines if line.strip()]
+    if "%" not in entry:
+        return [entry] * (entry.upper() not in ("", "LOCAL"))
+    pattern, first, last, *step = entry.split()
+    numbers = range(int(first), int(last) + 1, *map(int, step[:1]))
+    return [pattern % number for number in numbers]
 
 
 def _segments(raw: dict[str, Any], layer: int) -> Names:
@@ -100,15 +122,14 @@ def _place(header: dict[str, Any], space: list[int]) -> dict[str, Any]:
 
 
 def read_metaimage(request: Request) -> Volume:
-    """Read a ``.mha`` file, or a ``.mhd`` file and the data file that it names."""
+    """Read a ``.mha`` file, or a ``.mhd`` file and the data files that it names."""
     import SimpleITK
 
     path, (text, entry, start) = request.path, split_header(request.path)
-    if not start or entry.upper().startswith("LIST") or "%" in entry:  # ITK would open others
-        raise FileError("its ElementDataFile names no single file: save it as one .mha file")
-    data = path
-    if entry.upper() != "LOCAL":
-        data, start = check_beside(path, entry), 0
+    if not start:
+        raise FileError("its header is damaged: it has no ElementDataFile")
+    files = [check_beside(path, name) for name in _names_of(path, entry, start)]
+    data, start = (files[0], 0) if files else (path, start)
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
@@ -126,13 +147,13 @@ def read_metaimage(request: Request) -> Volume:
     true = set(TRUE.findall(text))
 
     def load(index: Index) -> Any:
-        if b"CompressedData" in true:
+        if b"CompressedData" in true and len(files) < 2:
             unpacker = zlib.decompressobj()
             numbers = unpacker.decompress(data.read_bytes()[start:], promised + 1)
             if len(numbers) == promised and unpacker.eof:
                 kind = dtype.newbyteorder(">" if len(true) > 1 else "<")
                 return np.frombuffer(numbers, kind).reshape(size[::-1]).T[index]
-        elif data.stat().st_size - start >= promised:
+        elif data.stat().st_size - start >= promised or len(files) > 1:
             return SimpleITK.GetArrayFromImage(reader.Execute()).T[index]
         raise FileError(f"{data} is truncated or damaged: {promised:,} bytes are promised")
 
