@@ -43,21 +43,6 @@ def wait(*_, **__):
 convert.mesh_grid = wait
 main()
 """
-# The same in the midst of an import, by code that makes another error of what is raised in it.
-IMPORT = """
-import sys, time
-class Finder:
-    def find_spec(self, name, *_):
-        if name == "onnxruntime":
-            print("importing", flush=True)
-            try:
-                time.sleep(600)
-            except BaseException as error:
-                raise ImportError("something else") from error
-sys.meta_path.insert(0, Finder())
-from super_sdf.cli.main import main
-main()
-"""
 
 
 def ended(script, number, *more):
@@ -74,11 +59,10 @@ def ended(script, number, *more):
 SIGNALS = {"interrupted": signal.SIGINT, "ended by SIGHUP": signal.SIGHUP, "ended by SIGTERM": 15}
 
 
-@pytest.mark.parametrize("script", [STAGE, IMPORT])
 @pytest.mark.parametrize("line", SIGNALS)
-def test_a_signal_leaves_a_line_its_exit_code_and_no_file(script, line):
+def test_a_signal_leaves_a_line_its_exit_code_and_no_file(line):
     number = SIGNALS[line]
-    code, out, err = ended(script, number, "--json")
+    code, out, err = ended(STAGE, number, "--json")
     assert (code, err.splitlines()[-1]) == (128 + number, f"Error: {line}")
     assert json.loads(out) == {"error": line} and os.listdir() == ["in.npy"]
 

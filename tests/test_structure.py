@@ -36,10 +36,10 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together: they may shrink only; the design's figure beside
-    TOP: 1416,  # 1,250
+    TOP: 1415,  # 1,250
     "grid": 2542,  # 1,800
     "network": 499,
-    "refine": 1303,  # 1,300
+    "refine": 1300,
     "surface": 2186,
     "tiles": 287,
     "files": 2825,  # 2,700: readers of twelve libraries
@@ -48,9 +48,9 @@ BUDGETS = {  # of lines, for some rooms together: they may shrink only; the desi
     "simplify check truth": 1203,  # 1,100: with the walls between labels
     "batch": 898,
     "pages": 400,
-    "cli": 880,  # 800
+    "cli": 870,  # 800
 }
-MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 48, 110  # 95, 45, 110 in the design
+MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 47, 110  # 95, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 18_288, 37_300  # 17,800 and 36,000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {

@@ -45,7 +45,6 @@ FLOAT32: Final = "float32"
 INT8: Final = "int8"
 DEFAULT_QUALITY: Final = "base"
 FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
-MESHERS: tuple[MesherName, ...] = get_args(MesherName)
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
@@ -254,7 +253,7 @@ class Options:
     cap: bool = _option(True, MESH, "list", FLAG,
         "Close the surface along the border of the grid (default), or leave it open there, as one "
         "that ends at unknown samples must be.", off="open")
-    mesher: MesherName = _option(AUTO, MESH, "list", one_of(MESHERS),
+    mesher: MesherName = _option(AUTO, MESH, "list", one_of(get_args(MesherName)),
         "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
         "them; auto is sharp for distances, marching for masks and noise.")
     simplify: float | None = _option(None, MESH, "list labels",

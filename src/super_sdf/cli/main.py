@@ -155,20 +155,13 @@ def check_page(word: str, page: Path, sources: Paths, others: Paths, *, force: b
 
 
 @contextmanager
-def progress_bar(
-    label: str, quiet: bool, before: str = ""
-) -> Iterator[Callable[[int, int], None] | None]:
-    """Draw a progress bar on a terminal's stderr, labelled ``before`` until there is progress."""
+def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
+    """Draw a progress bar on a terminal's stderr."""
     if quiet or not (sys.stderr and sys.stderr.isatty()):
         yield None
         return
-    with click.progressbar(length=1000, label=before or label, file=sys.stderr) as shown:
-
-        def show(done: int, total: int) -> None:
-            shown.label = label
-            shown.update(1000 * done // total - shown.pos)
-
-        yield show
+    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
+        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
 
 
 def printable(line: str) -> str:

@@ -98,7 +98,7 @@ def converted(
 ) -> Any:
     """Return the conversion of a grid, here or on a cluster, or that of the labels of an image."""
     with ExitStack() as stack:
-        bar = main.progress_bar("upsampling", given["quiet"], "reading")
+        bar = main.progress_bar("upsampling", given["quiet"])
         both: Any = {"progress": stack.enter_context(bar), "force": given["force"]}
         if options.labels is not None:
             from ..labels.files import check_options, convert_labels, read_names

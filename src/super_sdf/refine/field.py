@@ -151,8 +151,7 @@ class FineLattice(SamplePlanes):
             i, j, k = corner[:, None, some] + nodes
             here = (i >= 0) & (i < len(planes))
             planes[i[here], j[here], k[here]] = field.blocks[:, rows][:, some][here]
-        scale = grid.voxel_size / 2
-        return np.multiply(planes, scale, out=planes, dtype=np.float64, casting="same_kind")
+        return np.multiply(planes, grid.voxel_size / 2, out=planes, dtype="f8", casting="same_kind")
 
 
 def fine_grid(field: FineField) -> SdfGrid:

@@ -73,7 +73,7 @@ class VoxelIndex:
     """The rows of voxels (n, 3), in C order, by their place in a grid of a shape."""
 
     def __init__(self, voxel_ijk: IntArray, shape: tuple[int, int, int]) -> None:
-        self.shape, self.strides = shape, np.array([shape[1] * shape[2], shape[2], 1])
+        self.shape, self.strides = shape, np.array([shape[1] * shape[2], shape[2], 1], np.int64)
         self.keys = voxel_ijk @ self.strides  # numbers in C order of the whole grid
 
     def find(self, voxel_ijk: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -100,11 +100,10 @@ class SharedParts:
 def share_parts(table: IntArray) -> SharedParts:
     """Return the owners of all parts, given the voxels' neighbour table, (D, 27) int32."""
     by_place = np.ascontiguousarray(table.T)
-    there = by_place >= 0
     owner = np.full(by_place.shape, CENTRE, np.int8)
     for part, sharing in enumerate(SHARING):
         for place in sharing[sharing < CENTRE][::-1]:  # the first is written last
-            np.copyto(owner[part], place, where=there[place])
+            np.copyto(owner[part], place, where=by_place[place] >= 0)
     return SharedParts(by_place, owner)
 
 

@@ -49,10 +49,9 @@ CORNER_PARTS = np.flatnonzero(np.abs(NEIGHBOURHOOD).all(1))
 CELLS = 1, 2, 2  # along a block, of the lattice on which errors are averaged, each time
 
 # The fitted values of a block depend on this many voxels to either side: one each time that errors
-# are averaged, for the foot points in the blocks beside; then the foot points' samples, and the
-# blocks in which these were searched for; and one for the averaging of shared nodes.
-SAMPLE_TO_FOOT = 2  # (MAX_DISTANCE + BEYOND) / 2, rounded
-REACH_IN_VOXELS = len(CELLS) + 2 * SAMPLE_TO_FOOT + 1
+# are averaged, for the foot points in the blocks beside; two from these to their samples, and two
+# to the blocks in which they were searched for; and one for the averaging of shared nodes.
+REACH_IN_VOXELS = len(CELLS) + 2 + 2 + 1
 
 Spheres: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
 """Samples (3, n), their signed distances (n,), and directions, about the gradients there (3, n)."""
@@ -249,14 +248,14 @@ def find_correction(
     numbers, count = number_parts(parts, 2)  # one node per part
     correction, left = np.zeros(numbers.shape, np.float32), errors.copy()
 
-    def nodes_round(some: slice) -> tuple[IntArray, FloatArray]:
+    def nodes_round(some: slice) -> tuple[NDArray[np.intp], FloatArray]:
         """Return the 8 nodes round foot points, (8, n), and their trilinear weights there."""
         low, inside = _find_cell(place[:, some], cells)
         step = STRIDES * (2 // cells)
         upper = np.stack([1 - inside, inside])  # (2, 3, n)
         x, y, z = CORNERS.T
-        at = step @ low + (CORNERS @ step)[:, None]
-        return numbers[at, rows[some]], upper[x, 0] * upper[y, 1] * upper[z, 2]
+        at = (step @ low + (CORNERS @ step)[:, None]) * numbers.shape[1] + rows[some]
+        return numbers.ravel().take(at).astype(np.intp), upper[x, 0] * upper[y, 1] * upper[z, 2]
 
     def mean(some: slice) -> FloatArray:
         weight, total, squares = sums[:, some]
