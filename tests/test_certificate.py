@@ -12,7 +12,6 @@ from solids import cube, inverted, joined, saved
 
 from super_sdf import Mesh, SdfGrid, check
 from super_sdf.check import check_mesh
-from super_sdf.truth.solid import Solid
 
 H = 1 / 24  # of the grids
 RADIUS = 0.4
@@ -100,25 +99,6 @@ def test_slivers_and_needles_are_counted():
     flat = np.array([[0, 0, 0], [1, 0, 0], [0.5, 0.004, 0]])
     found = check.examine_surface(joined(spiked, Mesh(flat, np.array([[0, 1, 2]], np.int32))))
     assert (found.slivers, found.needles) == (1, 1)
-
-
-# A triangle over another: beside it, through it, flat over it; at a common corner in it and off.
-PAIRS = [
-    ([[1.0, 1, -1], [1, 1, 1], [2, 2, 1]], 0),
-    ([[0.2, 0.2, -0.5], [0.3, 0.2, 0.5], [0.2, 0.3, 0.5]], 1),
-    ([[0.1, 0.1, 0.01], [0.9, 0.1, 0.01], [0.1, 0.9, 0.01]], 0),
-    ([[0.0, 0, 0], [1, 1, 1], [0.5, 0.5, -1]], 1),
-    ([[0.0, 0, 0], [-1, 0, 1], [-1, 0.5, -1]], 0),
-    ([[0.0, 0, 0], [-1, 0, 0], [0, -1, 0]], 0),
-]
-
-
-@pytest.mark.parametrize("corners, count", PAIRS)
-def test_pairs_of_triangles_that_intersect_are_counted(corners, count):
-    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], *corners])
-    faces = np.array([[0, 1, 2], [3 * any(corners[0]), 4, 5]], np.int32)
-    for order in (faces, faces[::-1]):
-        assert Solid(Mesh(points, order)).intersecting().tolist() == [[0, 1]] * count
 
 
 def test_a_vertex_shared_by_two_pieces_is_pinched():

@@ -197,14 +197,13 @@ def test_the_command_writes_a_file_for_each_label(image, command):
     np.testing.assert_allclose((low + high) / 2, (3, -9, 23), atol=0.5)
 
 
-@pytest.mark.parametrize(("words", "name"), [
-    ("--triangles 99", "--triangles 99"), ("--mesher sharp", "--mesher 'sharp'"),
-    ("--open", "--open"), ("--save-field f.npz", "--save-field"),
-])  # fmt: skip
-def test_options_that_would_tear_the_walls_are_refused(words, name, image, command):
+@pytest.mark.parametrize(
+    "words", ["--triangles 99", "--mesher sharp", "--open", "--save-field f.npz"]
+)
+def test_options_that_would_tear_the_walls_are_refused(words, image, command):
     code, _, err = command("upsample", image, "a.ply", "--labels", "all", *words.split(), *PLAIN)
-    assert code == 2 and f"Error: {name} does not go with labels, which share their walls: " in err
-    assert not Path("a-1.ply").exists()
+    said = f"Error: {words.split()[0]} does not go with labels, which share their walls: "
+    assert code == 2 and said in err and not Path("a-1.ply").exists()
 
 
 TABLES = {

@@ -20,7 +20,6 @@ from super_sdf.errors import (
     OutOfMemoryError,
 )
 from super_sdf.network.network import load_network
-from super_sdf.simplify.measuring import Original
 from super_sdf.simplify.walls import Walls, irregular_places
 from super_sdf.truth.solid import Solid, smallest_angles
 
@@ -65,14 +64,6 @@ def three_holes() -> Mesh:
     for k in range(3):
         plate = np.maximum(plate, 2.4 - np.hypot(x - 3.2 - 8.3 * k, y))
     return reconstruct(SdfGrid.trusted(plate.astype(np.float32), 1.0), trilinear, factor=2)
-
-
-def speck(place: list[float]) -> Mesh:
-    """Return an octahedron of radius 0.01."""
-    ends = np.concatenate([np.eye(3), -np.eye(3)]) * 0.01 + place
-    top = np.array([[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2]])
-    bottom = np.array([[1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]])
-    return Mesh(ends, np.concatenate([top, bottom]).astype(np.int32))
 
 
 @pytest.mark.parametrize("turn, most", [(np.eye(3), 12), (TURN, 24)], ids=["straight", "turned"])
@@ -156,15 +147,6 @@ def test_any_field_stays_a_closed_manifold_within_the_error(seed, error, in_floa
     assert before == after
 
 
-def test_the_deviation_is_that_of_shifted_squares():
-    low, high = refined(square(0.0), 2), square(0.25)
-    found = Original(low).compare(Solid(high))[1]
-    assert found == pytest.approx((0.25,) * 4)
-    half = Mesh(low.vertices * [0.5, 1, 1], low.faces)  # the part beyond is up to a half away
-    found = Original(low).compare(Solid(half))[1]
-    assert found == pytest.approx((0.5, 0.125, 0, 0), abs=2e-3)
-
-
 def test_a_number_of_triangles_is_not_exceeded_and_what_the_shape_does_not_allow_is_said():
     mesh = torus(48, 24)
     for count in (1001, 60):
@@ -182,18 +164,14 @@ def test_a_number_of_triangles_is_not_exceeded_and_what_the_shape_does_not_allow
     assert max(found.deviation) <= 0.05 * diagonal
 
 
-@pytest.mark.parametrize("shape, error", [("torus", 1e-2), ("two balls and a speck", 1e-2)])
-def test_a_number_of_triangles_is_no_farther_off_than_an_error_that_leaves_as_many(shape, error):
-    ball = sphere(0.3, 24).transformed(np.eye(3), np.array([1.0, 0, 0]))
-    balls = joined(sphere(0.4), ball, speck([0.5, 0, 0.2]))
-    mesh = torus() if shape == "torus" else balls
-    within = simplify_mesh(mesh, error=error)
+def test_a_number_of_triangles_is_no_farther_off_than_an_error_that_leaves_as_many():
+    small = sphere(0.02, 6).transformed(np.eye(3), np.array([0.5, 0, 0.2]))
+    mesh = joined(torus(48, 24), small.transformed(np.eye(3), np.array([1.0, 0, 0])))
+    within = simplify_mesh(mesh, error=1e-2)
     found = simplify_mesh(mesh, triangles=len(within.mesh.faces))
     assert found.warnings == () and len(found.mesh.faces) <= len(within.mesh.faces)
-    off = found.deviation
-    assert max(off.largest, off.largest_back) <= error
-    assert is_closed_manifold(found.mesh)
-    assert found.mesh.components()[0] == mesh.components()[0]
+    assert max(found.deviation.largest, found.deviation.largest_back) <= 1e-2
+    assert is_closed_manifold(found.mesh) and found.mesh.components()[0] == 2
 
 
 def test_what_does_not_fit_in_memory_is_refused():

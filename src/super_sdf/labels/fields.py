@@ -69,13 +69,14 @@ def label_fields(
     OutOfMemoryError if more bytes than ``bound`` would be held.
     """
     nodes, shape = (factor + 1) ** 3, np.array(numbers.shape)
-    check_room(numbers.size, 0, count, nodes, bound)
     padded = np.pad(numbers, 1)  # beyond the border there is no label
     edges = at_walls(padded)
     near = over_three(edges, np.logical_or)
     near[1:-1, 1:-1, 1:-1] = edges[1:-1, 1:-1, 1:-1]
     places = np.argwhere(near).astype(np.int32)
-    check_room(numbers.size, len(places), count, nodes, bound)
+    need = SAMPLE_BYTES * numbers.size + len(places) * (VOXEL_BYTES + NODE_BYTES * nodes)
+    what = f"meshing {count} labels in {numbers.size:,} samples, {len(places):,} of them at walls,"
+    check_bound(need, what, bound, "choose fewer (--labels), a smaller factor, cut the image, or ")
     own, index, voxel_ijk = padded[tuple(places.T)], VoxelIndex(places, padded.shape), places - 1
     low, high = np.full((count + 1, 3), shape), np.zeros((count + 1, 3), np.intp)  # of the labels
     np.minimum.at(low, own, voxel_ijk)
@@ -100,13 +101,6 @@ def label_fields(
         fields[label] = rows, blocks
     share_border(holder, voxel_ijk, shape, index, factor)
     return Labelled(grid.shape, factor, index, voxel_ijk, holder, fields)
-
-
-def check_room(samples: int, voxels: int, labels: int, nodes: int, bound: int | None) -> None:
-    """Raise OutOfMemoryError if labels in a number of samples need more memory than the bound."""
-    need = SAMPLE_BYTES * samples + voxels * (VOXEL_BYTES + NODE_BYTES * nodes)
-    what = f"meshing {labels} labels in {samples:,} samples, {voxels:,} of them at walls,"
-    check_bound(need, what, bound, "choose fewer (--labels), a smaller factor, cut the image, or ")
 
 
 def refined(

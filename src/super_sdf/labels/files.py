@@ -18,7 +18,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..errors import FileError, MeshError, OptionError, flag, seen
+from ..errors import FileError, MeshError, OptionError, flag
 from ..files.formats import check_regular_file, files_of
 from ..files.grids import names_in
 from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, write_meshes
@@ -135,23 +135,20 @@ def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:
     """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
-    others = {name: value for name, value in vars(options).items() if name not in LABELS}
-    usual = {name: (OPTIONS[name].default, MARCHING) for name in others}
-    given = {name: f" {seen(x)}" for name, x in others.items() if x not in usual[name]}
+    usual = {name: (OPTIONS[name].default, MARCHING) for name in OPTIONS if name not in LABELS}
+    given = [name for name, values in usual.items() if getattr(options, name) not in values]
     for name in (*given, *more):
-        text = flag("open" if name == "cap" else name) + given.get(name, "") * (name != "cap")
         raise OptionError(
-            f"{text} does not go with labels, which share their walls: "
-            "leave it out, or mesh one label (--label)"
+            f"{flag('open' if name == 'cap' else name)} does not go with labels, which share their "
+            "walls: leave it out, or mesh one label (--label)"
         )
 
 
 def with_numbers(options: Options, names: Names | None) -> Options:
     """Return options with numbers in place of names of labels; OptionError if some do not go."""
-    if options.labels is None:
-        return options
-    check_options(options)
-    if isinstance(options.labels, str):
+    if options.labels is not None:
+        check_options(options)
+    if options.labels is None or isinstance(options.labels, str):
         return options
     numbers: dict[Any, int] = {entry.name: number for number, entry in (names or {}).items()}
     chosen = [numbers.get(label, label) for label in options.labels]
