@@ -2,7 +2,7 @@
 
 All planes are read once, in order. What needs neighbours is asked of a part: a small grid as it is,
 of others some planes with two to either side, half of them where the sign changes most, the others
-spread evenly. Of that part seeded samples are kept: what is asked are shares, for which they do.
+spread evenly. Of that part some samples are kept: what is asked are shares, for which they do.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ SHARE, LEAST = 0.05, 20  # of the most steps over any level, and steps, that cou
 MOST_OUTSIDE = 0.65  # of the border, above a level: maps of noise to .55, distances from .76
 MOST_NAMED = 8  # labels that a message lists
 TRIED = 4096  # samples whose different values are counted first
+GOLDEN = 0.6180339887  # its multiples, less whole numbers, are spread evenly from 0 to 1
 
 AXES = np.array([[0, 0, 0], *np.kron(np.eye(3, dtype=int), [[-2], [-1], [1], [2]])])
 ON_LINES = np.array([[1, 2, 0, 3, 4], [5, 6, 0, 7, 8], [9, 10, 0, 11, 12]])
@@ -139,7 +140,6 @@ def _part_of(samples: SampleArray, changes: NDArray[np.int64]) -> tuple[NDArray[
 
 def _closer(look: Look, part: NDArray[Any], own: BoolArray) -> Look:
     """Return a look with samples of a part of the grid; those asked lie in the own planes."""
-    random = np.random.default_rng(0)
     if not look.is_finite:
         part = np.where(np.isfinite(part), part, np.nan)
     padded = np.pad(part, 2, constant_values=np.nan)
@@ -147,7 +147,7 @@ def _closer(look: Look, part: NDArray[Any], own: BoolArray) -> Look:
 
     def around(asked: BoolArray, offsets: NDArray[Any], most: int) -> Floats:
         asked[~own] = False
-        at = np.stack(np.unravel_index(_some(np.flatnonzero(asked), most, random), part.shape), 1)
+        at = np.stack(np.unravel_index(_some(np.flatnonzero(asked), most), part.shape), 1)
         found: Floats = flat.take(((at + 2) @ step)[:, None] + offsets @ step).astype(np.float64)
         return found
 
@@ -158,7 +158,7 @@ def _closer(look: Look, part: NDArray[Any], own: BoolArray) -> Look:
         lines_of = np.moveaxis(part, axis, 0)
         one, other = lines_of[:-1], lines_of[1:]
         places = np.flatnonzero((one != other) & ~np.isnan(one) & ~np.isnan(other))
-        at = np.unravel_index(_some(places, PAIRS, random), one.shape)
+        at = np.unravel_index(_some(places, PAIRS), one.shape)
         pairs.append(np.stack([one[at], other[at]]).astype(np.float64))
     amid = part[equal_neighbours(part) == 6]  # samples amid equal ones
     found, times = np.unique(amid, return_counts=True)
@@ -168,11 +168,12 @@ def _closer(look: Look, part: NDArray[Any], own: BoolArray) -> Look:
     return replace(look, part=part, boxes=boxes, lines=lines, pairs=together, frequent=frequent)
 
 
-def _some(places: NDArray[np.intp], most: int, random: np.random.Generator) -> NDArray[np.intp]:
-    """Return all places or, by chance, one in each of ``most`` parts of them."""
+def _some(places: NDArray[np.intp], most: int) -> NDArray[np.intp]:
+    """Return all places or one in each of ``most`` parts of them, somewhere in it."""
     if len(places) <= most:
         return places
-    parts = np.arange(most) + random.random(most)
+    numbers = np.arange(most)
+    parts = numbers + numbers * GOLDEN % 1
     return places[(parts * (len(places) / most)).astype(np.intp)]
 
 
@@ -221,10 +222,10 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
     mean = np.sqrt((rise.mean(2) ** 2).sum(1))
     known = np.isfinite(mean) & (mean > 0)
     if known.sum() >= max(ENOUGH, len(lines) / 2) or not len(cut):
-        return float(np.median(mean[known])) if known.any() else float("nan")
+        return float(np.quantile(mean[known], 0.5)) if known.any() else float("nan")
     steep = np.nan_to_num(np.abs(rise)).max(2)
     length = np.sqrt((steep**2).sum(1))[(steep > 0).all(1)]
-    return float(np.median(length)) if len(length) else float("nan")
+    return float(np.quantile(length, 0.5)) if len(length) else float("nan")
 
 
 def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int64]] | None:
@@ -272,7 +273,7 @@ def which_level(look: Look, *, signed: bool = False) -> str:
     if grows[steps.argmax()] and (all_above := share < 0.1).any():
         steps = np.where(all_above, steps, 0)
     good = levels[steps >= AS_GOOD * steps.max()]
-    middle = float(np.median(good))
+    middle = float(np.quantile(good, 0.5))
     short = (float(f"{middle:.{digits}g}") for digits in (1, 2, 3))
     level = next((x for x in short if good.min() <= x <= good.max()), middle)
     if look.faces.dtype.kind in "iu":

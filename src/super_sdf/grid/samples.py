@@ -207,7 +207,7 @@ def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
         samples: NDArray[Any] = np.asanyarray(without_device(values))
     except (TypeError, ValueError, RuntimeError):  # ragged lists
         raise GridError(f"values are {seen(values)}: give an array of three axes") from None
-    if not isinstance(samples, np.ma.MaskedArray):
+    if not hasattr(samples, "mask"):  # of a masked array: what is masked is unknown
         return samples
     if samples.dtype.kind in "fiu":
         samples = samples.astype(np.result_type(samples.dtype, np.float32))
