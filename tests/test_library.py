@@ -95,6 +95,14 @@ def test_wrong_arguments_are_named_with_the_value_seen(message):
             assert isinstance(caught.value, TypeError) == (message in OF_OTHER_TYPES)
 
 
+def test_a_network_is_given_or_named():
+    named = reconstruct(GRID, quality="fast", device="cpu", factor=2)
+    loaded = reconstruct(GRID, load_network("fast", device="cpu"), 2)
+    np.testing.assert_array_equal(named.vertices, loaded.vertices)
+    said = refusal(OptionError, reconstruct, GRID, trilinear, quality="fast")
+    assert said == "a network and quality are given: give only one of them"
+
+
 OTHERS = {
     "threads is -1: give 1 or more, or 0 for one per core": lambda: load_network(threads=-1),
     "model is None: give the path of a file": lambda: load_network(None),

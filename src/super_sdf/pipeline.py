@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import OptionTypeError, OutOfMemoryError, seen
+from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
@@ -164,12 +164,16 @@ def extract_mesh(
 
 def reconstruct(
     grid: SdfGrid | None = None,
-    network: Decoder | str | Path = options.DEFAULT_QUALITY,
+    network: Decoder | None = None,
     factor: int | None = None,
     *,
     function: Function | None = None,
     bounds: ArrayLike | None = None,
     spacing: ArrayLike | None = None,
+    quality: options.Quality | str | Path | None = None,
+    device: options.Device | None = None,
+    precision: options.Precision | None = None,
+    threads: int | None = None,
     offset: float = 0.0,
     cap: bool = True,
     mesher: options.MesherName = options.AUTO,
@@ -182,8 +186,8 @@ def reconstruct(
     ----------
     grid : SdfGrid, optional
         Coarse signed distances. Without a grid the function is sampled.
-    network : Network, str or path
-        From ``load_network``, to load it once for many grids or on a device; or what it loads.
+    network : Network, optional
+        From ``load_network``, to load it once for many grids.
     factor : int, optional
         How many times finer per axis, K: an even number from 2 to 16; by default 2 for masks,
         else 4.
@@ -191,6 +195,8 @@ def reconstruct(
         What the grid has samples of; vertices are then put where it is 0.
     bounds, spacing : optional
         The box and the distance of the samples, without a grid; see ``DistanceFunction.sample``.
+    quality, device, precision, threads : optional
+        Which network to load, and where it runs, if none is given: see ``load_network``.
     offset : float
         Mesh the surface at this distance from the solid (world units, Sec. 5.3); positive is
         outwards. The distances must reach 1.5 spacings beyond the offset.
@@ -219,7 +225,12 @@ def reconstruct(
         exact = None if function is None else as_function(function)
         grid = sampled(grid, exact, bounds, spacing, chosen.offset)
     grid = check_grid(grid)
-    network = load_network(network) if isinstance(network, (str, Path)) else network
+    where = {"model": quality, "device": device, "precision": precision, "threads": threads}
+    asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
+    if network is not None and asked:
+        name = next(iter(asked)).replace("model", "quality")
+        raise OptionError(f"a network and {name} are given: give only one of them")
+    network = load_network(**asked) if network is None else network
     mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
     if exact is None:
         return mesh

@@ -17,7 +17,7 @@ import pyvista
 
 from .. import SdfGrid, grid_from_image, reconstruct
 from ..errors import FileError, check_modules, how_to_install
-from ..options import AUTO, DEFAULT_QUALITY, MesherName, Options, Values
+from ..options import AUTO, MesherName, Options, Quality, Values
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -68,7 +68,8 @@ class ImageAccessor:
         factor: int | None = None,
         *,
         scalars: str | None = None,
-        network: Decoder | str | Path = DEFAULT_QUALITY,
+        quality: Quality | str | Path | None = None,
+        network: Decoder | None = None,
         residuals: bool = False,
         offset: float = 0.0,
         cap: bool = True,
@@ -83,7 +84,7 @@ class ImageAccessor:
 
         Parameters
         ----------
-        factor, network, offset, cap, mesher, max_memory, progress
+        factor, quality, network, offset, cap, mesher, max_memory, progress
             See ``reconstruct``.
         scalars, inside, field, label, level, scale
             See ``grid``.
@@ -109,6 +110,7 @@ class ImageAccessor:
             grid,
             network,
             factor,
+            quality=quality,
             offset=offset,
             cap=cap,
             mesher=mesher,
