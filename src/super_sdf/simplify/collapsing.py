@@ -1,11 +1,11 @@
-"""Stages of collapsing edges with pyfqmr: where a result is wrong, its stage is made anew.
+"""Passes of collapsing edges with pyfqmr: where the result is wrong, they are made anew.
 
 pyfqmr is fast quadric mesh simplification (Forstmann): an edge is collapsed if the sum of squared
 distances of the new vertex to the planes of the triangles it replaces is under a threshold, which
 rises in every round. It neither bounds the distance of triangles nor keeps every mesh a manifold
-without intersections. So the result of each stage is examined. Where it is too far from the
-original, not a manifold, or meets itself, the stage is made anew with the triangles around the
-place kept.
+without intersections. So the result of the last pass is examined. Where it is too far from what it
+was made of, not a manifold, or meets itself, the triangles around the place are kept in the first
+pass that got it wrong, and this pass and those after it are made anew.
 
 What is simplified are the walls between labels, each once, so that every label stays closed, and
 neighbours stay neighbours; a mesh is the wall round one label.
@@ -29,13 +29,13 @@ from .walls import Walls, irregular_places, labels_apart
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])  # a triangle apart from all others
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
-# of the sum of squares), step by step. The first stage leaves hardly any triangle beyond the error,
-# the second does at some places, and leaves a fifth fewer triangles.
-PLANE_DISTANCES = (1.0, 1.3, 1.3, 1.3), (1.7, 1.7)
+# of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
+# the error, those of the second do at some places, and leave a fifth fewer triangles.
+PLANE_DISTANCES = (1.0,), (1.4, 1.4, 1.4), (1.7, 1.7)
 ROUNDS, RISE = 8, 5.0  # of the threshold; from more rounds, meshes get hardly smaller
 FEW_SLIVERS = 0.002  # of the triangles, which stay
 THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
-MOST_REPEATS, HALVINGS = 16, 3  # of a stage, before smaller distances are tried
+MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
 # A number of triangles is sought by the error that leaves as many.
 MOST_ERRORS = 12  # that are tried
 FIRST_ERROR = 0.006  # in sides of a triangle, over the share of the triangles that is wanted
@@ -55,11 +55,12 @@ class Unsimplified:
 def within(of: Unsimplified, error: float) -> Walls | None:
     """Return walls within a distance of the originals; None if no triangle can be spared."""
     for halving in range(HALVINGS):
-        unit, result = error / 2**halving, of.walls
-        for shares in PLANE_DISTANCES:
-            result = collapsed(of, result, [unit * share for share in shares], error) or result
-        if len(result.faces) < len(of.walls.faces):
-            return result
+        unit = error / 2**halving
+        passes = [[unit * share for share in steps] for steps in PLANE_DISTANCES]
+        for some in (passes, passes[:1]):
+            result = collapsed(of, some, error)
+            if result and len(result.faces) < len(of.walls.faces):
+                return result
     return None
 
 
@@ -90,43 +91,58 @@ def down_to(of: Unsimplified, triangles: int) -> Walls:
     return few[-1] if few else min(found, key=lambda walls: len(walls.faces))
 
 
-def collapsed(
-    of: Unsimplified, start: Walls, distances: Sequence[float], error: float
-) -> Walls | None:
-    """Return what is left of walls when edges are collapsed, within one distance after the other.
+def collapsed(of: Unsimplified, passes: Sequence[Sequence[float]], error: float) -> Walls | None:
+    """Return what the last pass makes once nothing is wrong with it, None if that fails.
 
-    Nothing is wrong with it, see ``examine``; None if that fails.
+    Of each pass are the distances within which edges are collapsed, step by step; see ``examine``.
     """
-    alone = start is of.walls and len(of.originals) == 1
-    solid, places = of.originals[0].solid if alone else Solid(start), np.zeros((0, 3))
+    alone = len(of.originals) == 1
+    stages, solids = [of.walls], [of.originals[0].solid if alone else Solid(of.walls)]
+    kept: list[BoolArray] = []  # triangles of each stage but the last
+    places, since = np.zeros((0, 3)), np.zeros(0, np.intp)  # to keep, and from which pass on
+    first = 0  # pass that is to be made anew
     for _ in range(MOST_REPEATS):
-        result, held = start, np.zeros(len(start.vertices), bool)
-        held[start.faces[solid.nearest(places)[1]]] = True
-        held[start.faces[held[start.faces].any(1)]] = True
-        kept = np.asarray(held[start.faces].all(1))
-        for distance in distances:
-            result, held = collapse_edges(result, held, distance=distance)
-        result = turn_edges(result, held, LOW * error)
-        wrong = examine(of, result, error)
-        if wrong is not None and not len(wrong):
-            return result
-        if wrong is None or kept[solid.nearest(wrong)[1]].all():
+        del stages[first + 1 :], solids[first + 1 :], kept[first:]
+        for number, steps in enumerate(passes[first:], first):
+            result, held = stages[number], np.zeros(len(stages[number].vertices), bool)
+            held[result.faces[solids[number].nearest(places[since <= number])[1]]] = True
+            held[result.faces[held[result.faces].any(1)]] = True
+            kept.append(np.asarray(held[result.faces].all(1)))
+            for distance in steps:
+                result, held = collapse_edges(result, held, distance=distance)
+            if number == len(passes) - 1:
+                result = turn_edges(result, held, LOW * error)
+            stages.append(result)
+            solids.append(Solid(result))
+        wrong = examine(of, result, solids[-1], error)
+        if wrong is None or not len(wrong):
+            return None if wrong is None else result
+        first = len(passes)
+        while len(wrong) and first:  # back to the first pass that got it wrong
+            first -= 1
+            distances, face, _ = solids[first].nearest(wrong)
+            earlier = kept[first][face] | ((distances > error) & (first > 0))
+            places = np.concatenate([places, wrong[~earlier]])
+            since = np.append(since, np.full(np.count_nonzero(~earlier), first))
+            wrong = wrong[earlier]
+        if len(wrong):  # although it is kept in all
             return None
-        places = np.concatenate([places, wrong])
     return None
 
 
-def examine(of: Unsimplified, result: Walls, error: float) -> Points | None:
+def examine(of: Unsimplified, result: Walls, solid: Solid, error: float) -> Points | None:
     """Return where a result is wrong, (n, 3); None if its topology is, but no place is known.
 
     Right are walls of which each label is within the error of its original, with no place that is
     less of a manifold than it was, without new triangles that intersect, with all components and
-    their holes.
+    their holes. ``solid`` is that of the result.
     """
-    labels = [Solid(mesh) for mesh, _ in labels_apart(result)]
+    labels = [solid]
+    if len(of.originals) > 1:
+        labels = [Solid(mesh) for mesh, _ in labels_apart(result)]
     if len(labels) < len(of.originals) or not all(len(label.mesh.faces) for label in labels):
         return None
-    wrong = [faults_made(of, result, labels[0] if len(labels) == 1 else Solid(result))]
+    wrong = [faults_made(of, result, solid)]
     wrong += [one.compare(label, error)[0] for one, label in zip(of.originals, labels)]
     if len(far := np.concatenate(wrong)):
         return far
