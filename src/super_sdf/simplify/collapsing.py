@@ -32,7 +32,8 @@ ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])  # a triangle apart from all
 # of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
 # the error, those of the second do at some places, and leave a fifth fewer triangles.
 PLANE_DISTANCES = (1.0,), (1.4, 1.4, 1.4), (1.7, 1.7)
-ROUNDS, RISE = 8, 5.0  # of the threshold; from more rounds, meshes get hardly smaller
+ROUNDS = 30, 3.0  # of the threshold, and its rise; from more rounds, meshes get no smaller
+FEW_ROUNDS, LARGE = (8, 5.0), 1 << 12  # nearly as well, from this many triangles on
 FEW_SLIVERS = 0.002  # of the triangles, which stay
 THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
 MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
@@ -218,8 +219,9 @@ def collapse_edges(
     faces = np.concatenate([faces, np.stack([pins, one, other], 1)]).astype(np.int32)
     options: dict[str, Any] = {"target_count": int(triangles) + len(last) + len(pins)}
     if distance:
-        options = {"target_count": 0, "max_iterations": ROUNDS}
-        options |= {"alpha": ROUNDS**-RISE, "K": 1, "aggressiveness": RISE}  # to the distance
+        rounds, rise = FEW_ROUNDS if len(walls.faces) > LARGE else ROUNDS
+        options = {"target_count": 0, "max_iterations": rounds}
+        options |= {"alpha": rounds**-rise, "K": 1, "aggressiveness": rise}  # to the distance
     with ONE_AT_A_TIME:
         library = Simplify()
         library.setMesh(points, faces)
