@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from contextlib import ExitStack
-from hashlib import sha256
 from typing import Any
 
 from click import argument, option
@@ -65,13 +64,16 @@ def command(source: str, target: str, **given: Any) -> None:
         "version": __version__,
         "asked": options.digest(),
         "model": options.network()["model"],
-        "network": sha256(network.path.read_bytes()).hexdigest(),
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),
         **done.report(),
     }
     seconds, start = seconds | done.seconds, time.perf_counter()
+    if given["as_json"] or page:
+        from hashlib import sha256  # imported here, as it loads OpenSSL
+
+        report["network"] = sha256(network.path.read_bytes()).hexdigest()
     if given["check"]:
         from ..check import check_mesh, read_for_check
 

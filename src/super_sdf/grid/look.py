@@ -222,10 +222,10 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
     mean = np.sqrt((rise.mean(2) ** 2).sum(1))
     known = np.isfinite(mean) & (mean > 0)
     if known.sum() >= max(ENOUGH, len(lines) / 2) or not len(cut):
-        return float(np.quantile(mean[known], 0.5)) if known.any() else float("nan")
+        return float(np.median(mean[known])) if known.any() else float("nan")
     steep = np.nan_to_num(np.abs(rise)).max(2)
     length = np.sqrt((steep**2).sum(1))[(steep > 0).all(1)]
-    return float(np.quantile(length, 0.5)) if len(length) else float("nan")
+    return float(np.median(length)) if len(length) else float("nan")
 
 
 def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int64]] | None:
@@ -273,7 +273,7 @@ def which_level(look: Look, *, signed: bool = False) -> str:
     if grows[steps.argmax()] and (all_above := share < 0.1).any():
         steps = np.where(all_above, steps, 0)
     good = levels[steps >= AS_GOOD * steps.max()]
-    middle = float(np.quantile(good, 0.5))
+    middle = float(np.median(good))
     short = (float(f"{middle:.{digits}g}") for digits in (1, 2, 3))
     level = next((x for x in short if good.min() <= x <= good.max()), middle)
     if look.faces.dtype.kind in "iu":

@@ -204,9 +204,9 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
         ring = whole & along.any(1)
         free = ring & ~np.isin(boxes[:, 1, 1, 1], cut)
         x = boxes[free, 1, 1, 1]
-        if len(x) < max(ENOUGH, ring.sum() / 2) or np.quantile(np.abs(x), 0.5) < NOTHING * largest:
+        if len(x) < max(ENOUGH, ring.sum() / 2) or np.median(np.abs(x)) < NOTHING * largest:
             continue
-        typical = float(np.quantile(np.abs(x), 0.5))
+        typical = float(np.median(np.abs(x)))
         alike = np.abs(np.abs(x) - typical) <= 0.01 * typical
         shape = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
         bits = np.packbits(signs[free].reshape(-1, 27), axis=1)
@@ -280,7 +280,7 @@ def _last_digit(look: Look) -> float:
     largest = max(abs(look.low), abs(look.high))
     values = (look.boxes[:, 2, 2, 2] / largest).astype(np.float32)
     values = np.unique(values[np.isfinite(values)])
-    return float(np.quantile(np.diff(values), 0.5)) * largest if len(values) > 1 else 0.0
+    return float(np.median(np.diff(values))) * largest if len(values) > 1 else 0.0
 
 
 def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> Any:
@@ -298,7 +298,7 @@ def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> An
     slope = np.sort(np.sqrt((gradients**2).sum(1)))
     third = max(len(slope) // 3, 1)  # the narrowest range that holds a third of them
     at = int(np.argmin(slope[third:] / slope[:-third]))
-    facts["unit"] = unit = float(np.quantile(slope[at : at + third + 1], 0.5))
+    facts["unit"] = unit = float(np.median(slope[at : at + third + 1]))
     facts["error"] = SAME_UNIT if fourth >= ENOUGH else 3 * SAME_UNIT
     error = EXACT + min(facts["digit"] / unit / h, MOST_DIGIT) / 2
     facts["slopes"] = float((np.abs(slope / unit - 1) < error).mean())
@@ -336,7 +336,7 @@ def _by_axis(gradients: Floats) -> Floats:
         if (square <= 0).any():
             return np.full(3, np.nan)
         off = np.abs(np.sqrt(gradients**2 @ square) - 1)
-        keep = off <= max(2 * np.quantile(off, 0.5), 1e-6)
+        keep = off <= max(2 * np.median(off), 1e-6)
     return np.asarray(1 / np.sqrt(square))
 
 
@@ -425,7 +425,7 @@ def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
         said = "only samples on the border of the grid are near 0, so no surface lies in it"
         return Answer("distance", "", facts, said)
     walls = walls[walls > -0.25]
-    if len(walls) and np.quantile(walls, 0.5) > THICK:
+    if len(walls) and np.median(walls) > THICK:
         return Answer("distance", "", facts)
     return _unsigned(sign, float(steps.max()), facts)
 
@@ -471,7 +471,7 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
     middle = middle[np.isfinite(middle)]
     if len(middle) >= ENOUGH:
         size, (one, other) = np.abs(middle), look.pairs
-        facts["centred"] = float(np.quantile(size, 0.5) / np.quantile(size, 0.995))
+        facts["centred"] = float(np.median(size) / np.quantile(size, 0.995))
         at_0, best = (((one > x) != (other > x)).sum() for x in (0.0, _parting(middle)))
         facts["area"] = float(at_0 / max(best, 1))
         if facts["centred"] < CENTRED and facts["area"] > AREA:
@@ -505,7 +505,7 @@ def _is_noise(look: Look, steps: Floats, facts: dict[str, Any]) -> bool:
     # a quarter of the differences of normal noise is below .3186 sqrt(70) of its deviation
     quarter = float(np.quantile(fourth, 0.25))
     facts["noise"] = noise = quarter / 0.3186 / 70**0.5 / float(steps.max())
-    if quarter < SPREAD * np.quantile(fourth, 0.5):
+    if quarter < SPREAD * np.median(fourth):
         return False
     without, allowed = (_contradictions(look, steps, facts["digit"], x) for x in (0.0, noise))
     return without > CONTRADICTIONS and allowed <= NOISE
@@ -519,7 +519,7 @@ def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
     share = np.count_nonzero(~np.isnan(look.part)) / np.prod(look.shape)
     found = _valleys(look, steep, sign)[0] / share / float(np.prod(look.shape)) ** (2 / 3)
     # steps between plateaus, with noise on them, make valleys, too
-    facts["rising"] = float(np.quantile(change, 0.5)) / steep
+    facts["rising"] = float(np.median(change)) / steep
     is_unsigned = (look.low if sign > 0 else look.high) not in facts["cut"]
     if is_unsigned and facts["rising"] > RISING and VALLEY[0] < found < VALLEY[1]:
         return _unsigned(sign, steep, facts)
