@@ -240,7 +240,7 @@ PARTS = ("a box", "cut off at 1", "noise", "a smooth union", "truth", "transform
 @pytest.mark.parametrize("name", PARTS)
 @pytest.mark.parametrize("whole", [0, 1 << 30])
 def test_planes_and_parts_are_taken_as_the_whole_array_is(name, whole, monkeypatch):
-    monkeypatch.setattr(look, "WHOLE", whole)
+    monkeypatch.setattr(look, "SMALL_GRID", whole)
     values, kind = KINDS[name]
     want, grid = (make_grid(array, **PLACE) for array in (values, Stored(values)))
     assert grid.field.kind == kind and grid.notes == want.notes

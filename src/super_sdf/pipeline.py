@@ -1,4 +1,4 @@
-"""The method on a page: the paper's Section 4, one named step per line of ``refine_band``.
+"""The method on a page: Section 4 of "SUPER-SDF", the paper, one named step a line.
 
     grid -> cubic lattice -> band -> patches and neighbour table -> network -> averaged shared nodes
          -> surface moved to touch the samples' spheres -> values kept within the samples' bounds
@@ -303,11 +303,13 @@ def mesh_grid(
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
+    # of voxels that are refined in one piece: none, if the grid is to be cut in any case
     most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
     bands = [survey(lattice, chosen.offset, threads=threads, most=most)]
     steps.finish("band")
     whole = bands[0].whole
     if whole.count <= most:
+        # popped, so that nothing here keeps the band in memory
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:
         raise OutOfMemoryError(

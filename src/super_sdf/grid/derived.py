@@ -26,10 +26,12 @@ from ..arrays import BoolArray, FloatArray, IntArray, Triple
 from .look import Extremes, Floats
 from .samples import MadePlanes, SampleArray, SamplePlanes, in_spacings, over_three
 
-REACH = 4  # voxels; patches are clipped to 3 (``steps.band.PATCH_LIMIT``), and half of one goes off
+REACH = (
+    4  # voxels; patches are clipped to 3 (``refine.band.PATCH_LIMIT``), and half of one goes off
+)
 
 FEET_REACH = 3  # samples from one up to which others are filled in with the help of its foot
-FAR = 2.6  # voxels: the distance of a sample without a foot point near it
+NO_FOOT = 2.6  # voxels: the distance of a sample without a foot point near it
 LEAST_SLOPE = 0.3  # of a sample whose foot point is used
 DISC = 0.2  # voxels
 ROUNDS = 2
@@ -123,7 +125,7 @@ def fill_in(values: FloatArray, low: float, high: float, steps: Floats) -> Float
 
     cut = (values <= low * WITHIN) | (values >= high * WITHIN)
     known, missing = (np.argwhere(x).astype(np.int32) for x in (~cut, cut))
-    distances, signed, far = values[~cut], values[cut], FAR * float(steps.max())
+    distances, signed, far = values[~cut], values[cut], NO_FOOT * float(steps.max())
     least = np.where(signed > 0, high, -low)
     hidden = cut
     for _ in range(ROUNDS):

@@ -81,8 +81,7 @@ class Case:
     notes: list[str]
     known: Known | None = None
 
-    @property
-    def positive_inside(self) -> bool:
+    def choose_side(self) -> bool:
         """Whether values are positive inside; unless it is said, the border is outside."""
         if self.wanted.inside != AUTO:
             return self.wanted.inside == "positive"
@@ -114,7 +113,7 @@ class Case:
         if self.known is not None and self.known.unseen is not None:
             field = replace(field, unseen=self.known.unseen, why_open=self.known.why_open)
         if "positive_inside" not in more:
-            more["positive_inside"] = self.positive_inside
+            more["positive_inside"] = self.choose_side()
         kept = {"values": self.samples, "extremes": (self.look.low, self.look.high)}
         return {**kept, **more, "spacing": spacing, "field": field, "notes": tuple(self.notes)}
 
@@ -372,7 +371,7 @@ def _of_distances(case: Case, facts: dict[str, Any]) -> dict[str, Any]:
     if case.known is not None:  # unknown samples are taken as cut off
         cut = [look.low, look.high]
     assert spacing is not None
-    positive = case.positive_inside
+    positive = case.choose_side()
     low = look.low if look.low in cut and look.low < 0 else -np.inf
     high = look.high if look.high in cut and look.high > 0 else np.inf
     exact = (-high, -low) if positive else (low, high)

@@ -21,12 +21,12 @@ Floats: TypeAlias = NDArray[np.float64]
 Extremes: TypeAlias = tuple[float, float]
 """The smallest and the largest sample."""
 
-WHOLE = 1 << 18  # samples of a grid that is a part as it is
+SMALL_GRID = 1 << 18  # samples of a grid that is a part as it is
 SLABS, CLOSER = (4, 8), 1 << 20  # how many planes, least and most; samples of all of them, about
 BOXES, LINES, PAIRS = 3000, 8000, 5300  # that are kept
 FREQUENT = 0.01  # share of the samples, amid equal ones, that have one value
 MOST_LABELS = 1000  # different values that are listed
-ENOUGH = 30  # samples that tell a slope
+TELLING = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
 AS_GOOD = 0.9  # of the largest mean step of neighbours over a level
 GROWS = 2.0  # times the share of all samples, that of the border above a level of unsigned values
@@ -38,7 +38,7 @@ GOLDEN = 0.6180339887  # its multiples, less whole numbers, are spread evenly fr
 
 AXES = np.array([[0, 0, 0], *np.kron(np.eye(3, dtype=int), [[-2], [-1], [1], [2]])])
 ON_LINES = np.array([[1, 2, 0, 3, 4], [5, 6, 0, 7, 8], [9, 10, 0, 11, 12]])
-FACES = np.array([(1, 2, 2), (3, 2, 2), (2, 1, 2), (2, 3, 2), (2, 2, 1), (2, 2, 3)])
+FACES_OF_5 = np.array([(1, 2, 2), (3, 2, 2), (2, 1, 2), (2, 3, 2), (2, 2, 1), (2, 2, 3)])
 BOX = np.indices((5, 5, 5)).reshape(3, -1).T - 2
 
 
@@ -75,7 +75,7 @@ class Look:
     def without(self, value: float) -> Look:
         """Return the same with the kept samples of a value unknown."""
         boxes, lines = (np.where(x == value, np.nan, x) for x in (self.boxes, self.lines))
-        sides = np.sign(boxes[(slice(None), *FACES.T)]) * np.sign(boxes[:, 2, 2, 2])[:, None]
+        sides = np.sign(boxes[(slice(None), *FACES_OF_5.T)]) * np.sign(boxes[:, 2, 2, 2])[:, None]
         pairs = self.pairs[:, (self.pairs != value).all(0)]
         return replace(self, boxes=boxes[(sides < 0).any(1)], lines=lines, pairs=pairs)
 
@@ -122,7 +122,7 @@ def _part_of(samples: SampleArray, changes: NDArray[np.int64]) -> tuple[NDArray[
     count, plane = len(samples), int(np.prod(samples.shape[1:]))
     small = samples.dtype in (np.float16, np.float32) or samples.dtype.itemsize < 3
     kind = np.float32 if small else np.float64
-    if count * plane <= WHOLE:
+    if count * plane <= SMALL_GRID:
         return np.asarray(samples[:], kind), np.ones(count, bool)
     half = int(np.clip(CLOSER // plane, *SLABS)) // 2
     total = np.cumsum(changes)
@@ -221,7 +221,7 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
     rise = np.diff(lines) / steps[:, None]
     mean = np.sqrt((rise.mean(2) ** 2).sum(1))
     known = np.isfinite(mean) & (mean > 0)
-    if known.sum() >= max(ENOUGH, len(lines) / 2) or not len(cut):
+    if known.sum() >= max(TELLING, len(lines) / 2) or not len(cut):
         return float(np.median(mean[known])) if known.any() else float("nan")
     steep = np.nan_to_num(np.abs(rise)).max(2)
     length = np.sqrt((steep**2).sum(1))[(steep > 0).all(1)]

@@ -41,7 +41,7 @@ from .samples import SampleArray, over_three
 PLATEAUS = 0.45  # whole images and integer distances to .43, labels from .55
 BY_RANK = 0.99  # integer distances 1, labels to .97, but where one is in the other
 AMID = 0.1  # of these the share that equal all 6: distances 0, labels inside others .3 and more
-WHOLE, FACTOR = 1e-3, 0.05
+NEARLY, FACTOR = 1e-3, 0.05
 FEW_LABELS = 8  # different values: rounded distances and images from 11, lesions and organs to 8
 # 3. Transforms: share of the samples beside the surface that equal others with the same 27 signs.
 # Values that do not jump over 0 need the steps of a mask: a share of these samples with other sides
@@ -61,7 +61,7 @@ MIXED = 0.05  # cut off 0, where it is also the cut-off value from .09
 # beside the surface that differ from two others by more than they are apart.
 SLOPES = 0.95  # exact from .98; smooth unions to .83, saturating to .36, noise of .05 to .66
 CONTRADICTIONS = 0.003  # exact and cut off 0; noise of .05 voxel from .009; other slopes .02
-STRAIGHT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
+BENT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
 EXACT = 0.02  # spacings, and share of a slope: the error of differences of exact distances
 SAME_UNIT = 0.01  # from 1: exact to .002; saturating and smooth unions from .019
 ANOTHER_UNIT = 0.03  # from 1: up to this, values are divided by their slope, with a note
@@ -92,14 +92,18 @@ RISING = 0.1  # of steps between neighbours, median over steepest: images to .03
 VALLEY = 0.2, 1.5  # unsigned distances .3 to .6; densities .05, noise 3
 ENOUGH = 20  # samples from which a share is evidence
 
-FACES = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
+CENTRE_OF_5 = 62  # of the samples in a box of 5 x 5 x 5
+FACES_OF_3 = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
 LENGTHS = BOX.astype(np.float64)
 TRANSFORM = "a distance transform, so only their sign says something"
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """One of six kinds, what decided, what was measured, and why it cannot be meshed, if so."""
+    """One of six kinds, what decided, what was measured, and why it cannot be meshed, if so.
+
+    Of labels and densities the user has to choose some, so they are no kinds of ``--field``.
+    """
 
     kind: str
     why: str = ""
@@ -177,13 +181,13 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
 
 def _are_whole(values: Floats) -> bool:
     """Return whether all values but 0 are whole numbers, times one factor near 1."""
-    some = values[np.abs(values) > WHOLE]
+    some = values[np.abs(values) > NEARLY]
     if not len(some) or np.abs(some).max() < 1 - FACTOR:
         return False
     least = np.abs(some).min()
     factor = least / max(np.rint(least), 1)
     some = some / factor
-    off = np.abs(some - np.rint(some)) <= np.maximum(WHOLE, 1e-9 * np.abs(some))
+    off = np.abs(some - np.rint(some)) <= np.maximum(NEARLY, 1e-9 * np.abs(some))
     return bool(abs(factor - 1) <= FACTOR and off.all())
 
 
@@ -200,7 +204,7 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
     cut = [x for x in facts["cut"] if x]
     whole = np.isfinite(boxes).all((1, 2, 3)) & (boxes[:, 1, 1, 1] != 0)
     for signs in (boxes > 0, boxes >= 0):  # 0 may be on either side
-        along = (signs != signs[:, 1:2, 1:2, 1:2])[(slice(None), *FACES[fine].T)]
+        along = (signs != signs[:, 1:2, 1:2, 1:2])[(slice(None), *FACES_OF_3[fine].T)]
         ring = whole & along.any(1)
         free = ring & ~np.isin(boxes[:, 1, 1, 1], cut)
         x = boxes[free, 1, 1, 1]
@@ -323,8 +327,8 @@ def _smooth_gradients(lines: Floats) -> tuple[Floats, int]:
     rough = np.abs(e - 4 * d + 6 * c - 4 * b + a).sum(1)
     kink = np.abs(e - 2 * d + 2 * b - a).max(1) / 2 if len(lines) else rough
     size, other = np.sqrt((fourth**2).sum(1)), np.sqrt((second**2).sum(1))
-    smooth = (rough < STRAIGHT * size) & (kink < 2 * STRAIGHT * size)
-    flat = np.isnan(size) & (bend < STRAIGHT * other)
+    smooth = (rough < BENT * size) & (kink < 2 * BENT * size)
+    flat = np.isnan(size) & (bend < BENT * other)
     return np.concatenate([fourth[smooth], second[flat]]), int(smooth.sum())
 
 
@@ -348,7 +352,7 @@ def _contradictions(look: Look, steps: Floats, digit: float, noise: float = 0.0)
     boxes = look.boxes.reshape(len(look.boxes), -1) / h
     apart = np.sqrt(((LENGTHS * steps / h) ** 2).sum(1))
     allowed = max(EXACT, min(digit / h, MOST_DIGIT), NOISES * noise)
-    beyond = np.abs(boxes - boxes[:, 62:63]) > apart + allowed
+    beyond = np.abs(boxes - boxes[:, CENTRE_OF_5, None]) > apart + allowed
     beyond &= np.abs(boxes) < MATTERS
     return float((np.count_nonzero(beyond, axis=1) >= 2).mean())
 
@@ -395,6 +399,7 @@ def _valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
         v = np.moveaxis(values, axis, 0)
         changes += int(np.count_nonzero((v[1:] > 0) & (v[:-1] <= 0) | (v[1:] <= 0) & (v[:-1] > 0)))
         before, x, after = v[:-2], v[1:-1], v[2:]
+        # distances fall to half a step at most, and rise by nearly one on either side
         low = (x >= 0) & (x < 0.52) & (before > x) & ((after > x) | ((after == x) & (x > 0.25)))
         count += int(np.count_nonzero(low & (before + after - 2 * x > 0.9)))
     return count, changes
@@ -410,7 +415,7 @@ def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
     nearest = look.low if sign > 0 else look.high
     if nearest in facts["cut"]:
         return Answer("density", "", facts, which_level(look))
-    if abs(nearest) > 1.05 / 2 * float(np.sqrt((steps**2).sum())):
+    if abs(nearest) > 1.05 / 2 * float(np.sqrt((steps**2).sum())):  # half a diagonal
         said = "every wall is nearer to some sample than that, so there is no surface"
         return Answer("distance", "", facts, said)
     thickness = []
