@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 from ..arrays import Triple
 from ..errors import GridError
 from ..options import AUTO, DISTANCE, MASK, NOISY, SMOOTH, Options
-from . import derived
 from .look import Extremes, Floats, Look, border_share, look_at, named, typical_slope, which_level
 from .recognise import Answer, cut_values, recognise
 from .samples import (
@@ -29,7 +28,9 @@ from .samples import (
     is_cubic,
     steps_of,
 )
-from .unknown import Known, check_infinite, with_known
+
+if TYPE_CHECKING:
+    from .unknown import Known
 
 INNER = 0.25  # spacings: as deep at least samples inside are, where parts of a solid touch
 NONE_EXACT: Extremes = (0.0, 0.0)
@@ -154,6 +155,8 @@ def interpret(
     if not ORDINARY[0] < (largest := max(abs(look.low), abs(look.high))) < ORDINARY[1]:
         raise GridError(f"the largest value is {largest:.6g}: multiply the values, --scale")
     if look.infinite:
+        from .unknown import check_infinite  # imported where they are needed, as few are
+
         check_infinite(samples)
     if wanted.level is not None:
         return _of_level(case, given)
@@ -222,6 +225,8 @@ def _as_recognised(case: Case, answer: Answer, given: SampleArray) -> dict[str, 
 
 def _with_known(case: Case, values: Sequence[float] = ()) -> Case:
     """Return samples of which unknown ones are filled in."""
+    from .unknown import with_known
+
     known = with_known(case.samples, case.look, values, case.notes)
     look = replace(look_at(known.samples), low=known.extremes[0], high=known.extremes[1])
     return replace(case, samples=known.samples, look=look, known=known)
@@ -283,6 +288,8 @@ def _of_sides(case: Case, facts: dict[str, Any], given: SampleArray) -> dict[str
 
 def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None) -> dict[str, Any]:
     """Return the distances of the samples that are true to those that are not, on the lattice."""
+    from .derived import extremes_of_masks, mask_planes
+
     positive = case.wanted.inside == "positive"
     if case.wanted.inside == AUTO:  # the border is outside
         above = float(look_at(mask).faces.mean())
@@ -299,8 +306,8 @@ def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None)
         "values taken as a mask (--field mask): they show the surface to half a voxel only"
     )
     h = min(steps_of(spacing))
-    more = {"extremes": derived.extremes_of_masks(h), "positive_inside": False}
-    values = derived.mask_planes(mask, h)
+    more = {"extremes": extremes_of_masks(h), "positive_inside": False}
+    values = mask_planes(mask, h)
     return case.taken(spacing, mask_field(spacing), facts or {}, values=values, **more)
 
 
@@ -349,8 +356,10 @@ def _of_spline(
     extremes = case.look.low / slope, case.look.high / slope
     values: SampleArray = changed(case.samples, lambda planes: planes / slope)
     if "inside" in facts:
+        from .derived import without_inner_faces
+
         deep = INNER * min(steps_of(spacing))
-        values = derived.without_inner_faces(values, facts["inside"], deep)
+        values = without_inner_faces(values, facts["inside"], deep)
     return case.taken(spacing, own, facts, values=values, extremes=extremes)
 
 
@@ -384,7 +393,9 @@ def _of_distances(case: Case, facts: dict[str, Any]) -> dict[str, Any]:
         cubic = is_cubic(spacing)
         own = Field(exact=exact if cubic else NONE_EXACT, network=None, own_lattice=not cubic)
     elif at < FILLED:
-        values = derived.filled_planes(values, steps, (look.low, look.high))
+        from .derived import filled_planes
+
+        values = filled_planes(values, steps, (look.low, look.high))
     return case.taken(spacing, own, facts, values=values, positive_inside=positive)
 
 

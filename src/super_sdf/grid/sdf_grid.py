@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
 from ..options import AUTO, DISTANCE, NOISY, FieldKind, Inside, Options
-from .derived import Resampled
 from .interpret import NONE_EXACT, Field, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
 from .samples import (
@@ -425,6 +424,8 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
             "samples beside the surface are unknown, and the spacing differs between axes: mesh "
             "the spline of the values (--field smooth)"
         )
+    from .derived import Resampled  # imported here, as few need it
+
     samples, h = grid.samples, grid.voxel_size
     steps, known = list(grid.spacing), [np.ones(count, bool) for count in grid.shape]
     for axis in np.argsort(grid.spacing, kind="stable").tolist():
