@@ -76,9 +76,10 @@ class Mesh:
         sums = np.zeros(count)
         chunks = chunks_of(len(self.faces), 1)
         for some in chunks:
-            corners = self.faces[some].T
-            sides = np.roll(marks[corners], -1, 0) - np.roll(marks[corners], 1, 0)
-            sums += np.bincount(corners.ravel(), sides.ravel(), count)
+            corners = np.ascontiguousarray(self.faces[some].T)
+            mark = marks[corners]
+            for nth, corner in enumerate(corners):
+                sums += np.bincount(corner, mark[nth - 2] - mark[nth - 1], count)
         loose, edges = sums != 0, [np.empty((0, 2), np.int32)]
         for some in chunks if loose.any() else ():
             ends = np.stack([self.faces[some], np.roll(self.faces[some], -1, 1)], -1)
