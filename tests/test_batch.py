@@ -292,25 +292,6 @@ def test_a_report_of_others_is_left_alone(command, text):
     assert Path("out/report.jsonl").read_bytes() == text and not list(Path("out").glob("*.ply"))
 
 
-def test_lines_of_others_are_passed_over(batch):
-    batch("in/a.npy")
-    report, (row,) = Path("out/report.jsonl"), rows()
-    damaged = [json.dumps({k: row[k] for k in row if k != key}).encode() for key in list(row)[:3]]
-    lines = [b"nonsense", b"[1]", 100_000 * b"[", report.read_bytes().strip(), *damaged]
-    report.write_bytes(b"\n".join(lines) + b"\n")
-    assert batch("in/a.npy")[1]["done_before"] == 1
-
-
-def test_without_room_a_mesh_fails_by_its_name(batch):
-    limit = "import resource as r; r.setrlimit(r.RLIMIT_FSIZE, (4000, 4000)); "
-    run = "from super_sdf.cli.main import main; main()"
-    words = [sys.executable, "-c", limit + run, "batch", "in/a.npy", "--out", "out", *LONE]
-    done = subprocess.run(list(map(str, words)), stderr=subprocess.PIPE, text=True)
-    want = f"Failed: in/a.npy: {Path('out/a.ply')} cannot be written: File too large\n"
-    assert done.returncode == 1 and want in done.stderr and "Traceback" not in done.stderr
-    assert not list(Path("out").rglob("*.p*")) and batch("in/a.npy")[1]["done"] == 1
-
-
 # Processes
 
 
@@ -341,19 +322,6 @@ def test_a_death_is_the_result_of_its_task_alone():
         worked([1, "no network"])
     with pytest.raises(SuperSdfError, match="5 processes in a row ended; the last one ended with"):
         worked(5 * ["ended"], 1)
-
-
-def test_a_file_at_which_two_processes_die_is_named(command, monkeypatch):
-    def deaths(take, work, count):
-        while (job := take()) is not None:
-            yield job, Death("was killed") if job.source.name == "a.npy" else work(job)
-
-    monkeypatch.setattr("super_sdf.batch.run.work_in_processes", deaths)
-    monkeypatch.setattr("super_sdf.batch.run.count_cores", lambda: 2)
-    code, _, err = command("batch", "in", "--out", "out", *SMALL, "--jobs", 2)
-    reason = "the process that converted it was killed, twice"
-    assert code == 1 and f"Failed: in/a.npy: {reason}\n" in err
-    assert [row["out"] for row in rows()][-1] == "a.ply" and len(rows()) == 4  # the others first
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
@@ -495,16 +463,3 @@ def test_formats_with_parts_listed_labels_and_names_in_lists(cases, command):
     Path("list.jsonl").write_text('{"in": "cases/0.npz", "labels": ["lung"]}')
     code, _, err = command(*words, "--out", "new")
     assert code == 2 and "labels has 'lung': give numbers, or names of" in err
-
-
-@pytest.mark.parametrize("force", [(), ("--force",)])
-def test_two_inputs_that_make_the_same_file_are_not_lost(cases, command, force):
-    lines = (
-        {"in": "cases/0.npz", "out": "a-1.stl", "label": 1},
-        {"in": "cases/1.npz", "out": "a.stl", "labels": "all"},
-    )
-    Path("list.jsonl").write_text("\n".join(map(json.dumps, lines)))
-    run = "batch", "list.jsonl", "--out", "out", *FAST, "--factor", 2, "--jobs", 1
-    code, _, err = command(*run, *force)
-    assert code == 1 and "1 done, 1 failed" in err
-    assert "was written while this batch ran: give its inputs other names (out)" in err

@@ -196,10 +196,6 @@ def test_labels_without_a_choice_are_refused(name, spacing):
     assert re.search(r"choose one with label=\d+, or mesh all with labels='all'$", said)
 
 
-def test_the_named_label_is_one_of_64_bits():
-    assert f"label={2**60 + 1}," in refusal(GridError, make_grid, LABELS["of 64 bits"])
-
-
 def pieces(mesh) -> list:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).split(only_watertight=False)
 

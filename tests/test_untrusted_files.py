@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
-import trimesh
 from conftest import refusal
 from placed import CUBES, sampled, save
 
@@ -235,13 +234,6 @@ def test_what_is_no_regular_file_is_named_as_grid_and_as_mesh(name):
     if name in ("folder.npy", "pipe.npy", "zero.npy", "loop.npy", "dangling.npy"):
         Path("a.ply").symlink_to(name)
         assert refusal(FileError, read_mesh, "a.ply") == f"a.ply {WHAT_IS_WRONG[name]}"
-
-
-def test_a_mesh_that_names_a_pipe_is_read_without_it():
-    os.mkfifo("pipe.mtl")
-    box = trimesh.creation.box().export(file_type="obj")
-    write("cube.obj", f"mtllib pipe.mtl\nusemtl red\n{box}")
-    assert len(read_mesh("cube.obj").faces) == 12
 
 
 # Where ITK places a MetaImage
