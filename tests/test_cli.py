@@ -147,7 +147,7 @@ OWN_INPUTS = {
 def test_no_command_writes_over_its_own_input(here, command, words):
     trimesh.creation.icosphere(2, 3).export("ball.ply")
     source, target = OWN_INPUTS[words]
-    os.link(source, target)
+    (os.symlink if source == "ball.ply" else os.link)(source, target)
     before, names = Path(source).read_bytes(), sorted(os.listdir())
     want = f"Error: {target} is the same file as {source}: give another file\n"
     assert command(*words.split(), "--force") == (1, "", want)

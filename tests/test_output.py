@@ -10,7 +10,7 @@ import pytest
 from conftest import refusal
 
 from super_sdf.errors import WriteError
-from super_sdf.files.output import check_apart, check_free, replacing
+from super_sdf.files.output import check_free, replacing
 
 pytestmark = pytest.mark.usefixtures("folder")
 
@@ -63,18 +63,6 @@ def test_a_file_that_is_replaced_keeps_its_mode_and_a_protected_one_stays(name):
         make(name, force=True, meanwhile=lambda: os.chmod(name, 0o444))
     assert "is write-protected" in why(name, force=True)  # also for root
     assert Path(name).read_text() == "old" and os.listdir() == [name]
-
-
-def test_a_file_is_apart_from_another_only_if_it_is_another():
-    Path("grid.npy").write_text("grid")
-    os.symlink("grid.npy", "soft.ply")
-    os.link("grid.npy", "hard.ply")
-    Path("own.ply").write_text("grid")
-    check_apart("own.ply", ["grid.npy", "none.npy"])
-    check_apart("none.npy", ["none.npy"])
-    for name in ("soft.ply", "hard.ply", "../" + Path.cwd().name + "/grid.npy"):
-        said = refusal(WriteError, check_apart, name, ["own.ply", "grid.npy"])
-        assert said == f"{name} is the same file as grid.npy: give another file"
 
 
 def test_places_where_no_file_can_be_are_named():

@@ -65,11 +65,3 @@ def test_a_package_without_networks_or_that_for_masks_says_so(models, command, t
     code, out, err = command("info", "--device", "cpu")
     assert (code, err) == (1, "") and f"failed   networks: {MISSING}\n" in out
     assert command(*words) == (1, "", f"Error: the network 'base' is missing: {MISSING}\n")
-
-
-def test_a_network_file_that_cannot_be_read_is_a_line_and_the_others_are_checked(models, command):
-    (models / "base.onnx").write_bytes(b"text")
-    fault = f"{models / 'base.onnx'} is no ONNX file that onnxruntime can run: "
-    code, out, err = command("info", "--check", "--device", "cpu")
-    assert (code, err) == (1, "") and f"\nfailed   network base on cpu: {fault}" in out
-    assert "\nok       network fast on cpu: " in out
