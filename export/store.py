@@ -16,7 +16,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from export.augment import DISTANCES, USUAL, Prepared, Shares, change, turned
+from export.augment import CLEAN, DISTANCES, USUAL, Prepared, Shares, change, turned
 from export.dataset import Sample, read_shard
 from export.losses import Batch, Recipe, batch_of
 from super_sdf.errors import FileError
@@ -82,7 +82,7 @@ def held_out(folder: Path, inputs: str, count: int, kind: str = "shard") -> list
     """Return the samples of the first shards, masks or unchanged; masks are always the same."""
     samples = [s for path in shards_of(folder, kind)[:count] for s in read_shard(path)]
     rngs = (np.random.default_rng(len(sample.voxel_ijk)) for sample in samples)
-    kept = [change(rng, sample, inputs, Shares(0, 0, 0)) for rng, sample in zip(rngs, samples)]
+    kept = [change(rng, sample, inputs, CLEAN) for rng, sample in zip(rngs, samples)]
     return [sample for sample in kept if len(sample.voxels)]
 
 

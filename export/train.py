@@ -120,17 +120,13 @@ class Run:
         for optimiser in self.optimisers:
             optimiser.step()
         self.step += 1
-        self.update_average()
-        return float(total.detach()), losses.tolist()
-
-    def update_average(self) -> None:
-        """Move the averaged weights towards the current ones."""
         decay = min(self.recipe.average_decay, self.step / (self.step + 9))
         average, now = list(self.average.parameters()), list(self.net.parameters())
         with torch.no_grad():
             torch._foreach_lerp_(average, now, 1 - decay)
         for kept, buffer in zip(self.average.buffers(), self.net.buffers()):
             kept.copy_(buffer)
+        return float(total.detach()), losses.tolist()
 
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:

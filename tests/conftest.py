@@ -12,7 +12,7 @@ import pytest
 from batches import FAST, PLAIN
 from hypothesis import HealthCheck, settings
 
-from super_sdf import Mesh, SdfGrid
+from super_sdf import Mesh, SdfGrid, load_network
 from super_sdf.arrays import NEIGHBOURHOOD
 from super_sdf.network import onnx
 from super_sdf.network.onnx import ort
@@ -77,6 +77,12 @@ def count_fans(faces: np.ndarray) -> np.ndarray:
     _, fan = connected_components(graph, directed=False)
     _, first = np.unique(fan, return_index=True)
     return np.bincount(keys[first] // size)[np.unique(faces)]
+
+
+@pytest.fixture(scope="session")
+def fast():
+    """Return the smallest network, on one thread."""
+    return load_network("fast", threads=1)
 
 
 @pytest.fixture

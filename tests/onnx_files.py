@@ -61,23 +61,18 @@ def declared(number: int, name: str, kind: int, *shape: int | str) -> bytes:
     return entry(number, entry(1, name) + entry(2, entry(1, entry(1, kind) + entry(2, sizes))))
 
 
-def metadata(values: Mapping[str, str]) -> bytes:
-    """Write metadata; appended to a file it replaces what the file says under the same names."""
-    return b"".join(entry(14, entry(1, key) + entry(2, text)) for key, text in values.items())
-
-
 def write_network(
     path: Path,
     last: tuple[tuple[str, tuple[str, ...], str, Mapping[str, object]], ...] = SAME,
     card: Mapping[str, str] | None = None,
-    inputs: Mapping[str, tuple[int | str, ...]] = INPUTS,
     output: tuple[int | str, ...] = (FLOAT, "D", "Q"),
 ) -> Path:
     """Write a network that makes "values" of "sum", the mean of the patch plus the offset's."""
     graph = b"".join(node(*step) for step in (*MEAN, *last)) + entry(2, "network")
-    graph += b"".join(declared(11, name, *kind) for name, kind in inputs.items())
+    graph += b"".join(declared(11, name, *kind) for name, kind in INPUTS.items())
     graph += declared(12, "values", *output)
     card = {"format_version": "1", "receptive_field": "1"} if card is None else card
-    model = entry(1, 8) + entry(8, entry(1, "") + entry(2, 13)) + entry(7, graph) + metadata(card)
+    about = b"".join(entry(14, entry(1, key) + entry(2, text)) for key, text in card.items())
+    model = entry(1, 8) + entry(8, entry(1, "") + entry(2, 13)) + entry(7, graph) + about
     path.write_bytes(model)
     return path

@@ -171,13 +171,18 @@ def save_slices(path: str, images: list[pydicom.Dataset], start: str = "IM") -> 
     """Write images to a folder, in names that are not in their order."""
     os.makedirs(path, exist_ok=True)
     for number, image in enumerate(images):
-        image.file_meta = pydicom.dataset.FileMetaDataset()
-        image.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-        image.SOPClassUID = image.file_meta.MediaStorageSOPClassUID = CTImageStorage
-        uid = generate_uid(entropy_srcs=[start, str(number)])
-        image.SOPInstanceUID = image.file_meta.MediaStorageSOPInstanceUID = uid
-        name = f"{path}/{start}{number * 7 % 31:03d}"
-        pydicom.dcmwrite(name, image, enforce_file_format=True)
+        image.SOPClassUID = CTImageStorage
+        image.SOPInstanceUID = generate_uid(entropy_srcs=[start, str(number)])
+        write_image(f"{path}/{start}{number * 7 % 31:03d}", image)
+
+
+def write_image(path: str, image: pydicom.Dataset) -> None:
+    """Write an image, behind what a file begins with."""
+    image.file_meta = pydicom.dataset.FileMetaDataset()
+    image.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID
+    image.file_meta.MediaStorageSOPInstanceUID = image.SOPInstanceUID
+    pydicom.dcmwrite(path, image, enforce_file_format=True)
 
 
 def save_dicom(path: str, affine: np.ndarray) -> None:

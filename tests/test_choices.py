@@ -9,7 +9,6 @@ import h5py
 import nibabel
 import nrrd
 import numpy as np
-import pydicom
 import pytest
 import pyvista
 import tifffile
@@ -17,8 +16,7 @@ import trimesh
 import xarray
 import zarr
 from conftest import refusal
-from placed import holding
-from pydicom.uid import ExplicitVRLittleEndian
+from placed import holding, write_image
 
 from super_sdf import read_grid
 from super_sdf.errors import GridError, SuperSdfError
@@ -48,29 +46,20 @@ def save_segments(
     """Write frames, each a segment's number, its height and its mask, along x = -y, y = x."""
     of_frames = [
         holding(
-            pydicom.Dataset(),
-            SegmentIdentificationSequence=holding(
-                pydicom.Dataset(), ReferencedSegmentNumber=number
-            ),
+            SegmentIdentificationSequence=holding(ReferencedSegmentNumber=number),
             PlanePositionSequence=holding(ImagePositionPatient=[1, 2, height]),
         )
         for number, height, _ in frames
     ]
     shared = holding(
-        pydicom.Dataset(),
-        PlaneOrientationSequence=holding(
-            pydicom.Dataset(), ImageOrientationPatient=[0, 1, 0, -1, 0, 0]
-        ),
-        PixelMeasuresSequence=holding(
-            pydicom.Dataset(), PixelSpacing=[0.5, 0.25], SpacingBetweenSlices=2
-        ),
+        PlaneOrientationSequence=holding(ImageOrientationPatient=[0, 1, 0, -1, 0, 0]),
+        PixelMeasuresSequence=holding(PixelSpacing=[0.5, 0.25], SpacingBetweenSlices=2),
     )
     masks = np.array([mask for *_, mask in frames])
     is_packed = masks.dtype == bool
     bits = 1 if is_packed else 8
     pixels = np.packbits(masks, bitorder="little") if is_packed else masks
     image = holding(
-        pydicom.Dataset(),
         SOPClassUID="1.2.840.10008.5.1.4.1.1.66.4",
         SOPInstanceUID="1.2.3.4",
         SeriesInstanceUID="1.2.3",
@@ -87,14 +76,8 @@ def save_segments(
         holding(SegmentNumber=n, SegmentLabel=label) for n, label in enumerate(labels, 1)
     ]
     image.PerFrameFunctionalGroupsSequence = of_frames
-    for name, value in about.items():
-        setattr(image, name, value)
-    image.file_meta = pydicom.dataset.FileMetaDataset()
-    image.file_meta.TransferSyntaxUID = ExplicitVRLittleEndian
-    image.file_meta.MediaStorageSOPClassUID = image.SOPClassUID
-    image.file_meta.MediaStorageSOPInstanceUID = image.SOPInstanceUID
     Path(path).parent.mkdir(exist_ok=True)
-    pydicom.dcmwrite(path, image, enforce_file_format=True)
+    write_image(path, holding(image, **about))
 
 
 def mask(seed: int) -> np.ndarray:

@@ -7,18 +7,15 @@ import sys
 import zipfile
 from pathlib import Path
 
-import click
 import numpy as np
 import pytest
 import trimesh
 from conftest import ball
 
 import super_sdf
-from super_sdf import write_mesh
-from super_sdf.cli import main as cli
 from super_sdf.files.formats import GRID_SUFFIXES
 from super_sdf.files.meshes import MESH_SUFFIXES
-from super_sdf.options import MESH_FORMATS, OPTIONS, Options
+from super_sdf.options import Options
 
 
 @pytest.fixture
@@ -83,22 +80,6 @@ def test_version_help_info_and_usage_errors(command):
     assert command("upsample")[0] == 2
     code, out, err = command("nonsense")
     assert (code, out) == (2, "") and err.startswith("Error: No such command 'nonsense'")
-
-
-def test_every_option_of_the_table_is_one_of_upsample_under_its_heading(command):
-    for name in cli.COMMANDS:
-        options = cli.cli.get_command(None, name).params
-        assert all(one.help for one in options if isinstance(one, click.Option)), name
-    upsample = cli.cli.get_command(None, "upsample")
-    taken = {parameter.name: parameter for parameter in upsample.params}
-    assert all(taken[name].default == OPTIONS[name].default for name in OPTIONS)
-    text = command("upsample", "--help")[1]
-    for name, row in OPTIONS.items():
-        heading, word = text.index(f"{row.group}:\n"), f"  --{name.replace('_', '-')} "
-        assert heading < text.index(word)
-    assert tuple(f".{name}" for name in MESH_FORMATS) == MESH_SUFFIXES
-    for text in (upsample.help, write_mesh.__doc__):
-        assert all(f" {suffix}" in text for suffix in MESH_SUFFIXES)
 
 
 def bad_files() -> None:
@@ -166,7 +147,7 @@ OWN_INPUTS = {
 def test_no_command_writes_over_its_own_input(here, command, words):
     trimesh.creation.icosphere(2, 3).export("ball.ply")
     source, target = OWN_INPUTS[words]
-    os.link(source, target)
+    (os.symlink if source == "ball.ply" else os.link)(source, target)
     before, names = Path(source).read_bytes(), sorted(os.listdir())
     want = f"Error: {target} is the same file as {source}: give another file\n"
     assert command(*words.split(), "--force") == (1, "", want)

@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import resource
 import signal
 import subprocess
@@ -67,16 +66,6 @@ def test_a_signal_leaves_a_line_its_exit_code_and_no_file(line):
     assert json.loads(out) == {"error": line} and os.listdir() == ["in.npy"]
 
 
-def test_an_ignored_hangup_stays_ignored():
-    script = STAGE.replace("time.sleep(600)", "raise MemoryError").replace(
-        "    print", "    __import__('os').kill(__import__('os').getpid(), 1); print"
-    )
-    words = [sys.executable, "-c", script, *QUICK]
-    before = lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN)  # noqa: E731
-    done = subprocess.run(words, capture_output=True, text=True, preexec_fn=before)
-    assert (done.returncode, done.stderr.count("out of memory")) == (1, 1)
-
-
 def test_with_json_an_error_is_json_on_stdout(command):
     for words, code in (
         (["upsample", "none.npy", "out.ply"], 1),
@@ -86,32 +75,6 @@ def test_with_json_an_error_is_json_on_stdout(command):
     ):
         found, out, err = command(*words, "--json")
         assert found == code and err == f"Error: {json.loads(out)['error']}\n"
-
-
-TABLE = (Path(__file__).parent.parent / "docs" / "reference" / "cli.md").read_text()
-CODES = {
-    0: [QUICK, ["--help"], ["batch", "in.npy", "--out", "a", *QUICK[3:]]],
-    1: [
-        ["upsample", "none.npy", "out.ply"],
-        ["batch", "in.npy", "flat.npy", "--out", "b", *QUICK[3:]],
-        ["check", "cube.ply", "in.npy", "--max-mean", "1e-9", *QUICK[7:]],
-    ],
-    2: [["none"], ["upsample", "in.npy"], ["upsample", "in.npy", "out.ply", "--factor", "3"]],
-}
-
-
-def test_the_table_has_all_exit_codes():
-    rows = re.findall(r"^\| (\d+) \|", TABLE, re.MULTILINE)
-    assert list(map(int, rows)) == sorted([*CODES, 129, 130, 137, 143])
-
-
-@pytest.mark.parametrize(
-    ("code", "words"), [(code, words) for code, runs in CODES.items() for words in runs]
-)
-def test_what_ends_with_a_code_of_the_table(code, words, command):
-    np.save("flat.npy", np.ones((4, 4, 4)))
-    trimesh.creation.box().export("cube.ply")
-    assert command(*words)[0] == code
 
 
 def test_streams_that_are_closed_or_full_cost_no_mesh():

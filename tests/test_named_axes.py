@@ -63,20 +63,11 @@ def test_arrays_of_dask_are_computed_if_they_fit(monkeypatch):
     assert make_grid(sphere("zyx")).shape == SHAPE  # what is in memory already fits
 
 
-def uneven(place: float) -> xarray.DataArray:
-    """Return the sphere with one coordinate moved."""
-    places = sphere().y.values.copy()
-    places[7] = place
-    return sphere().assign_coords(y=places)
-
-
 REFUSED = {
     "coordinates of 'y' are not evenly spaced: 13 is followed by 13.6, a step of 0.6 among steps "
-    "of 0.5; resample the array (array.interp(y=...))": uneven(13.6),
-    "coordinates of 'x' are not evenly spaced: 0 is followed by 0, a step of 0 among steps of 0; "
-    "resample the array (array.interp(x=...))": sphere().assign_coords(x=np.zeros(18)),
-    "coordinates of 'y' are not evenly spaced: 13 is followed by nan, a step of nan among steps "
-    "of 0.5; resample the array (array.interp(y=...))": uneven(np.nan),
+    "of 0.5; resample the array (array.interp(y=...))": (
+        sphere().assign_coords(y=np.where(np.arange(20) == 7, 13.6, sphere().y))
+    ),
     "coordinates of 'z' have dtype datetime64[s]: give numbers, in the unit of the distances": (
         sphere().assign_coords(z=np.arange(22).astype("datetime64[s]"))
     ),
@@ -88,8 +79,6 @@ REFUSED = {
     "only 'x', 'z' has coordinates: give those of all axes, or of none (array.drop_vars(...))": (
         sphere().drop_vars("y")
     ),
-    "values have shape (18, 20): give three axes (x, y, z)": sphere().isel(z=3),
-    "values have shape (18, 20, 1): give at least 2 samples on each axis": sphere().isel(z=[3]),
     "values are a Dataset: give one of its arrays (sdf)": sphere().to_dataset(),
 }
 

@@ -6,6 +6,7 @@ import shutil
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 from threading import Timer
 
 import numpy as np
@@ -15,18 +16,17 @@ from onnx_files import DOUBLE, FLOAT, write_network
 
 from super_sdf import load_network, reconstruct
 from super_sdf.errors import DeviceError, FileError, ModelError, OptionError
-from super_sdf.network.contract import decode
 from super_sdf.network.network import KIND_MODELS, shipped_models
 from super_sdf.options import QUALITIES
 from super_sdf.refine.band import gather_patches, is_active, neighbour_table, rescale
 from super_sdf.refine.nodes import block_offsets
 
 
-def network_inputs(grid):
-    field = rescale(grid)
+def network_inputs(field):
+    """Return what a network is given for a field in half voxels."""
     voxels = np.argwhere(is_active(field)).astype(np.int32)
     rows = np.arange(len(voxels), dtype=np.int32)
-    return gather_patches(field, voxels), neighbour_table(voxels, grid.shape), rows
+    return gather_patches(field, voxels), neighbour_table(voxels, field.shape), rows
 
 
 def test_shipped_networks_are_small_and_fulfil_the_contract():
@@ -43,7 +43,7 @@ def test_shipped_networks_are_small_and_fulfil_the_contract():
 def test_a_prediction_depends_neither_on_threads_nor_on_other_voxels(name, precision, factor):
     """Bit for bit, so that a mesh does not depend on its slabs or on the number of threads."""
     grid = ball(30, 11.0)
-    patches, table, rows = network_inputs(grid)
+    patches, table, rows = network_inputs(rescale(grid))
     voxels, offsets = np.argwhere(is_active(rescale(grid))), block_offsets(factor)
     one, two = (load_network(name, threads=n, precision=precision) for n in (1, 2))
     whole = one(patches, table, rows, offsets)
@@ -59,7 +59,7 @@ def test_a_prediction_depends_neither_on_threads_nor_on_other_voxels(name, preci
 
 
 def test_shipped_networks_run_in_int8_on_the_cpu_and_other_files_as_they_are(tmp_path):
-    given = *network_inputs(ball()), block_offsets(4)
+    given = *network_inputs(rescale(ball())), block_offsets(4)
     for quality in QUALITIES:
         whole, real = (load_network(quality, precision=p) for p in ("auto", "float32"))
         assert (whole.precision, whole.device, real.precision) == ("int8", "cpu", "float32")
@@ -105,22 +105,16 @@ TRANSPOSED = [("Transpose", ("sum",), "values", {})]
 ONE_COLUMN = [("Identity", ("mean",), "values", {})]
 DOUBLES = [("Cast", ("sum",), "values", {"to": DOUBLE})]
 OF_FORMAT = r"is no super-sdf network of format 1 "
-CARDS = {
-    "negative field": ("receptive_field", "-5", r"\(receptive_field -5\)"),
-    "truth": ("receptive_field", "true", r"\(receptive_field True\)"),
-    "no width": ("channels", "0", r"\(channels 0\)"),
-    "digits": ("receptive_field", "7" * 5000, r"\(receptive_field '777"),
-}
 WRONG = {
     "double": (
         {"last": DOUBLES, "output": (DOUBLE, "D", "Q")},
         OF_FORMAT + r".*outputs \{'values': 'tensor\(double\)'\}\)",
     ),
     "no version": ({"card": {}}, OF_FORMAT + r"\(format None, inputs \{'patches'"),
-    **{
-        name: ({"card": {"format_version": "1", key: value}}, OF_FORMAT + message)
-        for name, (key, value, message) in CARDS.items()
-    },
+    "negative field": (
+        {"card": {"format_version": "1", "receptive_field": "-5"}},
+        OF_FORMAT + r"\(receptive_field -5\)",
+    ),
 }
 
 
@@ -130,7 +124,6 @@ def test_a_network_with_another_output_or_invalid_metadata_is_an_error_of_one_li
     path = write_network(tmp_path / "own.onnx", **given)
     said = refusal(ModelError, load_network, path, device="cpu")
     assert re.match(f"{path} {message}", said), said
-    assert len(said) < 500 + len(str(path))
 
 
 @pytest.mark.parametrize(
@@ -142,44 +135,20 @@ def test_a_network_with_values_of_another_shape_is_an_error_when_it_runs(tmp_pat
     assert said.startswith("the network failed on cpu: ")
 
 
-INFINITE = [("Sub", ("sum", "sum"), "zero", {}), ("Div", ("sum", "zero"), "values", {})]
-NAN = [
-    ("Abs", ("sum",), "above", {}),
-    ("Neg", ("above",), "below", {}),
-    ("Log", ("below",), "values", {}),
-]
-
-
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("last", [INFINITE, NAN], ids=["infinite", "NaN"])
-@pytest.mark.parametrize("symmetries", [1, 2])
-def test_values_that_are_not_finite_are_refused(tmp_path, last, symmetries):
-    loaded = load_network(write_network(tmp_path / "own.onnx", last), device="cpu")
-    said = refusal(ModelError, reconstruct, ball(), replace(loaded, symmetries=symmetries), 2)
-    assert said == (
+@pytest.mark.parametrize("value", [np.inf, np.nan])
+def test_values_that_are_not_finite_are_refused(value):
+    def network(patches, table, voxels, offsets):
+        return np.full((len(voxels), len(offsets)), value, np.float32)
+
+    assert refusal(ModelError, reconstruct, ball(), network, 2) == (
         "the network gave values that are NaN, infinite or beyond 1e15: it cannot be used for this "
         "grid; use another model="
     )
 
 
-@pytest.mark.parametrize(
-    ("given", "what"),
-    [
-        (np.zeros((3, 27), np.float32), r"float32 of shape \(3, 27\)"),
-        (np.zeros((4, 27), np.int64), r"int64 of shape \(4, 27\)"),
-        ([[1.0] * 3] * 4, r"list of shape \(4, 3\)"),
-        (None, r"NoneType of shape \(\)"),
-    ],
-)
-def test_the_values_of_a_function_as_network_are_checked_too(given, what):
-    inputs = np.zeros((4, 27)), np.zeros((4, 27), np.int32), np.arange(4)
-    wanted = r" instead of float32 of shape \(4, 27\), \(voxels, offsets\)$"
-    with pytest.raises(ModelError, match=f"^the network gave {what}{wanted}"):
-        decode(lambda *_: given, inputs, block_offsets(2))
-
-
 def test_an_interrupt_ends_a_long_run_soon():
-    patches, table, rows = network_inputs(ball(30, 11.0))
+    patches, table, rows = network_inputs(rescale(ball(30, 11.0)))
     network, many = load_network("base", device="cpu"), np.resize(rows, 60_000)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # of a job in the background
     begun = time.perf_counter()
@@ -193,23 +162,17 @@ def test_an_interrupt_ends_a_long_run_soon():
     assert time.perf_counter() - begun < 60
 
 
-WHOLE = shipped_models()["fast"].read_bytes()
-CONTENTS = {"empty": b"", "half": WHOLE[: len(WHOLE) // 2], "text": b"me\n"}
-
-
-@pytest.mark.parametrize("kind", ["folder", "FIFO", *CONTENTS, "absent", "n" * 300, "a\0b"])
-def test_a_path_that_is_no_model_file_is_an_error_of_one_line(tmp_path, monkeypatch, command, kind):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize("kind", ["folder", "FIFO", "empty", "half", "absent"])
+def test_a_path_that_is_no_model_file_is_an_error_of_one_line(folder, command, kind):
+    whole = shipped_models()["fast"].read_bytes()
     os.mkdir("folder.onnx")
     os.mkfifo("FIFO.onnx")
-    for name, content in CONTENTS.items():
-        (tmp_path / f"{name}.onnx").write_bytes(content)
+    Path("empty.onnx").write_bytes(b"")
+    Path("half.onnx").write_bytes(whole[: len(whole) // 2])
     np.save("in.npy", ball().values)
-    words = "in.npy", "out.ply", "--model", f"{kind}.onnx", "--spacing", "1", "--device", "cpu"
-    code, out, err = command("upsample", *words)
-    assert (code, out, err.count("\n")) == (1, "", 1) and err.startswith("Error: ")
-    assert f"{kind}.onnx" in err or kind == "a\0b"
-    assert not os.path.exists("out.ply")
+    code, out, err = command("upsample", "in.npy", "out.ply", "--model", f"{kind}.onnx")
+    assert (code, out, err.count("\n")) == (1, "", 1)
+    assert err.startswith("Error: ") and f"{kind}.onnx" in err and not os.path.exists("out.ply")
 
 
 @pytest.mark.parametrize("flipped", [(0, 1), (1, 2)], ids=["about z", "about x"])
@@ -220,12 +183,9 @@ def test_a_mean_maps_a_field_after_a_half_turn_to_the_turned_surface(flipped):
 
     def dense_values(network, field):
         """Return the values at the nodes of every voxel of the band, NaN elsewhere."""
-        voxels = np.argwhere(is_active(field)).astype(np.int32)
-        rows = np.arange(len(voxels), dtype=np.int32)
-        table = neighbour_table(voxels, field.shape)
-        values = network(gather_patches(field, voxels), table, rows, block_offsets(2))
+        values = network(*network_inputs(field), block_offsets(2))
         dense = np.full((*field.shape, 3, 3, 3), np.nan, np.float32)
-        dense[tuple(voxels.T)] = values.reshape(-1, 3, 3, 3)
+        dense[is_active(field)] = values.reshape(-1, 3, 3, 3)
         return dense
 
     for network in (plain, replace(plain, symmetries=4)):

@@ -1,6 +1,5 @@
 """Files that appear whole or not at all, and what is left of those that did not."""
 
-import errno
 import os
 import stat
 import subprocess
@@ -10,8 +9,8 @@ from pathlib import Path
 import pytest
 from conftest import refusal
 
-from super_sdf.errors import GridError, SuperSdfError, WriteError
-from super_sdf.files.output import check_apart, check_free, replacing
+from super_sdf.errors import WriteError
+from super_sdf.files.output import check_free, replacing
 
 pytestmark = pytest.mark.usefixtures("folder")
 
@@ -66,27 +65,12 @@ def test_a_file_that_is_replaced_keeps_its_mode_and_a_protected_one_stays(name):
     assert Path(name).read_text() == "old" and os.listdir() == [name]
 
 
-def test_a_file_is_apart_from_another_only_if_it_is_another():
-    Path("grid.npy").write_text("grid")
-    os.symlink("grid.npy", "soft.ply")
-    os.link("grid.npy", "hard.ply")
-    Path("own.ply").write_text("grid")
-    check_apart("own.ply", ["grid.npy", "none.npy"])
-    check_apart("none.npy", ["none.npy"])
-    for name in ("soft.ply", "hard.ply", "../" + Path.cwd().name + "/grid.npy"):
-        said = refusal(WriteError, check_apart, name, ["own.ply", "grid.npy"])
-        assert said == f"{name} is the same file as grid.npy: give another file"
-
-
 def test_places_where_no_file_can_be_are_named():
-    os.symlink("round.ply", "round.ply")
     os.symlink("no/there.ply", "out.ply")
     os.mkfifo("pipe.ply")
-    assert why("round.ply", force=True).startswith("round.ply cannot be written: Too many le")
     assert why("out.ply", force=True).endswith("/no is not a folder: make it first")
     assert why("pipe.ply", force=True) == "pipe.ply is not a regular file: give another name"
     assert why("x" * 300) == f"{'x' * 300} cannot be written: File name too long"
-    assert why("a\0b").endswith(" cannot be written: embedded null byte")
 
 
 @pytest.mark.parametrize("target", ["out.ply", "x" * 250 + ".ply"])
@@ -104,14 +88,3 @@ def test_what_a_killed_process_left_goes_with_the_next_run(target):
         Path(name).write_text("half")
     make(target, force=True)
     assert sorted(os.listdir()) == sorted([target, lives, *others])
-
-
-def test_errors_keep_their_words():
-    full = OSError(errno.ENOSPC, "No space left")
-    for want, error in {
-        "a": GridError("a"),
-        "a.ply cannot be written: No space left": full,
-    }.items():
-        with pytest.raises(SuperSdfError) as caught, replacing(Path("a.ply")):
-            raise error
-        assert str(caught.value) == want and os.listdir() == []

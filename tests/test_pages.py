@@ -160,12 +160,6 @@ def test_the_page_of_a_batch_made_without_one_names_failures_first(run_batch, gr
     assert len(files_of("page.html")) == 4
 
 
-def test_a_page_of_others_is_not_replaced_by_a_batch(run_batch, grid_folder):
-    Path("page.html").write_text("mine")
-    assert run_batch(*BATCH)[::2] == (1, "Error: page.html exists: remove it or use --force\n")
-    assert Path("page.html").read_text() == "mine" and not Path("out").exists()
-
-
 @pytest.fixture
 def opened(tmp_path, monkeypatch):
     """Work in a folder with a grid and a mesh; return the addresses that a browser is opened at."""

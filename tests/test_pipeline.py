@@ -154,19 +154,6 @@ def test_a_field_without_a_surface_is_refused(low, high):
 # Progress
 
 
-def reported(work, *arguments):
-    """Return the progress that some work reports, in thousandths."""
-    reports = []
-    work(*arguments, progress=lambda done, total: reports.append((done, total)))
-    assert {total for _, total in reports} == {1000}
-    return [done for done, _ in reports]
-
-
-def test_steps_are_reported_in_thousandths_of_their_usual_time():
-    assert reported(reconstruct, ball(), trilinear) == [30, 480, 630, 1000]
-    assert reported(upsample, ball(), trilinear) == [48, 762, 1000]
-
-
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
 def test_an_exception_in_the_callback_ends_the_run_and_the_next_is_right(network, error):
     plain = reconstruct(ball(), network, 2)

@@ -8,7 +8,7 @@ import pytest
 from super_sdf import errors
 from super_sdf.cli import info
 from super_sdf.errors import EXTRAS
-from super_sdf.network import network, onnx
+from super_sdf.network import network
 
 pytestmark = pytest.mark.usefixtures("cpu_build")
 SHIPPED = network.shipped_models()
@@ -52,12 +52,6 @@ def test_wrong_values_fail(monkeypatch, wrong, models):
     assert info.check_network("fast", "cpu")[0] == "failed"
 
 
-def test_cuda_is_checked_where_it_is(monkeypatch, models):
-    monkeypatch.setattr(onnx, "check_cuda", lambda: None)
-    found = {what: says for _, what, says in info.run_checks("auto", True)}
-    assert found["cuda"] == "its libraries are there" and "network fast on cuda" in found
-
-
 MISSING = "super-sdf was installed without its networks: install it again"
 
 
@@ -71,11 +65,3 @@ def test_a_package_without_networks_or_that_for_masks_says_so(models, command, t
     code, out, err = command("info", "--device", "cpu")
     assert (code, err) == (1, "") and f"failed   networks: {MISSING}\n" in out
     assert command(*words) == (1, "", f"Error: the network 'base' is missing: {MISSING}\n")
-
-
-def test_a_network_file_that_cannot_be_read_is_a_line_and_the_others_are_checked(models, command):
-    (models / "base.onnx").write_bytes(b"text")
-    fault = f"{models / 'base.onnx'} is no ONNX file that onnxruntime can run: "
-    code, out, err = command("info", "--check", "--device", "cpu")
-    assert (code, err) == (1, "") and f"\nfailed   network base on cpu: {fault}" in out
-    assert "\nok       network fast on cpu: " in out

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import h5py
@@ -16,7 +15,7 @@ import SimpleITK as sitk  # noqa: N813
 import tifffile
 import zarr
 from conftest import refusal
-from placed import FIRST, SIZES, STEPS, affine_of, array_of, check, part, sampled, save
+from placed import FIRST, SIZES, STEPS, affine_of, array_of, check, part, sampled
 
 from super_sdf import read_grid
 from super_sdf.errors import FileError
@@ -218,20 +217,6 @@ def test_nifti_without_a_place_is_not_mirrored():
     assert sitk.ReadImage("a.nii").GetDirection() == (1, 0, 0, 0, 1, 0, 0, 0, 1)
     check(read_grid("a.nii"), shift=FIRST)
     check(read_grid("a.nii", origin=FIRST))
-
-
-def test_what_a_metaimage_may_leave_out_or_call_otherwise():
-    save("a.mha")
-    whole = Path("a.mha").read_bytes()
-    for name in (b"Offset", b"Origin", b"Position"):
-        Path("a.mha").write_bytes(whole.replace(b"Offset", name))
-        check(read_grid("a.mha"))
-        assert np.allclose(sitk.ReadImage("a.mha").GetOrigin(), FIRST)
-    Path("b.mha").write_bytes(whole.replace(b"ElementSpacing", b"ElementSize"))
-    check(read_grid("b.mha"))
-    Path("c.mha").write_bytes(re.sub(rb"ElementSpacing.*\n", b"", whole))
-    assert sitk.ReadImage("c.mha").GetSpacing() == (1, 1, 1)
-    check(read_grid("c.mha", spacing=STEPS))
 
 
 def test_arrays_of_cells_beside_those_of_points():

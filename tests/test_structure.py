@@ -178,13 +178,6 @@ def test_what_every_conversion_needs_is_few_packages(module):
     assert not others or is_extra or module in ("batch.cluster", "functions.pyvista")
 
 
-@pytest.mark.parametrize(
-    "room", sorted({room_of(m) for m in MODULES if "." in m} - {"functions.pyvista"})
-)
-def test_every_room_says_what_lives_there(room):
-    assert ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text()))
-
-
 def test_onnxruntime_is_imported_in_one_place():
     """There its telemetry is switched off before."""
     folders = [ROOT / name for name in ("src", "tests", "export", "lab", "examples")]
@@ -212,10 +205,3 @@ def test_one_conversion_loads_little(tmp_path):
 def test_a_batch_without_a_cluster_loads_nothing_of_dask(tmp_path):
     words = "batch", "examples", "--out", str(tmp_path), "--quality", "fast", "--jobs", "1", "-q"
     assert not loaded_by(tmp_path, *words) & {"dask", "distributed", "tornado"}
-
-
-def test_public_names_are_there():
-    import super_sdf
-
-    for name in super_sdf.__all__:
-        assert getattr(super_sdf, name) is not None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ball, refusal
+from solids import box_distance
 
 from super_sdf.errors import GridError
 from super_sdf.grid.sdf_grid import make_grid
@@ -19,8 +20,7 @@ R = np.sqrt(X**2 + Y**2 + Z**2)
 
 def box(x, y, z, *half):
     """Return the signed distance to a box of half sides."""
-    q = np.stack([np.abs(a) - h for a, h in zip((x, y, z), half)])
-    return np.linalg.norm(np.maximum(q, 0), axis=0) + np.minimum(q.max(0), 0)
+    return box_distance(np.stack([x, y, z], -1), half)
 
 
 THIN = {
@@ -46,13 +46,10 @@ def test_thin_solids_are_told(name, spacing, sign):
 
 UNSIGNED = {
     "ball": np.abs(R - 9.3),
-    "small ball": np.abs(R - 2.4),
     "box": np.abs(box(X, Y, Z, 8, 7, 9)),
-    "flat box": np.abs(box(X, Y, Z, 8, 7, 1.6)),
     "bar": np.abs(box(X, Y, Z + 0.2, 9, 2, 2)),
     "torus": np.abs(np.hypot(np.hypot(X, Y) - 9, Z) - 3.2),
     "two balls": np.abs(np.minimum(R - 5, np.sqrt((X - 11) ** 2 + Y**2 + Z**2) - 3)),
-    "thick shell": np.abs(np.abs(R - 9) - 2.3),
     "rod through the grid": np.abs(np.hypot(X, Y) - 4.4),
     "lower half": np.abs(Z + 3.1),
     "turned box": np.abs(box((X + Y) / 2**0.5, (X - Y) / 2**0.5, Z, 8, 7, 6)),
@@ -65,7 +62,6 @@ NO_SURFACE = {
     "a torus that shrank away": np.hypot(np.hypot(X, Y) - 9, Z) + 0.2,
     "a sheet that shrank away": np.abs(Z) + 0.2,
     "parabola": (R / 8) ** 2 + 0.1,
-    "bump": 1.2 - np.exp(-(R**2) / 50),
     "random": np.random.default_rng(0).random((N, N, N)) + 0.01,
     "steps": np.maximum(R - 9, 0) + 0.5,
     "slow": 0.1 * R + 0.05,

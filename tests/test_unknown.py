@@ -9,6 +9,7 @@ import trimesh
 from conftest import refusal, trilinear
 from scipy import ndimage
 from skimage.measure import marching_cubes
+from solids import box_distance
 from test_field_kinds import PLACE, box, thin_frame
 from trimesh import grouping
 
@@ -175,8 +176,7 @@ def test_values_that_are_cut_off_were_seen(cut, make):
 
 @pytest.mark.parametrize("half", [0.6, 0.9, 1.3])
 def test_flat_ground_of_a_thin_plate_was_seen_where_values_level_off(half):
-    outside = np.abs(np.indices((32,) * 3).T - 15.5) - np.array([11, 11, half])
-    distances = np.linalg.norm(np.maximum(outside, 0), axis=-1) + np.minimum(outside.max(-1), 0)
+    distances = box_distance(np.indices((32,) * 3).T - 15.5, [11, 11, half])
     grid = make_grid(2 * np.tanh(distances / 2), **PLACE)
     assert not any("exactly" in note for note in grid.notes)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bz2
 import os
-import socket
 import zlib
 from pathlib import Path
 
@@ -13,7 +12,6 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
-import trimesh
 from conftest import refusal
 from placed import CUBES, sampled, save
 
@@ -105,11 +103,6 @@ def test_what_is_loaded_whole_is_refused_if_it_would_not_fit():
 
 
 def test_damaged_numpy_files_are_a_line():
-    np.save("a.npy", VALUES)
-    whole = Path("a.npy").read_bytes()
-    said = said_of(write("a.npy", whole[:-40]))
-    assert said == "a.npy cannot be read as NumPy: mmap length is greater than file size"
-    said_of(write("a.npy", whole[:60]))
     np.savez("a.npz", values=VALUES)
     whole = bytearray(Path("a.npz").read_bytes())
     whole[9000] ^= 1
@@ -210,13 +203,10 @@ def test_files_of_an_ome_set_are_read_beside_the_file(tmp_path):
 
 WHAT_IS_WRONG = {
     "folder.npy": "is a folder: give a file",
-    **dict.fromkeys(("pipe.npy", "socket.npy", "zero.npy"), "is no regular file: give a file"),
-    "loop.npy": "cannot be read: Too many levels of symbolic links",
+    **dict.fromkeys(("pipe.npy", "zero.npy"), "is no regular file: give a file"),
     "dangling.npy": "does not exist",
     "missing.npy": "does not exist",
-    "file.npy/in.npy": "does not exist",
     "n" * 300 + ".npy": "cannot be read: File name too long",
-    "a\0.npy": "cannot be read: embedded null byte",
 }
 
 
@@ -224,24 +214,15 @@ WHAT_IS_WRONG = {
 def test_what_is_no_regular_file_is_named_as_grid_and_as_mesh(name):
     Path("folder.npy").mkdir()
     os.mkfifo("pipe.npy")
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind("socket.npy")
-    for link, end in {"zero": "/dev/zero", "loop": "loop.npy", "dangling": "nothing.npy"}.items():
-        Path(f"{link}.npy").symlink_to(end)
+    Path("zero.npy").symlink_to("/dev/zero")
+    Path("dangling.npy").symlink_to("nothing.npy")
     np.save("file", VALUES)
     Path("link.npy").symlink_to("file.npy")
     assert np.array_equal(read_grid("link.npy", spacing=0.5).values, VALUES)
     assert refusal(FileError, read_grid, name) == f"{name} {WHAT_IS_WRONG[name]}"
-    if name in ("folder.npy", "pipe.npy", "zero.npy", "loop.npy", "dangling.npy"):
+    if name in ("folder.npy", "pipe.npy", "zero.npy", "dangling.npy"):
         Path("a.ply").symlink_to(name)
         assert refusal(FileError, read_mesh, "a.ply") == f"a.ply {WHAT_IS_WRONG[name]}"
-
-
-def test_a_mesh_that_names_a_pipe_is_read_without_it():
-    os.mkfifo("pipe.mtl")
-    box = trimesh.creation.box().export(file_type="obj")
-    write("cube.obj", f"mtllib pipe.mtl\nusemtl red\n{box}")
-    assert len(read_mesh("cube.obj").faces) == 12
 
 
 # Where ITK places a MetaImage

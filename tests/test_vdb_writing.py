@@ -31,17 +31,6 @@ def stretched_mask() -> SdfGrid:
     return make_grid((np.linalg.norm(far, axis=-1) < 5.2).astype(np.uint8), spacing=(1, 1, 1.5))
 
 
-def long() -> SdfGrid:
-    """Return a ball at each end of a grid whose fine lattice has over 4096 voxels along x."""
-    ends = np.stack(
-        [
-            np.linalg.norm(np.moveaxis(np.indices((1036, 9, 10)), 0, -1) - [x, 4.3, 4.8], axis=-1)
-            for x in (5, 1028)
-        ]
-    )
-    return make_grid(ends.min(0) - 3.1, spacing=1.0)
-
-
 GRIDS = dict(whole=ball, leaving=cut_ball, tip=tip, turned=turned, stretched=stretched_mask)
 
 

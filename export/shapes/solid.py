@@ -27,7 +27,6 @@ MAX_FACES = 70_000  # the finest reliefs have some 50,000
 MIN_VOLUME = 1e-4  # of the cubed diagonal; the thinnest shells and trusses hold some 1e-3
 TOLERANCE = 1e-5  # of the diagonal; shorter edges only spoil the normals of their triangles
 
-
 Family = Callable[[np.random.Generator], Manifold]
 
 MACHINED: tuple[Family, ...] = (

@@ -8,19 +8,14 @@ from export import dataset, edges, parts
 from export.shapes.smooth import draw_smooth, ellipsoid, foot_points, settle, torus
 from export.shapes.solid import FAMILIES, MAX_FACES, draw_family, random_solid
 from super_sdf import Mesh
+from super_sdf.check import examine_surface
 from super_sdf.truth import solid
 
 
-def check_closed(mesh: Mesh) -> None:
-    """Each directed edge occurs once, and so does its opposite; every vertex is used."""
-    edges = mesh.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-    there = {tuple(edge) for edge in edges.tolist()}
-    assert len(there) == len(edges) and there == {(b, a) for a, b in there}
-    assert np.array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
-
-
-def check_size(mesh: Mesh) -> None:
-    """The bounding box is centred at the origin and has a diagonal of 1."""
+def check_solid(mesh: Mesh) -> None:
+    """It is closed, and its box is centred at the origin and has a diagonal of 1."""
+    found = examine_surface(mesh)
+    assert (found.open_edges, found.flipped_edges, found.crowded_edges) == (0, 0, 0)
     low, high = mesh.vertices.min(0), mesh.vertices.max(0)
     assert np.linalg.norm(high - low) == pytest.approx(1, abs=1e-12)
     assert low == pytest.approx(-high, abs=1e-12)
@@ -30,8 +25,7 @@ def check_size(mesh: Mesh) -> None:
 def test_random_solids_keep_every_promise_and_are_the_same_for_the_same_seed(name):
     mesh, again = (random_solid(np.random.default_rng(0), [name]) for _ in range(2))
     assert mesh.vertices.dtype == np.float64 and 4 <= len(mesh.faces) <= MAX_FACES
-    check_closed(mesh)
-    check_size(mesh)
+    check_solid(mesh)
     assert mesh.volume() > 5e-5
     assert np.array_equal(mesh.vertices, again.vertices)
     assert draw_family(np.random.default_rng(1), [name]) is FAMILIES[name]
@@ -42,8 +36,7 @@ def test_every_part_is_a_solid_of_a_kind_that_trains_no_network(tmp_path, number
     name, mesh = parts.draw_part(number)
     assert np.array_equal(mesh.vertices, parts.draw_part(number)[1].vertices)
     assert name.startswith(f"part-{number:02d}-") and name.split("-")[2] not in FAMILIES
-    check_closed(mesh)
-    check_size(mesh)
+    check_solid(mesh)
     assert 0.1 < mesh.volume() / np.prod(np.ptp(mesh.vertices, axis=0)) < 0.95
 
 
