@@ -17,7 +17,7 @@ from ..arrays import Triple
 from ..errors import GridError
 from ..options import AUTO, DISTANCE, MASK, NOISY, SMOOTH, Options
 from .look import Extremes, Floats, Look, border_share, look_at, named, typical_slope, which_level
-from .recognise import Answer, cut_values, recognise
+from .recognise import Answer, recognise
 from .samples import (
     LEAST_SPACING,
     MOST_SPACING,
@@ -163,7 +163,7 @@ def interpret(
     if wanted.field == MASK:
         return _of_sides(case if look.is_finite else _with_known(case), {}, given)
     steps_given = None if steps is None else np.array(steps_of(steps))
-    answer = Answer(wanted.field, "", {"cut": cut_values(look), "spacing": steps_given})
+    answer = Answer(wanted.field, "", {"cut": look.cut, "spacing": steps_given})
     if wanted.field == AUTO:
         answer = recognise(samples, look, steps_given, hint)
     elif look.is_two:
@@ -365,7 +365,7 @@ def _of_spline(
 
 def _slope_at_surface(look: Look, steps: Floats) -> float:
     """Return the typical slope beside the surface, in world units; of steps over 0 if unknown."""
-    slope = typical_slope(look, steps, cut_values(look))
+    slope = typical_slope(look, steps, look.cut)
     if not np.isfinite(slope):
         slope = float(np.abs(look.pairs[0] - look.pairs[1]).max(initial=0)) / float(steps.min())
     return slope or 1.0

@@ -72,6 +72,11 @@ class Look:
         """Whether no value is below 0, or none above."""
         return self.low >= 0 or self.high <= 0
 
+    @property
+    def cut(self) -> list[float]:
+        """The lowest and the highest value, as far as many samples have them: cut off there."""
+        return [value for value in (self.low, self.high) if value in self.frequent]
+
     def without(self, value: float) -> Look:
         """Return the same with the kept samples of a value unknown."""
         boxes, lines = (np.where(x == value, np.nan, x) for x in (self.boxes, self.lines))
@@ -248,6 +253,41 @@ def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int
     values = sorted(counts)
     kept = np.array(values, samples.dtype)
     return kept, np.array([counts[value] for value in values], np.int64)
+
+
+def count_valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
+    """Count valleys of slope, sign * values above 0, where 0 is near and the sign does not change.
+
+    And the changes of sign of neighbours.
+    """
+    count = changes = 0
+    values = look.part * (sign / slope)
+    for axis in range(3):
+        v = np.moveaxis(values, axis, 0)
+        changes += int(np.count_nonzero((v[1:] > 0) & (v[:-1] <= 0) | (v[1:] <= 0) & (v[:-1] > 0)))
+        before, x, after = v[:-2], v[1:-1], v[2:]
+        # distances fall to half a step at most, and rise by nearly one on either side
+        low = (x >= 0) & (x < 0.52) & (before > x) & ((after > x) | ((after == x) & (x > 0.25)))
+        count += int(np.count_nonzero(low & (before + after - 2 * x > 0.9)))
+    return count, changes
+
+
+def parting_level(values: Floats) -> float:
+    """Return the level that parts the values into two of least variance (Otsu's)."""
+    counts, edges = np.histogram(values, 512)
+    mids = (edges[1:] + edges[:-1]) / 2
+    below, mean = np.cumsum(counts)[:-1], np.cumsum(counts * mids)[:-1]
+    above, other = counts.sum() - below, (counts * mids).sum() - mean
+    apart = below * above * (mean / np.maximum(below, 1) - other / np.maximum(above, 1)) ** 2
+    return float(edges[1:-1][apart.argmax()])
+
+
+def last_digit(look: Look) -> float:
+    """Return by how much values beside the surface typically differ at least."""
+    largest = max(abs(look.low), abs(look.high))
+    values = (look.boxes[:, 2, 2, 2] / largest).astype(np.float32)
+    values = np.unique(values[np.isfinite(values)])
+    return float(np.median(np.diff(values))) * largest if len(values) > 1 else 0.0
 
 
 # What a refusal names

@@ -27,8 +27,11 @@ from .look import (
     Floats,
     Look,
     border_share,
+    count_valleys,
     different_values,
     equal_neighbours,
+    last_digit,
+    parting_level,
     typical_slope,
     which_label,
     which_level,
@@ -52,9 +55,7 @@ ZEROS = 0.25  # share of samples at 0 beside the surface: sides that start at 0 
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
 NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
-# 4. Unknown samples: share of the samples at one value from which it is cut off or stands for
-# unknown ones; steps to it over the steepest ones; how many of them jump.
-CUT = 0.01
+# 4. Unknown samples: steps to a frequent value over the steepest ones; how many of them jump.
 JUMP = 1.5  # cut off 1.0, sentinels from 2
 MIXED = 0.05  # cut off 0, where it is also the cut-off value from .09
 # 5. Distances: share of the smooth samples whose slope is the commonest one; share of the samples
@@ -115,7 +116,7 @@ def recognise(
     samples: SampleArray, look: Look, given: Floats | None = None, hint: str = ""
 ) -> Answer:
     """Return what samples are; ``given`` is the spacing (3,), ``hint`` what a file says of them."""
-    facts: dict[str, Any] = {"cut": cut_values(look)}
+    facts: dict[str, Any] = {"cut": look.cut}
     if look.is_two and hint != "labels":
         return Answer("mask", "there are two values", facts)
     if hint == "labels" or (not hint and _are_labels(samples, look, facts)):
@@ -126,7 +127,7 @@ def recognise(
         return Answer("mask", TRANSFORM, facts | {"zeros": _side_of_zeros(look)})
     signs = look
     look = _without_sentinels(look, facts)
-    facts["digit"] = _last_digit(look)
+    facts["digit"] = last_digit(look)
     unit = _find_unit(np.where(np.isin(look.lines, facts["cut"]), np.nan, look.lines), given, facts)
     enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
     if unit is not None and enough and facts["slopes"] >= SLOPES:
@@ -147,11 +148,6 @@ def recognise(
     if given is not None and _is_cut_near(look, given, facts):
         return Answer("distance", "", facts | {"spacing": given})
     return _of_both_sides(look, given, facts)
-
-
-def cut_values(look: Look) -> list[float]:
-    """Return the lowest and the highest value, as far as many samples have them."""
-    return [value for value in (look.low, look.high) if look.frequent.get(value, 0) > CUT]
 
 
 # Questions 2 and 3: labels and masks
@@ -279,14 +275,6 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
 # Question 5: distances
 
 
-def _last_digit(look: Look) -> float:
-    """Return by how much values beside the surface typically differ at least."""
-    largest = max(abs(look.low), abs(look.high))
-    values = (look.boxes[:, 2, 2, 2] / largest).astype(np.float32)
-    values = np.unique(values[np.isfinite(values)])
-    return float(np.median(np.diff(values))) * largest if len(values) > 1 else 0.0
-
-
 def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> Any:
     """Return how much values change from sample to sample, by axis if they differ; None if unclear.
 
@@ -380,29 +368,12 @@ def _distances(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any
     if look.is_one_sided:
         return _to_thin_walls(look, steps, facts)
     outside = 1 if border_share(look, lambda x: x > 0) >= 0.5 else -1
-    found, changes = _valleys(look, float(steps.min()), -outside)
+    found, changes = count_valleys(look, float(steps.min()), -outside)
     facts["seams"] = found / max(changes, 1)
     if facts["seams"] > SEAMS:
         why = "distances to parts that touch or overlap, with faces of these inside"
         return Answer("smooth", why, facts | {"inside": -outside})
     return Answer("distance", "", facts)
-
-
-def _valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
-    """Count valleys of slope, sign * values above 0, where 0 is near and the sign does not change.
-
-    And the changes of sign of neighbours.
-    """
-    count = changes = 0
-    values = look.part * (sign / slope)
-    for axis in range(3):
-        v = np.moveaxis(values, axis, 0)
-        changes += int(np.count_nonzero((v[1:] > 0) & (v[:-1] <= 0) | (v[1:] <= 0) & (v[:-1] > 0)))
-        before, x, after = v[:-2], v[1:-1], v[2:]
-        # distances fall to half a step at most, and rise by nearly one on either side
-        low = (x >= 0) & (x < 0.52) & (before > x) & ((after > x) | ((after == x) & (x > 0.25)))
-        count += int(np.count_nonzero(low & (before + after - 2 * x > 0.9)))
-    return count, changes
 
 
 def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
@@ -477,7 +448,7 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
     if len(middle) >= ENOUGH:
         size, (one, other) = np.abs(middle), look.pairs
         facts["centred"] = float(np.median(size) / np.quantile(size, 0.995))
-        at_0, best = (((one > x) != (other > x)).sum() for x in (0.0, _parting(middle)))
+        at_0, best = (((one > x) != (other > x)).sum() for x in (0.0, parting_level(middle)))
         facts["area"] = float(at_0 / max(best, 1))
         if facts["centred"] < CENTRED and facts["area"] > AREA:
             return Answer("density", "", facts, which_level(look, signed=True))
@@ -522,20 +493,10 @@ def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
     change = np.abs(look.pairs[0] - look.pairs[1])
     steep = float(np.quantile(change, 0.98))
     share = np.count_nonzero(~np.isnan(look.part)) / np.prod(look.shape)
-    found = _valleys(look, steep, sign)[0] / share / float(np.prod(look.shape)) ** (2 / 3)
+    found = count_valleys(look, steep, sign)[0] / share / float(np.prod(look.shape)) ** (2 / 3)
     # steps between plateaus, with noise on them, make valleys, too
     facts["rising"] = float(np.median(change)) / steep
     is_unsigned = (look.low if sign > 0 else look.high) not in facts["cut"]
     if is_unsigned and facts["rising"] > RISING and VALLEY[0] < found < VALLEY[1]:
         return _unsigned(sign, steep, facts)
     return Answer("density", "", facts, which_level(look))
-
-
-def _parting(values: Floats) -> float:
-    """Return the level that parts the values into two of least variance (Otsu's)."""
-    counts, edges = np.histogram(values, 512)
-    mids = (edges[1:] + edges[:-1]) / 2
-    below, mean = np.cumsum(counts)[:-1], np.cumsum(counts * mids)[:-1]
-    above, other = counts.sum() - below, (counts * mids).sum() - mean
-    apart = below * above * (mean / np.maximum(below, 1) - other / np.maximum(above, 1)) ** 2
-    return float(edges[1:-1][apart.argmax()])
