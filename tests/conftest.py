@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from batches import FAST, PLAIN
 from hypothesis import HealthCheck, settings
 
-from super_sdf import Mesh, SdfGrid, load_network
+from super_sdf import Mesh, SdfGrid, load_network, read_grid
 from super_sdf.arrays import NEIGHBOURHOOD
+from super_sdf.errors import SuperSdfError
 from super_sdf.network import onnx
 from super_sdf.network.onnx import ort
 from super_sdf.truth.solid import Solid
@@ -59,6 +58,13 @@ def refusal(kind: type[Exception], call: Callable[..., Any], *given: Any, **opti
         call(*given, **options)
     assert "\n" not in str(caught.value)
     return str(caught.value)
+
+
+def said_of(path: str, **options: Any) -> str:
+    """Return the one line with which a grid file is refused."""
+    said = refusal(SuperSdfError, read_grid, path, **options)
+    assert len(said) < 500
+    return said
 
 
 def count_fans(faces: np.ndarray) -> np.ndarray:
@@ -120,18 +126,6 @@ def grid_folder(tmp_path, monkeypatch):
     np.savez("in/deep/b.npz", values=ball(12, 3.5).values)
     np.save("in/deep/er/c.d.npy", ball(12, 4.0).values[:7])
     np.save("in/bad.npy", np.ones((4, 4, 4)))
-
-
-@pytest.fixture
-def run_batch(command):
-    """Run the batch; return exit code and what it says, without the time."""
-
-    def go(*arguments, out="out"):
-        network = () if "--model" in arguments else FAST
-        code, said, err = command("batch", *arguments, "--out", out, *PLAIN, *network)
-        return code, said, re.sub(r"; [\d.]+ s\n$", "\n", err)
-
-    return go
 
 
 @pytest.fixture

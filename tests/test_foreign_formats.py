@@ -12,7 +12,7 @@ import numpy as np
 import pydicom
 import pytest
 import pyvista
-from conftest import refusal
+from conftest import said_of
 from placed import (
     AFFINE,
     CUBES,
@@ -37,16 +37,10 @@ from placed import (
 )
 
 from super_sdf import read_grid
-from super_sdf.errors import SuperSdfError
 from super_sdf.files.formats import DICOM, find_format, is_grid
 from super_sdf.files.grids import open_volume
 
 pytestmark = pytest.mark.usefixtures("folder")
-
-
-def said_of(path: str) -> str:
-    """Return the one line with which a file is refused."""
-    return refusal(SuperSdfError, read_grid, path)
 
 
 def test_analyze_states_its_spacing_and_no_place():

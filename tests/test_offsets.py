@@ -1,17 +1,13 @@
 """Surfaces at an offset: closed forms, the sign of the solid, and how far distances reach."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
-import trimesh
 from conftest import refusal
 from solids import box_distance
 
 from super_sdf import make_grid, reconstruct
 from super_sdf.errors import GridError
 
-PART = Path(__file__).parent.parent / "examples" / "part.npz"
 SIDE = 8.6
 
 
@@ -79,14 +75,3 @@ def test_an_offset_beyond_all_values_has_no_surface(fast, fill):
         reconstruct(make_grid(values, spacing=1), fast, 2, offset=99)
     ends = "-3 to 3" if fill == 3 else f"{near.min():.6g} to {near.max():.6g}"
     assert str(caught.value) == f"no surface at 99: the values go from {ends}"
-
-
-def test_the_command_refuses_an_offset_near_the_truncation(command, folder, tmp_path):
-    message = (
-        "Error: offset 5.5 needs distances 1.5 spacings (2.25) to either side of it, but they end "
-        "at 6: the farthest that works is 3.75\n"
-    )
-    assert command("upsample", PART, "a.ply", "--offset", 5.5) == (1, "", message)
-    assert not list(tmp_path.iterdir())
-    assert command("upsample", PART, "a.ply", "--offset", 3.75, "--factor", 2)[0] == 0
-    assert trimesh.load("a.ply").is_watertight

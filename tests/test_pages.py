@@ -13,7 +13,7 @@ from urllib.request import url2pathname
 import numpy as np
 import pytest
 import trimesh
-from batches import CONSTANT
+from batches import CONSTANT, LONE
 from pages import blocks, wedge
 
 from super_sdf import Mesh, SdfGrid, reconstruct, write_mesh
@@ -89,7 +89,7 @@ def test_the_policy_allows_these_scripts_and_nothing_else():
 
 
 UPSAMPLE = ("upsample", "a.npy", "a.ply", "--quality", "fast", "--factor", 2, "--spacing", 1)
-BATCH = ("in", "--report", "page.html")
+BATCH = ("batch", "in", "--out", "out", *LONE)
 
 
 def files_of(page):
@@ -141,10 +141,10 @@ def test_without_the_extra_a_page_says_that_nothing_is_checked(command, opened, 
         assert [mesh["residuals"] for mesh in blocks(Path(page))["meshes-0"]] == [False, False]
 
 
-def test_the_page_of_a_batch_made_without_one_names_failures_first(run_batch, grid_folder):
-    run_batch("in")
+def test_the_page_of_a_batch_made_without_one_names_failures_first(command, grid_folder):
+    command(*BATCH)
     before = Path("out/a.ply").stat().st_mtime_ns
-    assert run_batch(*BATCH)[0] == 1
+    assert command(*BATCH, "--report", "page.html")[0] == 1
     assert Path("out/a.ply").stat().st_mtime_ns == before
     bad, *made = files_of("page.html")
     assert [entry["name"] for entry in made] == ["a.ply", "deep/b.ply", "deep/er/c.d.ply"]
@@ -155,7 +155,7 @@ def test_the_page_of_a_batch_made_without_one_names_failures_first(run_batch, gr
     beside = [entry["meshes"] for entry in made]
     assert sorted(beside) == sorted(f"page-files/{name}" for name in os.listdir("page-files"))
     times = [path.stat().st_mtime_ns for path in sorted(Path("page-files").iterdir())]
-    run_batch(*BATCH)  # the page is replaced, and nothing drawn again
+    command(*BATCH, "--report", "page.html")  # the page is replaced, and nothing drawn again
     assert [path.stat().st_mtime_ns for path in sorted(Path("page-files").iterdir())] == times
     assert len(files_of("page.html")) == 4
 

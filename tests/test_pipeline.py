@@ -149,19 +149,3 @@ def test_a_field_without_a_surface_is_refused(low, high):
             SdfGrid(values, (1.0,) * 3),
             lambda patches, table, voxels, offsets: np.ones((len(voxels), 125), np.float32),
         )
-
-
-# Progress
-
-
-@pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError])
-def test_an_exception_in_the_callback_ends_the_run_and_the_next_is_right(network, error):
-    plain = reconstruct(ball(), network, 2)
-
-    def stop(done, total):
-        if done > 20:  # after the band
-            raise error
-
-    with pytest.raises(error):
-        reconstruct(ball(), network, 2, progress=stop)
-    np.testing.assert_array_equal(reconstruct(ball(), network, 2).vertices, plain.vertices)

@@ -224,13 +224,3 @@ def test_the_command_simplifies_and_says_how_far_off(here, command):
     assert "simplify" in report["seconds"]
     assert command("upsample", "ball.npz", "b.ply", "--tolerance", 0.01, *QUICK)[0] == 0
     assert Path("a.ply").read_bytes() == Path("b.ply").read_bytes()
-
-
-def test_the_command_simplifies_an_open_mesh_too(here, command):
-    np.save("cut.npy", ball(20, 6.0).values[:10])
-    words = ("upsample", "cut.npy", "a.ply", "--simplify", 0.02, "--json", "--open", *QUICK)
-    code, out, err = command(*words)
-    report = json.loads(out)
-    assert code == 0 and not report["closed"]
-    assert report["triangles"] < report["simplified"]["triangles_before"] / 2
-    assert "Warning: the surface runs out of the grid and is open there" in err

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
-from conftest import refusal
+from conftest import refusal, said_of
 from placed import CUBES, sampled, save
 
 from super_sdf import read_grid
-from super_sdf.errors import FileError, SuperSdfError
+from super_sdf.errors import FileError
 from super_sdf.truth.solid import read_mesh
 
 VALUES = sampled(CUBES)
@@ -48,13 +48,6 @@ def nrrd_file(*lines: str, data: bytes = RAW) -> str:
     return write("a.nrrd", NRRD, *(f"{line}\n" for line in lines), "\n", data)
 
 
-def said_of(path, **options):
-    """Return the one line with which a file is refused."""
-    said = refusal(SuperSdfError, read_grid, path, **options)
-    assert path.split(":")[0] in said and len(said) < 500
-    return said
-
-
 # Data that is not as its header promises
 
 
@@ -78,12 +71,12 @@ def test_nrrd_in_every_encoding(packing):
         "gzip": gz.compress(RAW) + gz.flush(),
     }[packing]
     assert np.array_equal(read_grid(nrrd_file(f"encoding: {packing}", data=data)).values, VALUES)
-    said_of(nrrd_file(f"encoding: {packing}", data=data[: len(data) // 2]))
+    said = said_of(nrrd_file(f"encoding: {packing}", data=data[: len(data) // 2]))
+    assert said.startswith("a.nrrd")
 
 
-@pytest.mark.parametrize("first, size", [("", "999999999999999999"), ("-", "1000000000")])
-def test_sizes_that_no_file_has_are_refused_at_once(size, first):
-    huge = f"{first}{size} {size} {size}"
+@pytest.mark.parametrize("huge", ["999999999999999999 " * 3, "-1000000000 1000000000 1000000000"])
+def test_sizes_that_no_file_has_are_refused_at_once(huge):
     write("a.mha", MHA.replace("24 20 17", huge), "ElementDataFile = LOCAL\n", RAW)
     write("a.nrrd", NRRD.replace("24 20 17", huge), "encoding: gzip\n\n", RAW)
     write("a.sdf", f"{huge}\n0 0 0\n1\n1 2 3\n")
@@ -91,7 +84,7 @@ def test_sizes_that_no_file_has_are_refused_at_once(size, first):
     save("a.vti", CUBES)
     write("a.vti", Path("a.vti").read_bytes().replace(b"7 23", b"7 99999999"))
     for name in ("a.mha", "a.nrrd", "a.sdf", "b.sdf", "a.vti"):
-        said_of(name)
+        assert said_of(name).startswith(name)
 
 
 def test_what_is_loaded_whole_is_refused_if_it_would_not_fit():
@@ -107,7 +100,7 @@ def test_damaged_numpy_files_are_a_line():
     whole = bytearray(Path("a.npz").read_bytes())
     whole[9000] ^= 1
     assert "CRC" in said_of(write("a.npz", bytes(whole)))
-    said_of(write("a.npz", bytes(whole[:9000])))
+    assert said_of(write("a.npz", bytes(whole[:9000]))).startswith("a.npz")
 
 
 # Data in other files
@@ -138,16 +131,6 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
         assert said_of(name).endswith(said)
     write(name, DETACHED[name], "below/a.raw\n")
     assert read_grid(name, spacing=0.5).shape == (24, 20, 17)
-
-
-@pytest.mark.parametrize("entry", ["datafile: ", " data file : ", "data file:="])
-def test_a_nrrd_file_names_its_data_once_and_beside_it(entry, tmp_path):
-    write("a.raw", RAW)
-    other = f"{entry}{tmp_path.parent}/a.raw\n"
-    write("a.nhdr", DETACHED["a.nhdr"], "a.raw\n", other)
-    assert said_of("a.nhdr").startswith("a.nhdr")
-    write("a.nhdr", NRRD, "encoding: raw\n", other)
-    assert said_of("a.nhdr").endswith(APART)
 
 
 @pytest.mark.parametrize("entry", ["LIST\n../p003.raw\n", "../p%03d.raw 3 19 1\n"])

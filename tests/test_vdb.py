@@ -167,9 +167,8 @@ def test_damaged_leaves_and_lengths(tmp_path):
 
 def test_a_file_that_ends_early_or_is_another_one(tmp_path):
     whole, path = (DATA / "two-balls.vdb").read_bytes(), tmp_path / "a.vdb"
-    for size in (4, 60, 700, len(whole) // 2, len(whole) - 1):
-        said = said_of(path, whole[:size])
-        assert said == f"{path}: it is truncated or damaged"
+    for size in (4, 60, 700, len(whole) - 1):
+        assert said_of(path, whole[:size]) == f"{path}: it is truncated or damaged"
     said = said_of(path, whole[:8] + struct.pack("<I", 220) + whole[12:])
     assert said == f"{path}: it is no .vdb file of OpenVDB 3 or later: save it with openvdb.write"
 

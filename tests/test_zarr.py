@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
-from conftest import ball, refusal
+from conftest import ball, said_of
 
 from super_sdf import read_grid
-from super_sdf.errors import SuperSdfError
 from super_sdf.files.readers.zarr import CODECS
 
 SHAPE = (30, 26, 22)  # x, y, z: no chunk divides them
@@ -30,11 +29,6 @@ def edited(path, change):
     found = json.loads(Path(path).read_text())
     change(found)
     Path(path).write_text(json.dumps(found))
-
-
-def said_of(path, kind=SuperSdfError):
-    """Return the one line with which a file is refused."""
-    return refusal(kind, read_grid, path, spacing=1)
 
 
 def test_a_store_in_a_zip_file():
