@@ -219,8 +219,9 @@ class Options:
         "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.", metavar="X,Y,Z")
     direction: tuple[float, ...] | None = _option(None, GRID, "read list labels",
         numbers((9,), "nine numbers, row by row"),
-        "World directions of the array's axes: a rotation, maybe mirrored, as nine numbers row by "
-        "row. For NumPy, TIFF, HDF5 and Zarr; other files state it.", metavar="MATRIX")
+        "World directions of the array's axes, a matrix with a unit vector in each column, as nine "
+        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other files state it.",
+        metavar="MATRIX")
     axes: AxisOrder | None = _option(None, GRID, "read list labels", one_of(get_args(AxisOrder)),
         "Axis order of an array in NumPy, TIFF, HDF5 or Zarr. Default: by the names of the axes, "
         "else xyz for NumPy, zyx for the others.")

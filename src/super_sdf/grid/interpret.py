@@ -145,15 +145,9 @@ def interpret(
         samples = changed(samples, partial(np.multiply, float(wanted.scale)))
     case = Case(samples, look_at(samples), wanted, steps, notes)
     look = case.look
-    if look.low > look.high:
-        raise GridError("no value is finite: there is no surface")
-    if look.low == look.high:
-        only = look.low if samples.dtype.kind == "b" else f"{look.low:.6g}"
-        raise GridError(f"every value is {only}: a constant field has no surface")
+    _check_size(look)
     if samples.dtype.kind == "b":
         return _of_mask(case, samples)
-    if not ORDINARY[0] < (largest := max(abs(look.low), abs(look.high))) < ORDINARY[1]:
-        raise GridError(f"the largest value is {largest:.6g}: multiply the values, --scale")
     if look.infinite:
         from .unknown import check_infinite  # imported where they are needed, as few are
 
@@ -173,6 +167,18 @@ def interpret(
     ):
         raise _refused(answer, look, given if wanted.scale else samples)
     return _as_recognised(case, answer, given)
+
+
+def _check_size(look: Look) -> None:
+    """Raise GridError unless there are different values, of a size with which one can calculate."""
+    if look.low > look.high:
+        raise GridError("no value is finite: there is no surface")
+    if look.low == look.high:
+        only = look.low if isinstance(look.low, bool) else f"{look.low:.6g}"
+        raise GridError(f"every value is {only}: a constant field has no surface")
+    largest = max(abs(look.low), abs(look.high))
+    if not ORDINARY[0] < largest < ORDINARY[1]:
+        raise GridError(f"the largest value is {largest:.6g}: multiply the values, --scale")
 
 
 def _refused(answer: Answer, look: Look, given: SampleArray) -> GridError:

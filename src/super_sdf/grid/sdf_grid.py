@@ -77,8 +77,8 @@ class SdfGrid:
     ------
     GridError
         If the array is no finite grid of at least 2 samples along each of three axes; if most of
-        its border is negative; if the spacing is not positive, the direction is no rotation, or the
-        values change by more than the spacing.
+        its border is negative; if the spacing is not positive, the direction no unit vectors, or
+        the values change by more than the spacing.
     """
 
     samples: SampleArray
@@ -106,8 +106,8 @@ class SdfGrid:
         if look.low == look.high:
             raise GridError(f"every value is {look.low:.6g}: a constant field has no surface")
         if look.is_two and min(look.shape) > 2:
-            values = f"{look.low:.6g} and {look.high:.6g}"
-            raise GridError(f"the only values are {values}: {MASK_HINT}")
+            both = f"{look.low:.6g} and {look.high:.6g}"
+            raise GridError(f"the only values are {both}: {MASK_HINT}")
         below = border_share(look, lambda x: x < 0)
         if below > 0.5:
             raise GridError(

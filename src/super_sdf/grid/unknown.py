@@ -86,14 +86,16 @@ def with_known(
         f"{count:,} of the unknown samples are in regions that touch both sides of the surface: "
         "it is open there"
     )
-    first = np.unravel_index(int(unseen.argmax()), unseen.shape)
     which = f" (those that are exactly {named} are taken as such)" if values else ""
-    why = (
-        f"{count:,} samples are unknown{which}, values[{', '.join(map(str, first))}] the first, in "
-        "regions that touch samples on both sides of the surface, so whether they are inside is "
-        "unknown"
+    return Known(whole, (low, high), unseen, _why_open(unseen, count, which))
+
+
+def _why_open(unseen: BoolArray, count: int, which: str) -> str:
+    first = ", ".join(map(str, np.unravel_index(int(unseen.argmax()), unseen.shape)))
+    return (
+        f"{count:,} samples are unknown{which}, values[{first}] the first, in regions that touch "
+        "samples on both sides of the surface, so whether they are inside is unknown"
     )
-    return Known(whole, (low, high), unseen, why)
 
 
 def _sides_beside(regions: NDArray[np.int32], values: NDArray[Any], count: int) -> BoolArray:
