@@ -9,9 +9,9 @@
    along the chain of candidates, since an edge has a length.
 4. A linear rule says how far from the middle of its patch to that point the vertex goes: all the
    way on an edge, a part of it on rounded ground. Where it is little, marching cubes is kept. The
-   rule was fitted by ``export.edges``, on shapes with and without edges, to how far from the middle
-   to that point the true surface lies; it is in ``rule.json``.
+   rule, ``rule.json``, was fitted by ``export.edges`` to where the true surface of shapes lies.
 5. Beside features, vertices are moved as much of the way onto the settled planes.
+6. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
 
 References
 ----------
@@ -183,7 +183,8 @@ def place(patches: Patches, own: Planes, candidates: Candidates, share: Numbers)
     kept = share > LEAST_SHARE
     position = _move_beside(patches, own, candidates, share)
     vertex = candidates.middle + share[:, None] * (candidates.edge - candidates.middle)
-    return Placed(position, candidates.planes.normal, candidates.patch[kept], vertex[kept])
+    placed = Placed(position, candidates.planes.normal, candidates.patch[kept], vertex[kept])
+    return placed.unfolded(patches)
 
 
 def find_candidates(

@@ -52,6 +52,7 @@ from ..marching import (
 NEAR_SURFACE = 1.0  # fine spacings: slopes count at nodes that are nearer
 BEND = 0.3  # change of the slopes at a node, 1 for a distance, from which there may be an edge
 TEMPORARIES = 8  # numbers per node of a block
+PULL = 0.5  # share of the way to the middle of its crossings that a vertex which folds its fan goes
 
 
 def voxels_near_kinks(field: FineField, threads: int = 1) -> BoolArray:
@@ -194,6 +195,17 @@ class Placed:
         normal = unit(cross(b - a, c - a))
         least = [dot(normal, self.normal.take(at, 0)) for at in crossings]
         return least[0] if len(least) == 1 else np.minimum(*least)
+
+    def unfolded(self, patches: Patches) -> Placed:
+        """Return the same with vertices that lie beyond a side of their fan moved inwards."""
+        sides = _sides_of(patches, self)
+        corners = sides.start, sides.end, sides.peak
+        beyond = (self.facing(corners, sides.start) < 0) & (self.facing(corners, sides.end) < 0)
+        folded = np.zeros(len(self.feature), bool)
+        folded[sides.peak[beyond] - len(self.position)] = True
+        middle = patches.chosen(self.feature).mean(self.position)
+        inwards = np.where(folded[:, None], PULL * (middle - self.peak), 0)
+        return replace(self, peak=self.peak + inwards)
 
 
 Triangles = tuple[Index, Index]
