@@ -234,11 +234,8 @@ def _jump_over_0(look: Look) -> bool:
 
 def _side_of_zeros(look: Look) -> int:
     """Return the side of samples that are 0: that which has none of its own beside some of them."""
-    zeros = look.part == 0
-    lone = [
-        np.count_nonzero(zeros & ~over_three(side, np.logical_or))
-        for side in (look.part < 0, look.part > 0)
-    ]
+    zeros, sides = look.part == 0, (look.part < 0, look.part > 0)
+    lone = [np.count_nonzero(zeros & ~over_three(side, np.logical_or)) for side in sides]
     return int(np.sign(lone[1] - lone[0]))
 
 
@@ -421,8 +418,7 @@ def _is_cut_near(look: Look, given: Floats, facts: dict[str, Any]) -> bool:
     nearest = min(map(abs, facts["cut"]), default=np.inf)
     if nearest >= NARROW * given.max():
         return False
-    size = np.abs(look.lines[:, 0, 2]) / nearest
-    size = size[np.isfinite(size)]
+    size = np.abs(look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]) / nearest
     facts["crowded"] = float((size > 0.9).mean()) if size.size else 0.0
     slope = typical_slope(look, given, facts["cut"])
     is_even = facts["crowded"] < CROWDED and SLOPE_NEAR[0] < slope < SLOPE_NEAR[1]
@@ -446,8 +442,7 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
             return Answer("density", "", facts, which_level(look, signed=True))
     if given is not None and _is_noise(look, given, facts):
         return Answer("noisy", "distances with noise", facts | {"spacing": given})
-    middle = look.lines[:, 0, 2]
-    middle = middle[np.isfinite(middle)]
+    middle = look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]
     if len(middle) >= ENOUGH:
         size, (one, other) = np.abs(middle), look.pairs
         facts["centred"] = float(np.median(size) / np.quantile(size, 0.995))
