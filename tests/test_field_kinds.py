@@ -366,3 +366,45 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         said = refusal(GridError, make_grid, values, **PLACE, field="mask")
         ends = f"{values.min():.6g} to {values.max():.6g}"
         assert said.startswith(f"every value is {side} 0 (they go from {ends}), so their signs")
+
+
+def gyroid(period: float) -> np.ndarray:
+    """Return a gyroid whose cells are that many samples wide."""
+    x, y, z = np.indices((32,) * 3) * (2 * np.pi / period)
+    return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
+
+
+@pytest.mark.parametrize("period", [12, 16, 25.3])
+def test_a_lattice_whose_cells_repeat_with_the_samples_is_no_mask(period):
+    grid = make_grid(gyroid(period), **PLACE)
+    assert grid.field.kind == "smooth"
+
+
+@pytest.mark.parametrize("most", [100, 255])
+@pytest.mark.parametrize("width", [1.0, 1.7])
+def test_probabilities_in_whole_numbers_are_densities(most, width):
+    values = np.rint(most / (1 + np.exp(box() / width))).astype(np.uint8)
+    said = refusal(GridError, make_grid, values, **PLACE)
+    level = float(re.search(r"level=(\S+),", said).group(1))
+    assert "they look like densities" in said and 0.3 * most < level < 0.7 * most
+
+
+def test_the_level_is_between_the_plateaus_of_an_image_with_noise():
+    noise = np.random.default_rng(0).normal(size=box().shape)
+    for outside, inside, size in ((20, 300, 5), (100, 900, 30)):
+        values = np.where(box() < 0, inside, outside) + size * noise
+        said = refusal(GridError, make_grid, values.astype(np.float32), **PLACE)
+        level = float(re.search(r"level=(\S+),", said).group(1))
+        assert 0.2 < (level - outside) / (inside - outside) < 0.8
+
+
+def test_blurred_steps_of_a_thousand_are_no_noisy_distances():
+    noise = np.random.default_rng(0).normal(size=box().shape)
+    values = 650 * np.tanh(-box()) - 350 + 20 * noise
+    assert make_grid(values, **PLACE).field.kind == "smooth"
+
+
+@pytest.mark.parametrize("cut", [1.0, 0.8])
+def test_distances_cut_off_near_show_their_spacing(cut):
+    grid = make_grid(np.clip(box(), -cut, cut), origin=0)
+    assert grid.field.kind == "distance" and grid.spacing == pytest.approx((1, 1, 1), rel=0.03)

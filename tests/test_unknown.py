@@ -174,6 +174,22 @@ def test_a_value_far_off_stands_for_unknown_ones_also_beyond_samples_that_are_cu
     assert mesh.is_closed() and mesh.volume() == pytest.approx(4 / 3 * np.pi * 1000, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    "values",
+    [np.pad(np.clip(box(), -3, 3), 3), np.where(box() > 1.5, 0, np.clip(box(), -1.5, 1.5))],
+    ids=["padded", "unseen"],
+)
+def test_zeros_among_distances_are_no_surface(values):
+    mesh = reconstruct(make_grid(values, **PLACE), trilinear)
+    want = reconstruct(make_grid(np.clip(box(), -1.5, 1.5), **PLACE), trilinear)
+    assert mesh.is_closed() and mesh.volume() == pytest.approx(want.volume(), rel=0.01)
+
+
+def test_labels_beside_unknown_samples_are_labels():
+    values = np.where(box() < -3, 2, np.where(box() < 0, 1, np.nan))
+    assert "they look like labels (1, 2)" in refusal(GridError, make_grid, values, **PLACE)
+
+
 @pytest.mark.parametrize("cut", [0.2, 1, 3])
 @pytest.mark.parametrize("make", [box, thin_frame])
 def test_values_that_are_cut_off_were_seen(cut, make):

@@ -178,7 +178,9 @@ def _check_size(look: Look) -> None:
         raise GridError(f"every value is {only}: a constant field has no surface")
     largest = max(abs(look.low), abs(look.high))
     if not ORDINARY[0] < largest < ORDINARY[1]:
-        raise GridError(f"the largest value is {largest:.6g}: multiply the values, --scale")
+        end = look.high if look.high == largest else look.low
+        said = f"if it stands for unknown ones, --unknown {end:.17g}, else multiply them, --scale"
+        raise GridError(f"the largest value is {end:.6g}: {said}")
 
 
 def _refused(answer: Answer, look: Look, given: SampleArray) -> GridError:

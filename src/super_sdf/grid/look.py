@@ -30,10 +30,11 @@ TELLING = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
 AS_GOOD = 0.9  # of the largest mean step of neighbours over a level
 GROWS = 2.0  # times the share of all samples, that of the border above a level of unsigned values
-SHARE, LEAST = 0.05, 20  # of the most steps over any level, and steps, that count
+SHARE, LEAST = 0.01, 20  # of the most steps over any level, and steps, that count
 MOST_OUTSIDE = 0.65  # of the border, above a level: maps of noise to .55, distances from .76
 MOST_NAMED = 8  # labels that a message lists
 TRIED = 4096  # samples whose different values are counted first
+BENT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
 GOLDEN = 0.6180339887  # its multiples, less whole numbers, are spread evenly from 0 to 1
 
 AXES = np.array([[0, 0, 0], *np.kron(np.eye(3, dtype=int), [[-2], [-1], [1], [2]])])
@@ -76,6 +77,12 @@ class Look:
     def cut(self) -> list[float]:
         """The lowest and the highest value, as far as many samples have them: cut off there."""
         return [value for value in (self.low, self.high) if value in self.frequent]
+
+    @property
+    def box_lines(self) -> Floats:
+        """The lines (n, 3, 5) through the middles of the boxes."""
+        boxes = self.boxes
+        return np.stack([boxes[:, :, 2, 2], boxes[:, 2, :, 2], boxes[:, 2, 2]], 1)
 
     def without(self, value: float) -> Look:
         """Return the same with the kept samples of a value unknown."""
@@ -290,6 +297,35 @@ def last_digit(look: Look) -> float:
     return float(np.median(np.diff(values))) * largest if len(values) > 1 else 0.0
 
 
+def smooth_gradients(lines: Floats) -> tuple[Floats, int]:
+    """Return the gradients (n, 3) at samples, of lines (m, 3, 5), where no kink is near.
+
+    They are of fourth order where five samples in a row are known and their fourth differences are
+    small; else of second order where second differences are small. The number is of the first.
+    """
+    a, b, c, d, e = np.moveaxis(lines, -1, 0)
+    second, fourth = (d - b) / 2, (8 * (d - b) - (e - a)) / 12
+    bend = np.abs(d - 2 * c + b).sum(1)
+    rough = np.abs(e - 4 * d + 6 * c - 4 * b + a).sum(1)
+    kink = np.abs(e - 2 * d + 2 * b - a).max(1) / 2 if len(lines) else rough
+    size, other = np.sqrt((fourth**2).sum(1)), np.sqrt((second**2).sum(1))
+    smooth = (rough < BENT * size) & (kink < 2 * BENT * size)
+    flat = np.isnan(size) & (bend < BENT * other)
+    return np.concatenate([fourth[smooth], second[flat]]), int(smooth.sum())
+
+
+def steps_by_axis(gradients: Floats) -> Floats:
+    """Return the steps along the axes with which most gradients have length 1; NaN if none do."""
+    keep = np.ones(len(gradients), bool)
+    for _ in range(6):
+        square = np.linalg.lstsq(gradients[keep] ** 2, np.ones(keep.sum()), rcond=None)[0]
+        if (square <= 0).any():
+            return np.full(3, np.nan)
+        off = np.abs(np.sqrt(gradients**2 @ square) - 1)
+        keep = off <= max(2 * np.median(off), 1e-6)
+    return np.asarray(1 / np.sqrt(square))
+
+
 # What a refusal names
 
 
@@ -313,9 +349,9 @@ def which_level(look: Look, *, signed: bool = False) -> str:
     if grows[steps.argmax()] and (all_above := share < 0.1).any():
         steps = np.where(all_above, steps, 0)
     good = levels[steps >= AS_GOOD * steps.max()]
-    middle = float(np.median(good))
+    least, middle, most = np.quantile(good, [0.4, 0.5, 0.6]).tolist()
     short = (float(f"{middle:.{digits}g}") for digits in (1, 2, 3))
-    level = next((x for x in short if good.min() <= x <= good.max()), middle)
+    level = next((x for x in short if least <= x <= most), middle)
     if look.faces.dtype.kind in "iu":
         level = float(np.floor(level)) + 0.5
     values = np.unique(np.append(look.pairs, (look.low, look.high)))

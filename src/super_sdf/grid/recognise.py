@@ -32,6 +32,8 @@ from .look import (
     equal_neighbours,
     last_digit,
     parting_level,
+    smooth_gradients,
+    steps_by_axis,
     typical_slope,
     which_label,
     which_level,
@@ -54,6 +56,7 @@ STAIRS = 0.2  # solids along the axes to .18, masks of others from .26
 ZEROS = 0.25  # share of samples at 0 beside the surface: sides that start at 0 have .3
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
 NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
+ROUGH = 1.0  # fourth differences over slopes: lattices of short periods to .5, transforms from 4.7
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
 # 4. Unknown samples: steps to a frequent value over the steepest ones; how many of them jump.
 JUMP = 1.5  # cut off 1.0, sentinels from 2
@@ -62,7 +65,6 @@ MIXED = 0.05  # cut off 0, where it is also the cut-off value from .09
 # beside the surface that differ from two others by more than they are apart.
 SLOPES = 0.95  # exact from .98; smooth unions to .83, saturating to .36, noise of .05 to .66
 CONTRADICTIONS = 0.003  # exact and cut off 0; noise of .05 voxel from .009; other slopes .02
-BENT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
 EXACT = 0.02  # spacings, and share of a slope: the error of differences of exact distances
 SAME_UNIT = 0.01  # from 1: exact to .002; saturating and smooth unions from .019
 ANOTHER_UNIT = 0.03  # from 1: up to this, values are divided by their slope, with a note
@@ -78,6 +80,7 @@ THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin
 # 6. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
 # samples of all.
 NOISE = 0.05  # uniform noise of .05 to .5 voxel and Gaussian to .033; logits .087, networks .096
+MOST_NOISE = 1.0  # spacings: with more, distances beside the surface say nothing of it
 NOISES = 2.5  # times its deviation, by which noise may make two samples differ
 SPREAD = 0.34  # of fourth differences, lowest quarter over median: noise from .39, fused to .29
 SMOOTH_SHARE = 0.06  # noise of .05 voxel to .03; fields of other slopes from .10
@@ -117,7 +120,9 @@ def recognise(
 ) -> Answer:
     """Return what samples are; ``given`` is the spacing (3,), ``hint`` what a file says of them."""
     facts: dict[str, Any] = {"cut": look.cut}
-    if look.is_two and hint != "labels":
+    # beside unknown samples two numbers that are not 0 are labels
+    some = look.unknown and look.low * look.high and _are_whole(np.array([look.low, look.high]))
+    if look.is_two and hint != "labels" and not some:
         return Answer("mask", "there are two values", facts)
     if hint == "labels" or (not hint and _are_labels(samples, look, facts)):
         return Answer("labels", "", facts, which_label(samples))
@@ -127,14 +132,13 @@ def recognise(
         return Answer("mask", TRANSFORM, facts | {"zeros": _side_of_zeros(look)})
     signs = look
     look = _without_sentinels(look, facts)
-    facts["digit"] = last_digit(look)
-    unit = _find_unit(np.where(np.isin(look.lines, facts["cut"]), np.nan, look.lines), given, facts)
-    enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
-    if unit is not None and enough and facts["slopes"] >= SLOPES:
-        steps = unit * (np.ones(3) if given is None else given)
-        facts["contradictions"] = _contradictions(look, steps, facts["digit"])
-        if facts["contradictions"] <= CONTRADICTIONS:
-            return _distances(look, unit, given, facts)
+    unit = _unit_of_distances(look, given, facts)
+    if unit is not None:
+        return _distances(look, unit, given, facts)
+    if look.frequent.get(0.0) and look.low < 0 < look.high:  # no surface fills a space
+        others, known = look.without(0.0), facts | {"unknown_values": [0.0]}
+        if (unit := _unit_of_distances(others, given, known)) is not None:
+            return _distances(others, unit, given, known)
     if follow and facts["stepped"]:
         return Answer("mask", TRANSFORM, facts | {"zeros": _side_of_zeros(signs)})
     if hint == "density":
@@ -145,8 +149,10 @@ def recognise(
         value = facts["perhaps_unknown"]
         said = f"beside some of the samples that are {value:g} the values jump: --unknown {value:g}"
         return Answer("smooth", "", facts, said)
-    if given is not None and _is_cut_near(look, given, facts):
-        return Answer("distance", "", facts | {"spacing": given})
+    unit = facts.get("unit") or typical_slope(look, np.ones(3), facts["cut"])
+    steps = np.full(3, unit) if given is None else given
+    if _is_cut_near(look, steps, facts):
+        return Answer("distance", "", facts | {"spacing": steps})
     return _of_both_sides(look, given, facts)
 
 
@@ -154,7 +160,7 @@ def recognise(
 
 
 def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool:
-    if not look.is_finite or not _are_whole(look.pairs.ravel()):
+    if look.infinite or not _are_whole(look.pairs.ravel()):
         return False
     found = different_values(samples)
     if found is None or not _are_whole(found[0].astype(np.float64)):
@@ -222,7 +228,27 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
             is_many = patterns > PATTERNS or patterns > OF_ALL * most
             facts.update(follow=share, shape=shape, stairs=stairs, step=typical)
             facts["stepped"] = stairs > STAIRS and is_many and len(cut) < 2
-    return bool(facts["follow"] >= FOLLOW)
+    if facts["follow"] < FOLLOW or (look.is_one_sided and _fades_out(look, given, facts)):
+        return False
+    a, b, c, d, e = np.moveaxis(look.box_lines, -1, 0)
+    rough, rise = np.abs(e - 4 * d + 6 * c - 4 * b + a).sum(1), np.abs(d - b).sum(1) / 2
+    known = np.isfinite(rough + rise)
+    return bool(np.median(rough[known]) >= ROUGH * np.median(rise[known])) or not known.any()
+
+
+def _fades_out(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
+    """Return whether values of one side grow as no transform does, as an image that fades to 0.
+
+    Distances grow by a step from sample to sample, unless they are squared: then they are sums of
+    three squares of steps, which 7, 15, 23 and 28 are not. And they have no flat top.
+    """
+    step, values = facts["step"], np.abs(look.pairs)
+    longest = step * (1.0 if given is None else float(given.max() / given.min()))
+    if np.quantile(np.abs(values[0] - values[1]), 0.99) <= 2 * longest:
+        return False
+    is_cut = (look.high if look.low >= 0 else look.low) in facts["cut"]
+    squares = np.unique(values / step)
+    return bool(is_cut or np.isin((7, 15, 23, 28), squares.round(3)).any())
 
 
 def _jump_over_0(look: Look) -> bool:
@@ -250,10 +276,8 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
     is_frequent, found = np.isin(look.pairs, list(look.frequent)).all(0), []
     for value in look.frequent:
         at = (look.pairs == value).any(0)
-        others, steps = look.pairs[:, ~at], change[at & ~is_frequent]
-        if others.size and np.abs(others - value).min() > np.ptp(others):  # far off, as -1000
-            found.append(value)
-            continue
+        steps = change[at & ~is_frequent]
+        steps = steps if len(steps) else change[at]  # only beside samples that are cut off
         if not len(steps) or at.all():
             continue
         jumps = float((steps > JUMP * np.quantile(change[~at], 0.99)).mean())
@@ -275,12 +299,24 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
 # Question 5: distances
 
 
+def _unit_of_distances(look: Look, given: Floats | None, facts: dict[str, Any]) -> Any:
+    """Return the unit of values that are distances, see ``_find_unit``; None if they are none."""
+    facts["digit"] = last_digit(look)
+    unit = _find_unit(np.where(np.isin(look.lines, facts["cut"]), np.nan, look.lines), given, facts)
+    enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
+    if unit is None or not enough or facts["slopes"] < SLOPES:
+        return None
+    steps = unit * (np.ones(3) if given is None else given)
+    facts["contradictions"] = _contradictions(look, steps, facts["digit"])
+    return unit if facts["contradictions"] <= CONTRADICTIONS else None
+
+
 def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> Any:
     """Return how much values change from sample to sample, by axis if they differ; None if unclear.
 
     It is the commonest slope of the smooth samples; with a spacing it is in this, 1 for distances.
     """
-    gradients, fourth = _smooth_gradients(inner)
+    gradients, fourth = smooth_gradients(inner)
     facts["smooth"] = len(gradients) / max(len(inner), 1)
     facts["slopes"] = 0.0
     if len(gradients) < ENOUGH:
@@ -295,41 +331,12 @@ def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> An
     error = EXACT + min(facts["digit"] / unit / h, MOST_DIGIT) / 2
     facts["slopes"] = float((np.abs(slope / unit - 1) < error).mean())
     if facts["slopes"] < SLOPES and len(gradients) > 5 * ENOUGH:
-        axes = _by_axis(gradients)
+        axes = steps_by_axis(gradients)
         share = float((np.abs(np.sqrt(((gradients / axes) ** 2).sum(1)) - 1) < EXACT).mean())
         if share >= SLOPES:
             facts["slopes"] = share
             return axes
     return unit
-
-
-def _smooth_gradients(lines: Floats) -> tuple[Floats, int]:
-    """Return the gradients (n, 3) at samples, of lines (m, 3, 5), where no kink is near.
-
-    They are of fourth order where five samples in a row are known and their fourth differences are
-    small; else of second order where second differences are small. The number is of the first.
-    """
-    a, b, c, d, e = np.moveaxis(lines, -1, 0)
-    second, fourth = (d - b) / 2, (8 * (d - b) - (e - a)) / 12
-    bend = np.abs(d - 2 * c + b).sum(1)
-    rough = np.abs(e - 4 * d + 6 * c - 4 * b + a).sum(1)
-    kink = np.abs(e - 2 * d + 2 * b - a).max(1) / 2 if len(lines) else rough
-    size, other = np.sqrt((fourth**2).sum(1)), np.sqrt((second**2).sum(1))
-    smooth = (rough < BENT * size) & (kink < 2 * BENT * size)
-    flat = np.isnan(size) & (bend < BENT * other)
-    return np.concatenate([fourth[smooth], second[flat]]), int(smooth.sum())
-
-
-def _by_axis(gradients: Floats) -> Floats:
-    """Return the steps along the axes with which most gradients have length 1; NaN if none do."""
-    keep = np.ones(len(gradients), bool)
-    for _ in range(6):
-        square = np.linalg.lstsq(gradients[keep] ** 2, np.ones(keep.sum()), rcond=None)[0]
-        if (square <= 0).any():
-            return np.full(3, np.nan)
-        off = np.abs(np.sqrt(gradients**2 @ square) - 1)
-        keep = off <= max(2 * np.median(off), 1e-6)
-    return np.asarray(1 / np.sqrt(square))
 
 
 def _contradictions(look: Look, steps: Floats, digit: float, noise: float = 0.0) -> float:
@@ -470,16 +477,14 @@ def _before_rounding(look: Look, digit: float, given: Floats | None) -> Floats |
 
 def _is_noise(look: Look, steps: Floats, facts: dict[str, Any]) -> bool:
     """Return whether noise as large as fourth differences show explains what contradicts."""
-    boxes = look.boxes
-    lines = np.stack([boxes[:, :, 2, 2], boxes[:, 2, :, 2], boxes[:, 2, 2]], 1)
-    fourth = np.abs(np.diff(lines, 4, axis=-1)[..., 0])
+    fourth = np.abs(np.diff(look.box_lines, 4, axis=-1)[..., 0])
     fourth = fourth[np.isfinite(fourth)]
     if len(fourth) < 5 * ENOUGH or facts["smooth"] > SMOOTH_SHARE:
         return False
     # a quarter of the differences of normal noise is below .3186 sqrt(70) of its deviation
     quarter = float(np.quantile(fourth, 0.25))
     facts["noise"] = noise = quarter / 0.3186 / 70**0.5 / float(steps.max())
-    if quarter < SPREAD * np.median(fourth):
+    if quarter < SPREAD * np.median(fourth) or noise > MOST_NOISE:
         return False
     without, allowed = (_contradictions(look, steps, facts["digit"], x) for x in (0.0, noise))
     return without > CONTRADICTIONS and allowed <= NOISE
