@@ -120,6 +120,12 @@ def test_a_segment_alone_is_a_mask_as_are_fractions_over_a_half():
     assert np.array_equal(read("c.dcm:two")[2], parts % 3 == 2)
 
 
+def test_a_segmentation_that_is_cut_off_is_refused():
+    save_segments("a.dcm", [(1, 2.0 * k, mask(k)) for k in range(6)], ["only"])
+    Path("a.dcm").write_bytes(Path("a.dcm").read_bytes()[:-12])
+    assert "cannot be read: it is truncated" in refusal(SuperSdfError, read_grid, "a.dcm")
+
+
 def test_segments_that_do_not_go_together_are_refused():
     save_segments("a.dcm", [(1, 0.0, mask(0)), (2, 0.0, mask(0))], ["one", "two"])
     said = "a.dcm: its segments overlap: give one of them, a.dcm:two"

@@ -126,10 +126,15 @@ def _elements(groups: Iterable[Any]) -> dict[str, Any]:
 
 def _pixels(frame: _Frame) -> NDArray[Any]:
     """Return the values of all frames in the file of one: FileError names it if it is damaged."""
-    from pydicom.pixels.utils import pixel_array
+    from pydicom import dcmread
+    from pydicom.pixels.utils import get_expected_length, pixel_array
 
     try:
-        return np.asarray(pixel_array(frame.path)).reshape(-1, *frame.shape)
+        image = dcmread(frame.path)
+        is_packed = image.file_meta.TransferSyntaxUID.is_compressed
+        if not is_packed and len(image.PixelData) < get_expected_length(image):
+            raise EOFError("it is truncated")  # of single bits pydicom takes the rest for 0
+        return np.asarray(pixel_array(image)).reshape(-1, *frame.shape)
     except Exception as error:
         raise FileError(f"{frame.path} cannot be read: {' '.join(str(error).split())}") from error
 
