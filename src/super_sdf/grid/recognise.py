@@ -115,6 +115,7 @@ class Answer:
     refusal: str = ""
 
 
+@np.errstate(all="ignore")  # a value for unknown samples may be the largest number that there is
 def recognise(
     samples: SampleArray, look: Look, given: Floats | None = None, hint: str = ""
 ) -> Answer:
