@@ -165,6 +165,15 @@ def test_a_value_where_nothing_was_seen_is_told_by_its_jumps(value):
     assert mesh.volume() == pytest.approx(same.volume(), rel=1e-3)
 
 
+def test_a_value_far_off_stands_for_unknown_ones_also_beyond_samples_that_are_cut_off():
+    distances = np.linalg.norm(np.indices((32,) * 3).T - 15.5, axis=-1) - 10
+    values = np.where(distances > 6, -1000, np.clip(distances, -4, 4))
+    grid = make_grid(values, **PLACE)
+    assert "samples are exactly -1000, where no distance is" in grid.notes[0]
+    mesh = reconstruct(grid, trilinear)
+    assert mesh.is_closed() and mesh.volume() == pytest.approx(4 / 3 * np.pi * 1000, rel=0.01)
+
+
 @pytest.mark.parametrize("cut", [0.2, 1, 3])
 @pytest.mark.parametrize("make", [box, thin_frame])
 def test_values_that_are_cut_off_were_seen(cut, make):

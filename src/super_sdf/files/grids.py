@@ -62,7 +62,7 @@ def read_grid(
         The anatomical space of the grid's world; for files that state theirs. Default: that one.
     max_memory : int, optional
         Bytes that this process may hold in all. Default: a share of the free memory.
-    inside, field, label, level, scale
+    inside, field, label, level, scale, unknown
         What the values are; see ``make_grid``.
 
     Raises
@@ -180,7 +180,7 @@ def grid_from_image(
         The name of an array of numbers at its points or, if no array there has that name, in its
         cells; samples in cells are at their centres. Default: the active scalars of the points,
         else of the cells, else the only array.
-    max_memory, inside, field, label, level, scale
+    max_memory, inside, field, label, level, scale, unknown
         As in ``read_grid``.
 
     Raises

@@ -86,7 +86,7 @@ class ImageAccessor:
         ----------
         factor, quality, network, offset, cap, mesher, max_memory, progress
             See ``reconstruct``.
-        scalars, inside, field, label, level, scale
+        scalars, inside, field, label, level, scale, unknown
             See ``grid``.
         residuals : bool
             Also return the array "residual" of the points, float32: how far the surface is from

@@ -253,7 +253,10 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
     is_frequent, found = np.isin(look.pairs, list(look.frequent)).all(0), []
     for value in look.frequent:
         at = (look.pairs == value).any(0)
-        steps = change[at & ~is_frequent]
+        others, steps = look.pairs[:, ~at], change[at & ~is_frequent]
+        if others.size and np.abs(others - value).min() > np.ptp(others):  # far off, as -1000
+            found.append(value)
+            continue
         if not len(steps) or at.all():
             continue
         jumps = float((steps > JUMP * np.quantile(change[~at], 0.99)).mean())
