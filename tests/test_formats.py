@@ -47,16 +47,6 @@ def test_axes_in_any_order_and_direction_with_any_spacing(name, turn, is_oblique
     assert np.allclose(grid.direction, nearest, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["a.nii", "a.nrrd"])
-def test_distances_on_a_sheared_grid_are_refused(name):
-    shear = np.eye(3)
-    shear[:, 1] = [0.6, 0.8, 0]
-    save(name, affine_of(shear))
-    assert "its axes are not at right angles" in refusal(
-        GridError, read_grid, name, field="distance"
-    )
-
-
 def test_a_direction_is_given_where_the_file_has_none():
     affine = affine_of(OBLIQUE)
     place = {"spacing": STEPS, "origin": affine[:3, 3], "direction": OBLIQUE}
