@@ -121,7 +121,9 @@ def look_at(samples: SampleArray) -> Look:
     if high <= 0:
         changes = np.array([np.count_nonzero(plane < 0) for plane in samples])
     part, own = _part_of(samples, changes)
-    is_two = _has_two([part], low, high) and _has_two(samples, low, high)
+    # beside unknown samples two numbers that are not 0 may be labels
+    is_two = not (unknown and low * high)
+    is_two = is_two and _has_two([part], low, high) and _has_two(samples, low, high)
     return _closer(replace(look, is_two=is_two), part, own)
 
 

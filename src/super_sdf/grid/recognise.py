@@ -98,16 +98,12 @@ ENOUGH = 20  # samples from which a share is evidence
 
 CENTRE_OF_5 = 62  # of the samples in a box of 5 x 5 x 5
 FACES_OF_3 = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
-LENGTHS = BOX.astype(np.float64)
 TRANSFORM = "a distance transform, so only their sign says something"
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """One of six kinds, what decided, what was measured, and why it cannot be meshed, if so.
-
-    Of labels and densities the user has to choose some, so they are no kinds of ``--field``.
-    """
+    """One of six kinds, of which labels and densities need a choice, and why; or a refusal."""
 
     kind: str
     why: str = ""
@@ -121,9 +117,7 @@ def recognise(
 ) -> Answer:
     """Return what samples are; ``given`` is the spacing (3,), ``hint`` what a file says of them."""
     facts: dict[str, Any] = {"cut": look.cut}
-    # beside unknown samples two numbers that are not 0 are labels
-    some = look.unknown and look.low * look.high and _are_whole(np.array([look.low, look.high]))
-    if look.is_two and hint != "labels" and not some:
+    if look.is_two and hint != "labels":
         return Answer("mask", "there are two values", facts)
     if hint == "labels" or (not hint and _are_labels(samples, look, facts)):
         return Answer("labels", "", facts, which_label(samples))
@@ -346,7 +340,7 @@ def _contradictions(look: Look, steps: Floats, digit: float, noise: float = 0.0)
         return 0.0
     h = float(steps.max())
     boxes = look.boxes.reshape(len(look.boxes), -1) / h
-    apart = np.sqrt(((LENGTHS * steps / h) ** 2).sum(1))
+    apart = np.sqrt(((BOX * steps / h) ** 2).sum(1))
     allowed = max(EXACT, min(digit / h, MOST_DIGIT), NOISES * noise)
     beyond = np.abs(boxes - boxes[:, CENTRE_OF_5, None]) > apart + allowed
     beyond &= np.abs(boxes) < MATTERS
