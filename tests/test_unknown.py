@@ -185,6 +185,12 @@ def test_zeros_among_distances_are_no_surface(values):
     assert mesh.is_closed() and mesh.volume() == pytest.approx(want.volume(), rel=0.01)
 
 
+@pytest.mark.parametrize("low, high", [(-1, 1), (0, 1), (0.3, 0.7)])
+def test_two_values_beside_unknown_samples_are_a_mask(low, high):
+    values = np.where(np.abs(box()) > 4, np.nan, np.where(box() < 0, high, low))
+    assert make_grid(values, **PLACE, inside="positive").field.kind == "mask"
+
+
 def test_labels_beside_unknown_samples_are_labels():
     values = np.where(box() < -3, 2, np.where(box() < 0, 1, np.nan))
     assert "they look like labels (1, 2)" in refusal(GridError, make_grid, values, **PLACE)

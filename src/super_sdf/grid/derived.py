@@ -216,6 +216,7 @@ class Resampled(SamplePlanes):
         before, after = [lines[0] + 2 * first, lines[0] + first], [lines[-1] + last] * 2
         after[1] = after[1] + last
         around = np.concatenate([before, lines, after])  # continued linearly by two
+        wide = np.pad(lines, ((0, 0), *((ACROSS, ACROSS),) * 2), constant_values=np.nan)
         slopes, values = self._slopes(lines, around), np.empty((len(places), *lines.shape[1:]))
         for start in range(0, len(places), PLACES):
             some = slice(start, start + PLACES)
@@ -231,7 +232,7 @@ class Resampled(SamplePlanes):
             near = [x < reach + s * self.h for x, s in zip(off, (share, rest))]
             which = np.nonzero(near[0] & near[1] & (share > 0) & (share < 1))
             at = cells[which[0]], *which[1:]
-            smooth[which] = self._bounded(smooth[which], lines, at, share[which[0], 0, 0])
+            smooth[which] = self._bounded(smooth[which], wide, at, share[which[0], 0, 0])
             values[some] = smooth
         return values
 
@@ -270,10 +271,12 @@ class Resampled(SamplePlanes):
         return np.where(is_wall, wall * side + self.level, smooth)
 
     def _bounded(
-        self, values: Floats, lines: Floats, at: tuple[NDArray[np.intp], ...], share: Floats
+        self, values: Floats, around: Floats, at: tuple[NDArray[np.intp], ...], share: Floats
     ) -> Floats:
-        """Return values between samples, (n,), kept within what the samples round them allow."""
-        around = np.pad(lines, ((0, 0), *((ACROSS, ACROSS),) * 2), constant_values=np.nan)
+        """Return values between samples, (n,), kept within what the samples round them allow.
+
+        ``around`` are the lines, and ``ACROSS`` unknown ones on every side.
+        """
         cells, row, column = at
         low, high = np.full(len(values), -np.inf), np.full(len(values), np.inf)
         for cell, along in ((cells, share), (cells + 1, 1 - share)):

@@ -165,7 +165,7 @@ def interpret(
     if answer.refusal and not (
         answer.kind == DISTANCE and wanted.inside != AUTO and look.is_one_sided
     ):
-        raise _refused(answer, look, given if wanted.scale else samples)
+        raise _refused(answer, look, given if wanted.scale else None)
     return _as_recognised(case, answer, given)
 
 
@@ -183,10 +183,10 @@ def _check_size(look: Look) -> None:
         raise GridError(f"the largest value is {end:.6g}: {said}")
 
 
-def _refused(answer: Answer, look: Look, given: SampleArray) -> GridError:
-    """Return the error for values that cannot be meshed as they are."""
+def _refused(answer: Answer, look: Look, given: SampleArray | None) -> GridError:
+    """Return the error for values that cannot be meshed; they were ``given`` with another scale."""
     said, side = answer.refusal, ""
-    if answer.kind == DENSITY:  # a level is one of the values
+    if answer.kind == DENSITY and given is not None:  # a level is one of these values
         said = which_level(look_at(given), signed=not look.is_one_sided)
     if look.is_one_sided:
         which = (

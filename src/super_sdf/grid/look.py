@@ -121,9 +121,7 @@ def look_at(samples: SampleArray) -> Look:
     if high <= 0:
         changes = np.array([np.count_nonzero(plane < 0) for plane in samples])
     part, own = _part_of(samples, changes)
-    # beside unknown samples two numbers that are not 0 may be labels
-    is_two = not (unknown and low * high)
-    is_two = is_two and _has_two([part], low, high) and _has_two(samples, low, high)
+    is_two = _has_two([part], low, high) and _has_two(samples, low, high)
     return _closer(replace(look, is_two=is_two), part, own)
 
 
@@ -132,7 +130,10 @@ def _has_two(values: Iterable[NDArray[Any]], low: float, high: float) -> bool:
 
 
 def _part_of(samples: SampleArray, changes: NDArray[np.int64]) -> tuple[NDArray[Any], BoolArray]:
-    """Return the part that is asked, (p, ny, nz), and which planes are not there for others."""
+    """Return the planes that are looked at, (p, ny, nz), and from which of them samples are kept.
+
+    The other planes are the neighbours of these.
+    """
     count, plane = len(samples), int(np.prod(samples.shape[1:]))
     small = samples.dtype in (np.float16, np.float32) or samples.dtype.itemsize < 3
     kind = np.float32 if small else np.float64

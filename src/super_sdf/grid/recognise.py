@@ -117,10 +117,12 @@ def recognise(
 ) -> Answer:
     """Return what samples are; ``given`` is the spacing (3,), ``hint`` what a file says of them."""
     facts: dict[str, Any] = {"cut": look.cut}
-    if look.is_two and hint != "labels":
-        return Answer("mask", "there are two values", facts)
-    if hint == "labels" or (not hint and _are_labels(samples, look, facts)):
+    is_mask = look.is_two and hint != "labels"
+    may_be_labels = not is_mask or (look.unknown and look.low > 0)  # such as 1 and 2 beside NaN
+    if hint == "labels" or (not hint and may_be_labels and _are_labels(samples, look, facts)):
         return Answer("labels", "", facts, which_label(samples))
+    if is_mask:
+        return Answer("mask", "there are two values", facts)
     follow = not hint and _follow_from_signs(look, given, facts)
     is_sure = follow and (facts["shape"] >= FOLLOW or facts["zeros"] >= ZEROS)
     if (is_sure and facts["stepped"]) or (follow and _jump_over_0(look)):
@@ -161,7 +163,6 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
     if found is None or not _are_whole(found[0].astype(np.float64)):
         return False
     distinct, counts = found
-    facts["different"] = len(distinct)
     ranks = np.abs(np.diff(np.searchsorted(distinct, look.pairs), axis=0))
     facts["by_rank"] = float((ranks == 1).mean())
     inner = ~np.isnan(look.part) & (look.part != distinct[counts.argmax()])
@@ -220,13 +221,13 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
         if share > facts["follow"] or (share >= FOLLOW and len(x) > most):
             most, patterns = len(x), int(np.count_nonzero(~same)) + 1
             stairs = float((along[free].reshape(most, -1, 2).any(2).sum(1) > 1).mean())
-            is_many = patterns > PATTERNS or patterns > OF_ALL * most
             facts.update(follow=share, shape=shape, stairs=stairs, step=typical)
+            is_many = patterns > min(PATTERNS, OF_ALL * most)
             facts["stepped"] = stairs > STAIRS and is_many and len(cut) < 2
     if facts["follow"] < FOLLOW or (look.is_one_sided and _fades_out(look, given, facts)):
         return False
-    a, b, c, d, e = np.moveaxis(look.box_lines, -1, 0)
-    rough, rise = np.abs(e - 4 * d + 6 * c - 4 * b + a).sum(1), np.abs(d - b).sum(1) / 2
+    rough = np.abs(np.diff(look.box_lines, 4)[..., 0]).sum(1)
+    rise = np.abs(np.diff(look.box_lines[..., 1::2])[..., 0]).sum(1) / 2
     known = np.isfinite(rough + rise)
     return bool(np.median(rough[known]) >= ROUGH * np.median(rise[known])) or not known.any()
 
