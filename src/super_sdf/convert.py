@@ -130,7 +130,7 @@ def _facts(
 ) -> dict[str, Any]:
     """Return what is known of a mesh, for JSON."""
     notes, warnings = list(made.lattice.notes), _warnings(grid, made, options.offset)
-    capped = options.cap and made.leaves
+    capped, columns = options.cap and made.leaves, mesh.vertices.T  # in world units
     if capped:
         closed = "its surface is closed along the border (leave it open with --open)"
         notes.append(f"the solid runs out of the grid: {closed}")
@@ -143,7 +143,7 @@ def _facts(
         "triangles": len(mesh.faces),
         "tiles": made.tiles,
         "factor": options.factor_for(mask=grid.field.sides_only),
-        "bounds": [mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()],  # in world units
+        "bounds": [[x.min().item() for x in columns], [x.max().item() for x in columns]],
         "closed": mesh.is_closed() if simplified else not made.open_edges,
         "capped": capped,
         "field": grid.field.report(),

@@ -94,14 +94,14 @@ def decode(
     network: Decoder,
     inputs: tuple[FloatArray, IntArray, IntArray],
     offsets: FloatArray,
+    blocks: FloatArray,
     threads: int = 1,
-) -> FloatArray:
-    """Run a network once, and return its values as blocks, (Q, D + 1) float32.
+) -> None:
+    """Run a network once, and write its values into blocks, (Q, D) float32.
 
     ``inputs`` are patches (V, 27), neighbour table (V, 27) and voxels (D,); ``offsets``, (Q, 3),
-    are in half voxels, and so are the values: a row per offset, a column per voxel, and a last
-    column of zeros, see ``refine.nodes``. ModelError if they have another shape or type, or are not
-    finite: later steps do not check.
+    are in half voxels, and so are the values: a row per offset, a column per voxel. ModelError if
+    they have another shape or type, or are not finite: later steps do not check.
     """
     count, width = len(inputs[2]), len(offsets)
     values: Any = network(*inputs, offsets)
@@ -111,7 +111,6 @@ def decode(
             f"the network gave {getattr(values, 'dtype', type(values).__name__)} of shape "
             f"{np.shape(values)} instead of float32 of shape {(count, width)}, (voxels, offsets)"
         )
-    blocks = np.zeros((width, count + 1), np.float32)
 
     def transpose_and_check(rows: slice) -> bool:
         with np.errstate(over="ignore"):  # values that are too large are found
@@ -124,4 +123,3 @@ def decode(
             "the network gave values that are NaN, infinite or beyond 1e15: it cannot be used for "
             "this grid; use another --model"
         )
-    return blocks

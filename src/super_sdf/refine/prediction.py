@@ -47,19 +47,18 @@ def predict(
     """
     plane, offsets, reach = band.voxel_ijk[:, 0], block_offsets(factor), network.receptive_field
     parts = -(-len(plane) // AT_ONCE)
-    if parts == 1 or reach is None:
-        return decode(network, (band.patches, table, voxels), offsets, threads)
     blocks = np.zeros((len(offsets), len(voxels) + 1), np.float32)
+    if parts == 1 or reach is None:
+        decode(network, (band.patches, table, voxels), offsets, blocks[:, :-1], threads)
+        return blocks
     ends = {-1, *plane[np.arange(1, parts) * len(plane) // parts].tolist(), band.grid.shape[0]}
     for first, last in pairwise(sorted(ends)):  # the planes after the first, to the last
         start, stop = np.searchsorted(plane, [first + 1 - reach, last + 1 + reach])
-        own = np.flatnonzero((plane[voxels] > first) & (plane[voxels] <= last))
-        if not len(own):
-            continue
+        own = slice(*np.searchsorted(plane[voxels], [first, last], "right").tolist())
         near = table[start:stop] - np.int32(start)
         near[(near < 0) | (near >= stop - start)] = -1
         inputs = band.patches[start:stop], near, voxels[own] - np.int32(start)
-        blocks[:, own] = decode(network, inputs, offsets, threads)[:, :-1]
+        decode(network, inputs, offsets, blocks[:, own], threads)
         if progress:
             progress(last / band.grid.shape[0])
     return blocks

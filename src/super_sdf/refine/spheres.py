@@ -55,6 +55,7 @@ REACH_IN_VOXELS = len(CELLS) + 2 + 2 + 1
 
 Spheres: TypeAlias = tuple[IntArray, FloatArray, FloatArray]
 """Samples (3, n), their signed distances (n,), and directions, about the gradients there (3, n)."""
+Feet: TypeAlias = tuple[IntArray, FloatArray, FloatArray, FloatArray]  # block, place, error, weight
 
 
 class Look(NamedTuple):
@@ -90,7 +91,8 @@ def fit_to_spheres(
         return find_foot_points(blocks, factor, spheres, index)
 
     feet = map_chunks(touch, len(distance), TEMPORARIES, threads)
-    correction = find_correction(parts, *(np.concatenate(each, -1) for each in zip(*feet)))
+    rows, place, errors, weights = (np.concatenate(each, -1) for each in zip(*feet))
+    correction = find_correction(parts, (rows, place, errors, weights), threads)
 
     def subtract(rows: slice) -> None:
         blocks[:, rows] -= prolong(correction[:, rows], 2, factor)
@@ -136,16 +138,13 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
     )
 
 
-def find_foot_points(
-    blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex
-) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Return foot points of samples: their blocks, places in these, errors and weights.
+def find_foot_points(blocks: FloatArray, factor: int, spheres: Spheres, index: VoxelIndex) -> Feet:
+    """Return foot points of samples; those outside all blocks (Q, D + 1) are left out.
 
-    Those outside all blocks (Q, D + 1) are left out. The weight, 0 to 1, falls with the angle
-    between direction and normal, with the error (a Cauchy weight: a large error is probably a place
-    on the wrong part of the surface), and with the sample's distance, since an error of the
-    direction matters more. Spheres from beyond the band mostly touch edges, which linear cells cut
-    off: that they are clear of them is no error.
+    The weight, 0 to 1, falls with the angle between direction and normal, with the error (a Cauchy
+    weight: a large error is probably a place on the wrong part of the surface), and with the
+    sample's distance, since an error of the direction matters more. Spheres from beyond the band
+    mostly touch edges, which linear cells cut off: that they are clear of them is no error.
     """
     centre, distance, direction = spheres
 
@@ -236,16 +235,14 @@ def _find_cell(place: FloatArray, cells: int) -> tuple[IntArray, FloatArray]:
     return low, scaled - low.astype(np.float32)
 
 
-def find_correction(
-    parts: SharedParts, rows: IntArray, place: FloatArray, errors: FloatArray, weights: FloatArray
-) -> FloatArray:
+def find_correction(parts: SharedParts, feet: Feet, threads: int = 1) -> FloatArray:
     """Return the correction on the lattice of 2 cells per block, (27, D), in half voxels.
 
     It is the mean error of foot points at the corners of voxels, plus the means at the nodes of the
     lattice of the errors that are left each time. Where errors disagree, means are smaller. Errors
     are summed in the order of the samples, some at a time, to save memory.
     """
-    numbers, count = number_parts(parts, 2)  # one node per part
+    (rows, place, errors, weights), (numbers, count) = feet, number_parts(parts, 2)  # one per part
     correction, left = np.zeros(numbers.shape, np.float32), errors.copy()
 
     def nodes_round(some: slice) -> tuple[NDArray[np.intp], FloatArray]:
@@ -256,6 +253,10 @@ def find_correction(
         x, y, z = CORNERS.T
         at = (step @ low + (CORNERS @ step)[:, None]) * numbers.shape[1] + rows[some]
         return numbers.ravel().take(at).astype(np.intp), upper[x, 0] * upper[y, 1] * upper[z, 2]
+
+    def reduce(some: slice) -> None:
+        at, shares = nodes_round(some)
+        left[some] -= (means.take(at) * shares).sum(0)
 
     def mean(some: slice) -> FloatArray:
         weight, total, squares = sums[:, some]
@@ -268,14 +269,12 @@ def find_correction(
         sums = np.zeros((3, count))  # of weights, errors and squares
         for some in chunks_of(len(rows), TEMPORARIES):
             at, shares = nodes_round(some)
-            weight = (shares * weights[some]).T.astype(np.float64)
+            at, weight = at.T.ravel(), (shares * weights[some]).T.astype(np.float64, "C")
             for total in sums:
-                np.add.at(total, at.T.ravel(), weight.ravel())
+                np.add.at(total, at, weight.ravel())
                 weight *= left[some, None]
-        means = np.concatenate(map_chunks(mean, count, 8))
-        for some in chunks_of(len(rows), TEMPORARIES):
-            at, shares = nodes_round(some)
-            left[some] -= (means.take(at) * shares).sum(0)
+        means = np.concatenate(map_chunks(mean, count, 8, threads))
+        map_chunks(reduce, len(rows), TEMPORARIES, threads)
         own = CORNER_PARTS if cells == 1 else slice(None)
         for some in chunks_of(len(correction[0]), 4 * len(correction)):
             correction[:, some] += prolong(means.take(numbers[own, some]), cells, 2)
