@@ -22,8 +22,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, cross
-from ..arrays import unit as of_length_1
+from ..arrays import BoolArray, FloatArray, cross, unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
 from ..surface.mesh import Mesh, check_mesh
@@ -109,7 +108,7 @@ def write_mesh(
         finite, or corners of a triangle would coincide.
     """
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
-    path = check_free(check_mesh_suffix(check_path(path, "path"), world.unit), force=force)
+    path = check_free(check_mesh_suffix(check_path(path), world.unit), force=force)
     write_meshes({path: {"": mesh}}, force=force, world=world)
 
 
