@@ -53,13 +53,10 @@ def read_vtk(request: Request) -> Volume:
         if len(text[start:].split()) < sum(each.GetNumberOfValues() for each, _ in arrays.values()):
             raise FileError("it is truncated")
     # what has several numbers a sample, and VTK's own marks, is read only if it is named
-    plain = [
-        name
-        for name, (array, _) in arrays.items()
-        if name == request.member
-        or (array.GetNumberOfComponents() == 1 and name.removeprefix("CellData/") not in MARKS)
-    ]
-    name = request.choose(plain or list(arrays), "array of points or cells")
+    single = [name for name, (array, _) in arrays.items() if array.GetNumberOfComponents() == 1]
+    plain = [name for name in single if name.removeprefix("CellData/") not in MARKS]
+    names = plain if plain and request.member not in arrays else list(arrays)
+    name = request.choose(names, "array of points or cells")
     return _volume_of(image, name, *arrays[name], *request.numbers)
 
 
