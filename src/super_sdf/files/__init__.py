@@ -1,1 +1,1 @@
-"""Grid files in, mesh files and refined fields out: libraries read the formats, complete files only."""
+"""Grid files in, mesh files and refined fields out: complete files only."""
