@@ -30,8 +30,6 @@ from .samples import EdgeCurves, sample_surface
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
 REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIELD_NOISE = range(7)
-
-
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
 SUFFIXES = (*MESH_SUFFIXES, ".gltf")
 
@@ -62,7 +60,7 @@ class Shape:
     def __init__(self, name: str, mesh: Mesh) -> None:
         self.name, self.solid = name, Solid(mesh)
         self.mesh = self.solid.mesh
-        self.drawn = sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
+        self.drawn = sample_surface(self.mesh, self.seed(REFERENCE_POINTS))
         self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
         self.pieces = self.mesh.components()[0]
 
@@ -86,13 +84,11 @@ def name_seed(name: str, stream: int) -> tuple[int, int]:
 
 
 def turn_of(name: str, seed: int) -> NDArray[np.float64]:
-    """Return the rotation matrix, (3, 3), by which a seed turns the shape of a name."""
-    return random_rotation(np.random.default_rng((seed, *name_seed(name, TURN))))
+    """Return the rotation matrix, (3, 3), by which a seed turns the shape of a name.
 
-
-def random_rotation(random: np.random.Generator) -> NDArray[np.float64]:
-    """Return a rotation matrix, (3, 3), all rotations equally likely: of a random quaternion."""
-    quaternion = random.normal(size=4)
+    All rotations are equally likely: it is that of a random quaternion.
+    """
+    quaternion = np.random.default_rng((seed, *name_seed(name, TURN))).normal(size=4)
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
