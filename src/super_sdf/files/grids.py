@@ -87,7 +87,7 @@ def read_array(
     max_memory: int | None,
 ) -> dict[str, Any]:
     """Return values, place (unless ``given``), hint, space and notes: see ``read_grid``."""
-    path, direction = check_path(path, "path"), given["direction"]
+    path, direction = check_path(path), given["direction"]
     with open_volume(path, axes, max_memory, direction) as (volume, request):
         volume = volume.in_space(space, str(path))
         if direction is not None:  # of x, y and z
@@ -202,7 +202,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     No sample is read where the format allows it. What the file does not state is None or missing.
     Raises as ``read_grid``.
     """
-    path = check_path(path, "path")
+    path = check_path(path)
     with open_volume(path) as (volume, _):
         order, _, place = find_placement(volume, {})
     shape = [volume.shape[axis] for axis in order]

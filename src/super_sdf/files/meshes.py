@@ -22,8 +22,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, cross
-from ..arrays import unit as of_length_1
+from ..arrays import BoolArray, FloatArray, cross, unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
 from ..surface.mesh import Mesh, check_mesh
@@ -113,7 +112,7 @@ def write_mesh(
         mesh; if the file cannot be written, or its format cannot hold the mesh: a coordinate is not
         finite, or corners of a triangle would coincide.
     """
-    path = check_path(path, "path")
+    path = check_path(path)
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     check_target(path, force=force, unit=world.unit)
     write_meshes({path: {"": mesh}}, force=force, world=world)

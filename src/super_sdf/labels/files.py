@@ -28,7 +28,7 @@ from ..grid.sdf_grid import SdfGrid, describe_place
 from ..network.contract import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..surface.mesh import Mesh
-from ..threads import Progress, Stopwatch
+from ..threads import Progress, Steps
 from .reconstruct import find_image, in_order, label_meshes
 from .volumes import volume_notes
 
@@ -55,10 +55,6 @@ class LabelConversion(NamedTuple):
     facts: dict[str, Any]  # as ``--json`` has them
     seconds: dict[str, float]  # per stage
 
-    def report(self) -> dict[str, Any]:
-        """Return the result as a dictionary that can be written as JSON."""
-        return self.facts
-
 
 def convert_labels(
     source: str | Path,
@@ -79,7 +75,7 @@ def convert_labels(
     the errors are those of ``convert``; options besides ``options.LABELS`` must have their
     defaults.
     """
-    watch, options = Stopwatch(), options or Options()
+    watch, options = Steps(), options or Options()
     known = names or {n: LabelName(*each) for n, each in names_in(source).items()}
     options = with_numbers(replace(options, labels=options.labels or ALL), known)
     check_mesh_suffix(Path(target), options.unit)

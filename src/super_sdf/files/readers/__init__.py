@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from ...arrays import Triple
 from ...errors import FileError, GridError, OptionError
 from ...grid.samples import UNNAMED, as_direction, as_triple, check_direction, even_steps
-from ...threads import check_bound
+from ...threads import check_fits, memory_bound
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
 MOST_NAMED = 10  # arrays that an error lists
@@ -53,7 +53,8 @@ class Request:
         """Raise OutOfMemoryError if an array that is loaded whole does not fit."""
         what = f"{self.path}, {' x '.join(map(str, shape))} {dtype}, loaded whole,"
         need = COPIES * prod(map(int, shape)) * dtype.itemsize
-        check_bound(need, what, self.max_memory, "save it as .npy in C order, or ")
+        way_out = "save it as .npy in C order, or allow more (--max-memory)"
+        check_fits(need, what, way_out, memory_bound(self.max_memory))
 
     def choose(self, names: Sequence[str], what: str) -> str:
         """Return the name of the array to read: the one asked for, else the only one."""
