@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 from .files.formats import files_of
 from .files.grids import read_grid
-from .files.meshes import World, check_target, write_meshes
-from .files.output import check_apart
+from .files.meshes import World, check_mesh_suffix, write_meshes
+from .files.output import check_apart, check_free
 from .grid.sdf_grid import SdfGrid, describe_place, mean_spacing, volume_of_samples
 from .pipeline import Result, mesh_grid
 from .threads import STEPS, Progress, Steps
@@ -57,7 +57,7 @@ def convert(
     SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
     """
     steps, files, saved = Steps(progress, STEPS), files_of(source), dict[str, Any]()
-    check_target(target, force=force, unit=options.unit)
+    check_free(check_mesh_suffix(Path(target), options.unit), force=force)
     check_apart(target, files)
     with ExitStack() as saving:
         if save_field is not None:

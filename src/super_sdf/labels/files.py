@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 from ..errors import FileError, MeshError, OptionError, flag
 from ..files.formats import check_regular_file, files_of
 from ..files.grids import names_in
-from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, write_meshes
-from ..files.output import check_apart
+from ..files.meshes import World, check_mesh_suffix, has_parts, write_meshes
+from ..files.output import check_apart, check_free
 from ..files.readers import PLACE
 from ..grid.sdf_grid import SdfGrid, describe_place
 from ..network.contract import Decoder
@@ -84,7 +84,7 @@ def convert_labels(
     called, lacking = names_of(image.labels, known), names_of(image.missing, known)
     paths = paths_of(Path(target), called, known)
     for path in dict.fromkeys(paths):
-        check_target(path, force=force)
+        check_free(path, force=force)
         check_apart(path, files_of(source))
     watch.lap("read")
     meshes, notes, warnings = label_meshes(image, network, options, progress)
