@@ -19,7 +19,7 @@ import numpy as np
 from click import Argument, Option
 
 from .. import __version__, errors
-from ..options import FLOAT32, MASK, OPTIONS, Device
+from ..options import OPTIONS, Device
 from . import main
 
 OK, MISSING, FAILED = "ok", "missing", "failed"
@@ -98,10 +98,10 @@ def check_network(name: str, device: Device) -> tuple[str, str, str]:
     from .. import load_network, make_grid, reconstruct
 
     values: Any = np.linalg.norm(np.indices((32, 32, 32)) - CENTRE, axis=0) - RADIUS
-    is_mask, what = name.startswith(MASK), f"network {name} on {device}"
+    is_mask, what = name.startswith("mask"), f"network {name} on {device}"
     grid = make_grid(values < 0 if is_mask else values, spacing=1.0, origin=0.0)
     try:  # float32, as its file for int8 is a network of its own
-        network = load_network(name, device=device, precision=FLOAT32)
+        network = load_network(name, device=device, precision="float32")
         found = reconstruct(grid, network, mesher="marching").vertices
     except errors.SuperSdfError as error:
         return FAILED, what, error.flagged
