@@ -23,8 +23,8 @@ from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.options import OPTIONS
 from super_sdf.refine.band import is_active, rescale
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.sampling import sample_grid, unit_layout
-from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
+from super_sdf.truth.sampling import sample_solid
+from super_sdf.truth.solid import Distances, Solid, load_solid
 
 from . import metrics
 from .edges import EdgeCurves
@@ -62,7 +62,9 @@ class Shape:
 
     def __init__(self, name: str, mesh: Mesh) -> None:
         self.name = name
-        self.solid = Solid(normalise(mesh))
+        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
+        size = np.linalg.norm(high - low)
+        self.solid = Solid(mesh.transformed(np.eye(3) / size, -(low + high) / 2 / size))
         self.mesh = self.solid.mesh
         self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
         self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
@@ -112,10 +114,11 @@ class Case:
         longest = float(np.ptp(shape.mesh.vertices, axis=0).max())
         self.side = longest / setting.scale if setting.scale else 1.0
         self.low = -self.side / 2
-        self.layout = unit_layout(setting.size, self.side)
-        _, self.spacing, origin = self.layout
+        n, origin = setting.size, np.full(3, (0.5 / setting.size - 0.5) * self.side)
+        self.spacing = self.side / n
         self.fine = self.spacing / self.factor
-        self.coarse = sample_grid(shape.solid, self.layout)
+        layout = (n, n, n), self.spacing, origin
+        self.coarse = sample_solid(shape.solid, layout, band=np.inf).values
         values = self.coarse.astype(np.float32)
         if setting.noise:
             random = np.random.default_rng(shape.seed(NOISE))

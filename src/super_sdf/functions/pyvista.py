@@ -124,5 +124,5 @@ class ImageAccessor:
 
             options = Options(offset=offset, max_memory=max_memory)
             found = check_mesh(mesh, grid, options)
-            surface.point_data["residual"] = found.residuals_at(found.mesh.vertices)
+            surface.point_data["residual"] = found.residuals_at(mesh.vertices)
         return surface
