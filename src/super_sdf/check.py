@@ -24,7 +24,7 @@ from .options import LENGTHS, Options
 from .refine.band import Band, no_surface, survey
 from .refine.nodes import VoxelIndex
 from .surface.mesh import Mesh
-from .threads import check_bound, give_back, useful_threads
+from .threads import check_fits, give_back, memory_bound, useful_threads
 from .truth.solid import Points, Solid, merged, read_mesh, smallest_angles
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
@@ -228,7 +228,8 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certif
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)
     need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
-    check_bound(need, f"checking {len(mesh.faces):,} triangles", options.max_memory)
+    what, most = f"checking {len(mesh.faces):,} triangles", memory_bound(options.max_memory)
+    check_fits(need, what, "allow more (--max-memory)", most)
     surface, touched = examine_surface(mesh), touch(Solid(mesh), band, lattice)
     is_mask, nearest = lattice.field.sides_only, np.rint(lattice.to_index(mesh.vertices))
     beyond = ((nearest < 0) | (nearest >= lattice.shape)).any(1)
@@ -253,10 +254,9 @@ def examine_surface(mesh: Mesh) -> Surface:
     corners, at = whole.vertices.astype(np.float64)[whole.faces], whole.faces.ravel()
     sides = (np.roll(corners, -1, axis=1) - corners).reshape(-1, 3)
     sides /= np.maximum(length(sides), 1e-300)[:, None]
+    directions = length(sums_at(at.astype(np.int64), sides, len(fans)))
     degrees = np.bincount(at, minlength=len(fans))
-    tips = (length(sums_at(at.astype(np.int64), sides, len(fans))) > NEEDLE * degrees) & (
-        degrees > 2
-    )
+    tips = (directions > NEEDLE * degrees) & (degrees > 2)
     return Surface(
         open_edges=int((uses % 2).sum()),
         crowded_edges=int((uses > 2).sum()),

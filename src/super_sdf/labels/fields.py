@@ -21,7 +21,7 @@ from ..pipeline import refine_band
 from ..refine.band import survey
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
 from ..surface.marching import strides
-from ..threads import Progress, StepCounter, check_bound, part_of, useful_threads
+from ..threads import Progress, Steps, check_fits, memory_bound, useful_threads
 from .walls import Labelled, Labels
 
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
@@ -76,7 +76,8 @@ def label_fields(
     places = np.argwhere(near).astype(np.int32)
     need = SAMPLE_BYTES * numbers.size + len(places) * (VOXEL_BYTES + NODE_BYTES * nodes)
     what = f"meshing {count} labels in {numbers.size:,} samples, {len(places):,} of them at walls,"
-    check_bound(need, what, bound, "choose fewer (--labels), a smaller factor, cut the image, or ")
+    way_out = "choose fewer (--labels), a smaller factor, or allow more (--max-memory)"
+    check_fits(need, what, way_out, memory_bound(bound))
     own, index, voxel_ijk = padded[tuple(places.T)], VoxelIndex(places, padded.shape), places - 1
     low, high = np.full((count + 1, 3), shape), np.zeros((count + 1, 3), np.intp)  # of the labels
     np.minimum.at(low, own, voxel_ijk)
@@ -94,8 +95,8 @@ def label_fields(
             continue
         rows = index.find(ijk + start + 1)
         meets = slice(None) if label else times[rows] > 1
-        share = part_of(progress, turn / (count + 1), (turn + 1) / (count + 1))
-        steps = StepCounter(share, ["network", "nodes"])
+        begin, end = turn / (count + 1), (turn + 1) / (count + 1)
+        steps = Steps(progress, ["network", "nodes"], begin, end)
         blocks = refined(mask, ijk, ijk[meets], grid, network, factor, steps)
         contest.enter(label, rows, blocks, could_hold(mask, ijk)[part])
         fields[label] = rows, blocks
@@ -110,7 +111,7 @@ def refined(
     grid: SdfGrid,
     network: Adapter,
     factor: int,
-    steps: StepCounter,
+    steps: Steps,
 ) -> FloatArray:
     """Return the blocks of voxels, (Q, n), of a mask; NaN for those that are not ``wanted``."""
     extremes = extremes_of_masks(1.0)

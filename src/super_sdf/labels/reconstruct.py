@@ -199,7 +199,7 @@ def label_meshes(
 
     OutOfMemoryError if the fields do not fit in memory.
     """
-    options.check_called(network, progress)
+    options.NETWORK.check(network, "network")
     grid, factor, count = image.grid, chosen.factor_for(mask=True), len(image.labels)
     if chosen.goals():
         check_modules("simplifying", "simplify")
