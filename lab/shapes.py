@@ -26,8 +26,7 @@ from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import sample_solid
 from super_sdf.truth.solid import Distances, Solid, load_solid
 
-from . import metrics
-from .edges import EdgeCurves
+from .samples import EdgeCurves, sample_surface
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
 REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIELD_NOISE = range(7)
@@ -58,15 +57,12 @@ class Setting:
 
 
 class Shape:
-    """A normalised reference mesh, and the points that are drawn from it for all methods."""
+    """A reference mesh in its frame, and the points that are drawn from it for all methods."""
 
     def __init__(self, name: str, mesh: Mesh) -> None:
-        self.name = name
-        low, high = mesh.vertices.min(0), mesh.vertices.max(0)
-        size = np.linalg.norm(high - low)
-        self.solid = Solid(mesh.transformed(np.eye(3) / size, -(low + high) / 2 / size))
+        self.name, self.solid = name, Solid(mesh)
         self.mesh = self.solid.mesh
-        self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
+        self.drawn = sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
         self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
         self.pieces = self.mesh.components()[0]
 
@@ -79,10 +75,17 @@ class Shape:
         """
         mesh = load_solid(path)[0].mesh
         turn = np.eye(3) if turned is None else turn_of(path.stem, turned)
-        return cls(path.stem, mesh.transformed(turn, np.zeros(3)))
+        return cls(path.stem, normalise(mesh.transformed(turn, np.zeros(3))))
 
     def seed(self, stream: int) -> tuple[int, int]:
         return name_seed(self.name, stream)
+
+
+def normalise(mesh: Mesh) -> Mesh:
+    """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
+    vertices = mesh.vertices.astype(np.float64)
+    low, high = vertices.min(0), vertices.max(0)
+    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
 
 
 def name_seed(name: str, stream: int) -> tuple[int, int]:

@@ -152,11 +152,9 @@ def _volume(
     origin = first.corner - planes.min() * shift
     off = [float(np.linalg.norm(f.corner - origin - n * shift)) for f, n in zip(frames, planes)]
     if not max(off) < (EVEN_FRAMES if more else EVEN) * step:
-        raise GridError(
-            f"{frames[int(np.argmax(off))].path.name} is {max(off):.4g} mm off from even steps of "
-            f"{step:.6g}: put all slices of one volume (one time, one echo) into a folder, or "
-            "resample the series"
-        )
+        said = f"{frames[int(np.argmax(off))].path.name} is {max(off):.4g} mm off from even steps"
+        one = "put all slices of one volume (one time, one echo) into a folder"
+        raise GridError(f"{said} of {step:.6g}: {one}, or resample the series")
     shape = int(planes.max() + planes.min()) + 1, *first.shape
 
     def load(index: Index) -> NDArray[Any]:

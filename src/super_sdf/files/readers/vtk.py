@@ -92,8 +92,7 @@ def _volume_of(image: Any, name: str, array: Any, of_points: bool, *numbers: int
     extent = np.array(image.GetExtent()) if hasattr(image, "GetExtent") else np.zeros(6, int)
     direction, first = XYZ, extent[::2]  # which need not be 0
     if image.IsA("vtkImageData"):
-        matrix = image.GetDirectionMatrix()
-        direction = np.array([[matrix.GetElement(i, j) for j in range(3)] for i in range(3)])
+        direction = np.reshape(image.GetDirectionMatrix().GetData(), (3, 3))
         spacing, origin = image.GetSpacing(), image.GetOrigin()
     elif image.IsA("vtkRectilinearGrid"):
         places = [vtk_to_numpy(getattr(image, f"Get{axis}Coordinates")()) for axis in "XYZ"]
