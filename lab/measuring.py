@@ -17,7 +17,7 @@ import super_sdf
 from super_sdf.errors import SuperSdfError
 from super_sdf.network.contract import Decoder
 from super_sdf.network.network import KIND_MODELS, find_model, load_network, shipped_models
-from super_sdf.options import AUTO, DEFAULT_QUALITY
+from super_sdf.options import DEFAULT_QUALITY
 
 from .kinds import MASKS
 from .methods import FLOOR, ON, make_surface
@@ -47,14 +47,14 @@ class Task:
     setting: Setting
     methods: tuple[str, ...]  # in the order of measuring
     model: str = DEFAULT_QUALITY
-    precision: str = AUTO
+    precision: str = "auto"
     threads: int = 0  # of the network; 0: one per core
     turned: int | None = None  # seed by which the shape is turned at random
     triangles: tuple[tuple[str, int], ...] = ()  # of methods that were measured before
 
     def network(self, method: str) -> tuple[str, str]:
         model, _, precision = method.partition("@")[2].partition(":")
-        return (model, precision or AUTO) if model else (self.model, self.precision)
+        return (model, precision or "auto") if model else (self.model, self.precision)
 
     def key(self, method: str) -> Measurement:
         """Return the key of a method's measurement: it is valid as long as nothing here changes."""
@@ -136,7 +136,7 @@ def digest_of_file(path: Path) -> str:
 
 
 @cache
-def digest_of_ours(model: str, precision: str = AUTO) -> str:
+def digest_of_ours(model: str, precision: str = "auto") -> str:
     """Return a hash of a network's file, of those that replace it for a kind, and of the code."""
     network, symmetries = find_model(model, precision)
     digest = hashlib.sha256(str(symmetries).encode())

@@ -108,7 +108,7 @@ FIELD_TABLE: dict[str, Callable[[FineField, Path], None]] = {
 def saving_field(
     path: str | Path, *, force: bool = False
 ) -> Iterator[Callable[[FineField], dict[str, Any]]]:
-    """Yield what writes a field, and returns what was written, to a file, there after the block."""
+    """Yield what writes a field, and returns facts of the file, which appears after the block."""
     path = check_path(path)
     kind = path.suffix.lower()
     if kind not in FIELD_TABLE:

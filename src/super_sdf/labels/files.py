@@ -26,7 +26,7 @@ from ..files.output import check_apart, check_free
 from ..files.readers import PLACE
 from ..grid.sdf_grid import SdfGrid, describe_place
 from ..network.contract import Decoder
-from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
+from ..options import LABELS, OPTIONS, Options
 from ..surface.mesh import Mesh
 from ..threads import Progress, Steps
 from .reconstruct import find_image, in_order, label_meshes
@@ -77,7 +77,7 @@ def convert_labels(
     """
     watch, options = Steps(), options or Options()
     known = names or {n: LabelName(*each) for n, each in names_in(source).items()}
-    options = with_numbers(replace(options, labels=options.labels or ALL), known)
+    options = with_numbers(replace(options, labels=options.labels or "all"), known)
     check_mesh_suffix(Path(target), options.unit)
     wanted, place = in_order(options.labels), {name: getattr(options, name) for name in PLACE}
     image = find_image(source, wanted, place, options.axes, options.max_memory, options.space)
@@ -131,7 +131,7 @@ def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:
     """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
-    usual = {name: (OPTIONS[name].default, MARCHING) for name in OPTIONS if name not in LABELS}
+    usual = {name: (OPTIONS[name].default, "marching") for name in OPTIONS if name not in LABELS}
     given = [name for name, values in usual.items() if getattr(options, name) not in values]
     for name in (*given, *more):
         raise OptionError(

@@ -40,7 +40,7 @@ SLIGHT, MOST_REPEATS = 0.01, 8  # voxels from planes within which triangles are 
 
 def reconstruct_labels(
     values: ArrayLike | str | PathLike[str],
-    labels: str | Sequence[int] = options.ALL,
+    labels: str | Sequence[int] = "all",
     network: Decoder | None = None,
     factor: int | None = None,
     *,
@@ -204,7 +204,7 @@ def label_meshes(
     if chosen.goals():
         check_modules("simplifying", "simplify")
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
-    adapter = adapt(network_for(network, options.MASK))
+    adapter = adapt(network_for(network, "mask"))
     fields = label_fields(image.numbers, count, grid, adapter, factor, chosen.max_memory, progress)
     walls = extract_walls(fields)
     del fields

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ...options import LPS
 from ..formats import check_beside
 from . import LABELS, Index, Names, Request, Volume, triple
 
@@ -168,7 +167,7 @@ def _volume(
     length = float(np.linalg.norm(shift))
     direction = np.column_stack([*first.across, shift / length])
     place = triple((*first.spacing[::-1], length)), triple(origin), direction
-    return Volume(load, shape[::-1], dtype, *place, space=LPS, **more)
+    return Volume(load, shape[::-1], dtype, *place, space="LPS", **more)
 
 
 def _of_images(frames: list[_Frame]) -> Volume:
