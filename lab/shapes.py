@@ -23,8 +23,8 @@ from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.options import OPTIONS
 from super_sdf.refine.band import is_active, rescale
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.sampling import sample_grid, unit_layout
-from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
+from super_sdf.truth.sampling import sample_solid
+from super_sdf.truth.solid import Distances, Solid, load_solid
 
 from .samples import EdgeCurves, sample_surface
 
@@ -79,6 +79,13 @@ class Shape:
         return name_seed(self.name, stream)
 
 
+def normalise(mesh: Mesh) -> Mesh:
+    """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
+    vertices = mesh.vertices.astype(np.float64)
+    low, high = vertices.min(0), vertices.max(0)
+    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
+
+
 def name_seed(name: str, stream: int) -> tuple[int, int]:
     return zlib.crc32(name.encode(errors="surrogateescape")), stream
 
@@ -106,10 +113,11 @@ class Case:
         longest = float(np.ptp(shape.mesh.vertices, axis=0).max())
         self.side = longest / setting.scale if setting.scale else 1.0
         self.low = -self.side / 2
-        self.layout = unit_layout(setting.size, self.side)
-        _, self.spacing, origin = self.layout
+        n, origin = setting.size, np.full(3, (0.5 / setting.size - 0.5) * self.side)
+        self.spacing = self.side / n
         self.fine = self.spacing / self.factor
-        self.coarse = sample_grid(shape.solid, self.layout)
+        layout = (n, n, n), self.spacing, origin
+        self.coarse = sample_solid(shape.solid, layout, band=np.inf).values
         values = self.coarse.astype(np.float32)
         if setting.noise:
             random = np.random.default_rng(shape.seed(NOISE))
