@@ -114,6 +114,14 @@ def test_a_format_holds_the_mesh_or_refuses_it(name, suffix):
         assert len(back.faces) == done.facts["triangles"]
 
 
+def test_normals_of_small_triangles_have_length_1():
+    """Normals are stored in .stl alone: of a ball in metres, with samples a micron apart."""
+    mesh = reconstruct(ball(12, 3.0), trilinear)
+    write_mesh(Mesh(1e-6 * mesh.vertices, mesh.faces), "small.stl")
+    normals = np.frombuffer(Path("small.stl").read_bytes()[84:], "<3f4, <9f4, <u2")["f0"]
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1, abs=1e-6)
+
+
 def test_vertices_that_are_not_finite_are_refused(mesh):
     bad = Mesh(np.where(mesh.vertices > 5, np.nan, mesh.vertices), mesh.faces)
     for suffix in MESH_SUFFIXES:
