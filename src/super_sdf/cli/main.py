@@ -129,7 +129,7 @@ def chosen_options(given: dict[str, Any]) -> Options:
     if given.get("names") and given["label"] is not None:
         from ..labels.files import read_names
 
-        numbers = {entry.name: number for number, entry in read_names(given["names"]).items()}
+        numbers = {name: number for number, (name, _) in read_names(given["names"]).items()}
         given = {**given, "label": numbers.get(given["label"], given["label"])}
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
