@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ball, count_fans, farthest, trilinear, walled
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 from solids import cube, joined, sphere, square, torus
 
 from super_sdf import Mesh, SdfGrid, read_grid, reconstruct, simplify_mesh

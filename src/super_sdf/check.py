@@ -24,7 +24,7 @@ from .options import LENGTHS, Options
 from .refine.band import Band, no_surface, survey
 from .refine.nodes import VoxelIndex
 from .surface.mesh import Mesh
-from .threads import check_bound, give_back, useful_threads
+from .threads import check_fits, give_back, memory_bound, useful_threads
 from .truth.solid import Points, Solid, merged, read_mesh, smallest_angles
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
@@ -235,7 +235,8 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certif
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)
     need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
-    check_bound(need, f"checking {len(mesh.faces):,} triangles", options.max_memory)
+    what, most = f"checking {len(mesh.faces):,} triangles", memory_bound(options.max_memory)
+    check_fits(need, what, "allow more (--max-memory)", most)
     surface, found = examine_surface(mesh), touch(Solid(mesh), band, lattice)
     is_mask, nearest = lattice.field.sides_only, np.rint(lattice.to_index(mesh.vertices))
     beyond = ((nearest < 0) | (nearest >= lattice.shape)).any(1)

@@ -157,7 +157,6 @@ FLAG = having(
 )
 PATH = having("the path of a file", lambda value: isinstance(value, (str, PathLike)), Path)
 NETWORK = having("one from load_network()", callable, lambda network: network)
-PROGRESS = having("a function of (done, total), in thousandths", callable, lambda call: call)
 
 
 class Option(NamedTuple):
@@ -349,16 +348,9 @@ READ, BATCH_LISTS, LABELS = (
 )
 
 
-def check_path(path: Any, name: str) -> Path:
+def check_path(path: Any, name: str = "path") -> Path:
     """Return an argument as a path; OptionTypeError if it is neither a string nor a path."""
     return Path(PATH.check(path, name))
-
-
-def check_called(network: Any, progress: Any) -> None:
-    """Raise OptionTypeError if a network, or a progress that is not None, cannot be called."""
-    NETWORK.check(network, "network")
-    if progress is not None:
-        PROGRESS.check(progress, "progress")
 
 
 def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:

@@ -67,7 +67,7 @@ def command(source: str, target: str, **given: Any) -> None:
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),
-        **done.report(),
+        **done.facts,
     }
     seconds, start = seconds | done.seconds, time.perf_counter()
     if given["as_json"] or page:

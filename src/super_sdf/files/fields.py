@@ -112,7 +112,7 @@ def saving_field(
 
     The file appears at the end of the block, if that succeeds.
     """
-    path = check_path(path, "path")
+    path = check_path(path)
     kind = path.suffix.lower()
     if kind not in FIELD_TABLE:
         raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_TABLE)}")
@@ -174,7 +174,7 @@ def read_field(path: str | Path) -> FineField:
     FileError
         If the file is missing, damaged, or holds something else.
     """
-    path = check_regular_file(check_path(path, "path"))
+    path = check_regular_file(check_path(path))
     try:
         with path.open("rb") as file, NpzFile(file) as archive:
             if (version := archive["version"]) != VERSION:

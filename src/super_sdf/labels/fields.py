@@ -20,7 +20,7 @@ from ..pipeline import refine_band
 from ..refine.band import survey
 from ..refine.nodes import SHARING, VoxelIndex, block_ijk, part_of_node
 from ..surface.marching import strides
-from ..threads import Progress, StepCounter, check_bound, part_of, useful_threads
+from ..threads import Progress, Steps, check_fits, memory_bound, useful_threads
 from .walls import Labelled, Labels
 
 MARGIN = REACH + 1  # samples beside a label on which its distances, and those beside them, depend
@@ -44,7 +44,8 @@ def label_fields(
     need = SAMPLE_BYTES * numbers.size
     need += len(own) * (VOXEL_BYTES + NODE_BYTES * (factor + 1) ** 3)
     what = f"meshing {count} labels in {numbers.size:,} samples, {len(own):,} of them at walls,"
-    check_bound(need, what, bound, "choose fewer (--labels), a smaller factor, cut the image, or ")
+    way_out = "choose fewer (--labels), a smaller factor, or allow more (--max-memory)"
+    check_fits(need, what, way_out, memory_bound(bound))
     holder, times = np.repeat(own[None], (factor + 1) ** 3, axis=0), np.zeros(len(own), np.int16)
     found = Labelled(grid.shape, factor, index, voxel_ijk, holder, {})
     for turn, label in enumerate((*range(1, count + 1), 0)):
@@ -56,8 +57,8 @@ def label_fields(
         if not len(ijk):
             continue
         rows = index.find(ijk + start + 1)
-        share = part_of(progress, turn / (count + 1), (turn + 1) / (count + 1))
-        steps = StepCounter(share, ["network", "nodes"])
+        begin, end = turn / (count + 1), (turn + 1) / (count + 1)
+        steps = Steps(progress, ["network", "nodes"], begin, end)
         more: dict[str, Any] = {"extremes": extremes_of_masks(1.0), "field": grid.field}
         band = survey(SdfGrid.trusted(mask_distances(mask), 1.0, **more), threads=threads)
         at = VoxelIndex(ijk, mask.shape).find(band.voxel_ijk)

@@ -21,15 +21,14 @@ from typing import Any, NamedTuple
 from ..errors import FileError, MeshError, OptionError, flag
 from ..files.formats import check_regular_file, files_of
 from ..files.grids import names_in
-from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, write_meshes
-from ..files.output import check_apart
-from ..files.readers import PLACE
-from ..files.readers import Names as Names
+from ..files.meshes import World, check_mesh_suffix, has_parts, write_meshes
+from ..files.output import check_apart, check_free
+from ..files.readers import PLACE, Names as Names
 from ..grid.sdf_grid import describe_place
 from ..network.contract import Decoder
 from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
 from ..surface.mesh import Mesh
-from ..threads import Progress, Stopwatch
+from ..threads import Progress, Steps
 from .reconstruct import find_image, in_order, label_meshes
 from .volumes import volume_notes
 
@@ -44,10 +43,6 @@ class LabelConversion(NamedTuple):
 
     facts: dict[str, Any]  # as ``--json`` has them
     seconds: dict[str, float]  # per stage
-
-    def report(self) -> dict[str, Any]:
-        """Return the result as a dictionary that can be written as JSON."""
-        return self.facts
 
 
 def convert_labels(
@@ -69,14 +64,14 @@ def convert_labels(
     the errors are those of ``convert``; options besides ``options.LABELS`` must have their
     defaults.
     """
-    watch, options, known = Stopwatch(), options or Options(), names or names_in(source)
+    watch, options, known = Steps(), options or Options(), names or names_in(source)
     options = with_numbers(replace(options, labels=options.labels or ALL), known)
     check_mesh_suffix(Path(target), options.unit)
     image = find_image(source, options, [getattr(options, name) for name in PLACE], partly=True)
     called, lacking = names_of(image.volumes, known), names_of(image.missing, known)
     paths = paths_of(Path(target), called, known)
     for path in set(paths):
-        check_target(path, force=force)
+        check_free(path, force=force)
         check_apart(path, files_of(source))
     watch.lap("read")
     meshes, notes, warnings = label_meshes(image, network, options, progress)

@@ -177,7 +177,7 @@ def label_meshes(
     image: LabelImage, network: Decoder, asked: options.Options, progress: Progress | None
 ) -> tuple[list[Mesh], list[str], list[str]]:
     """Return the meshes of an image's labels, notes and warnings."""
-    options.check_called(network, progress)
+    options.NETWORK.check(network, "network")
     if asked.goals():
         check_modules("simplifying", "simplify")
     grid, factor, voxel = image.grid, asked.factor_for(mask=True), image.grid.voxel_size

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import MeshError, check_modules
 from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
-from ..threads import check_bound, give_back
+from ..threads import check_fits, give_back, memory_bound
 
 if TYPE_CHECKING:
     from .measuring import Deviation
@@ -84,9 +84,9 @@ def simplify_mesh(
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
-    count, most = len(mesh.faces), OPTIONS["max_memory"].check(max_memory)
-    way_out = "use a smaller factor, do not simplify, or "
-    check_bound(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", most, way_out)
+    count, most = len(mesh.faces), memory_bound(OPTIONS["max_memory"].check(max_memory))
+    way_out = "use a smaller factor, do not simplify, or allow more (--max-memory)"
+    check_fits(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", way_out, most)
     from ..truth.solid import Solid
     from .collapsing import Unsimplified, down_to, within  # need the extra
     from .measuring import Deviation

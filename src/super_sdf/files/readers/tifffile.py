@@ -37,7 +37,7 @@ def read_tiff(request: Request) -> Volume:
         names = names[:-3] + request.axes
     stated = _imagej_axes(file) if ome is None else _ome_axes(ome)
     axes, order = [stated.get(name, Axis(name)) for name in names], [n for n in names if n in "xyz"]
-    place = placed(request, axes, {}, shape, "".join(order))
+    place = placed(request, shape, {}, axes, "".join(order))
     return Volume(lambda index: series.asarray()[index], shape, series.dtype, **place)
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from importlib import import_module
-from math import prod
 from typing import Any
 
 import numpy as np
 
 from ...errors import FileError, GridError, OptionTypeError, seen
 from ...grid.samples import even_steps
-from . import XYZ, Request, Volume, of_array, triple
+from . import XYZ, Request, Volume, stored, triple
 
 NAME = "the image"  # in memory, in error messages
 MARKS = ("vtkGhostType", "vtkValidPointMask")
@@ -104,12 +103,10 @@ def _volume_of(image: Any, name: str, array: Any, of_points: bool, *numbers: int
         said = f"it holds {image.GetClassName()}, no image data"
         raise GridError(f"{said}: sample its distances on a lattice, and write that as .vti")
     shape = tuple(int(n) for n in extent[1::2] - extent[::2] + of_points)
-    components, length = array.GetNumberOfComponents(), array.GetNumberOfTuples()
+    components = array.GetNumberOfComponents()
     if components != 1 and not (len(numbers) == 1 and numbers[0] < components):
         said = f"its array {name!r} has {components} numbers per sample"
         raise GridError(f"{said}: give an array of one, or NAME[0]")
-    if length != prod(shape):
-        raise GridError(f"its array {name!r} has {length:,} values for {prod(shape):,} samples")
     start = direction @ (np.array(spacing) * (first + (0 if of_points else 0.5)))
     values = vtk_to_numpy(array).reshape(*shape[::-1], -1)[..., numbers[0] if numbers else 0].T
-    return Volume(*of_array(values), triple(spacing), triple(np.array(origin) + start), direction)
+    return Volume(*stored(values), triple(spacing), triple(np.array(origin) + start), direction)
