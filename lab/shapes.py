@@ -26,8 +26,7 @@ from super_sdf.surface.mesh import Mesh
 from super_sdf.truth.sampling import sample_grid, unit_layout
 from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
 
-from . import metrics
-from .edges import EdgeCurves
+from .samples import EdgeCurves, sample_surface
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
 REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIELD_NOISE = range(7)
@@ -58,13 +57,12 @@ class Setting:
 
 
 class Shape:
-    """A normalised reference mesh, and the points that are drawn from it for all methods."""
+    """A reference mesh in its frame, and the points that are drawn from it for all methods."""
 
     def __init__(self, name: str, mesh: Mesh) -> None:
-        self.name = name
-        self.solid = Solid(normalise(mesh))
+        self.name, self.solid = name, Solid(mesh)
         self.mesh = self.solid.mesh
-        self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
+        self.drawn = sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
         self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
         self.pieces = self.mesh.components()[0]
 
@@ -77,7 +75,7 @@ class Shape:
         """
         mesh = load_solid(path)[0].mesh
         turn = np.eye(3) if turned is None else turn_of(path.stem, turned)
-        return cls(path.stem, mesh.transformed(turn, np.zeros(3)))
+        return cls(path.stem, normalise(mesh.transformed(turn, np.zeros(3))))
 
     def seed(self, stream: int) -> tuple[int, int]:
         return name_seed(self.name, stream)

@@ -8,15 +8,11 @@ import numpy as np
 import pytest
 from solids import cube
 
-from lab.kinds import (
-    BY_METHOD,
-    KINDS,
-    level_set,
-    samples_of,
-)
+from lab.kinds import BY_METHOD, KINDS, level_set, samples_of
 from lab.measuring import Task
 from lab.shapes import Case, Setting, Shape
 from super_sdf import load_network
+from super_sdf.truth.solid import normalise
 
 SIDE = 3**-0.5  # of the cube whose box diagonal is 1
 CUBIC = [name for name, kind in KINDS.items() if kind.ratio == 1]
@@ -30,7 +26,7 @@ def mesh_of(name, case, network):
 
 @pytest.fixture(scope="module")
 def case() -> Case:
-    return Case(Shape("box", cube()), Setting(16))
+    return Case(Shape("box", normalise(cube())), Setting(16))
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from lab.measuring import Task, measure_method
 from lab.shapes import Case, Setting, Shape
 from lab.surfaces import interpolate_spline
 from super_sdf import Mesh
+from super_sdf.truth.solid import normalise
 
 TASK = Task(Path(), Setting(8), ())
 
@@ -56,7 +57,7 @@ def test_the_bound_is_better_than_ours_and_ours_than_the_coarse_grid():
 
 
 def shape_and_case(mesh: Mesh, setting: Setting) -> tuple[Shape, Case]:
-    shape = Shape("some", mesh)
+    shape = Shape("some", normalise(mesh))
     return shape, Case(shape, setting)
 
 

@@ -133,7 +133,7 @@ def extract_mesh(
     field: FineField,
     grid: SdfGrid | None = None,
     *,
-    mesher: options.MesherName = options.AUTO,
+    mesher: options.MesherName = "auto",
     cap: bool = True,
 ) -> Mesh:
     """Return the zero level of a field as triangles in world coordinates; a node of 0 is inside.
@@ -170,7 +170,7 @@ def reconstruct(
     threads: int | None = None,
     offset: float = 0.0,
     cap: bool = True,
-    mesher: options.MesherName = options.AUTO,
+    mesher: options.MesherName = "auto",
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:

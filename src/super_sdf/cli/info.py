@@ -11,7 +11,7 @@ import numpy as np
 from click import argument, option
 
 from .. import __version__, errors
-from ..options import FLOAT32, MASK, OPTIONS, Device
+from ..options import OPTIONS, Device
 from . import main
 from .main import SHARED, table_option
 
@@ -108,10 +108,10 @@ def check_network(name: str, device: Device) -> tuple[str, str, str]:
     from .. import load_network, make_grid, reconstruct
 
     values: Any = np.linalg.norm(np.indices((32, 32, 32)) - CENTRE, axis=0) - RADIUS
-    is_mask, what = name.startswith(MASK), f"network {name} on {device}"
+    is_mask, what = name.startswith("mask"), f"network {name} on {device}"
     grid = make_grid(values < 0 if is_mask else values, spacing=1.0, origin=0.0)
     try:
-        network = load_network(name, device=device, precision=FLOAT32)  # its own file
+        network = load_network(name, device=device, precision="float32")  # its own file
         found = reconstruct(grid, network, mesher="marching").vertices
     except errors.SuperSdfError as error:
         return FAILED, what, error.flagged

@@ -29,8 +29,6 @@ from .readers import Names, Request, Volume, axes_direction, find_placement
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-NAMING = ("nrrd", "dicom")  # formats of which a file may name its labels
-
 
 def read_grid(
     path: str | Path,
@@ -98,7 +96,7 @@ def read_array(
 
 def names_in(path: str | Path) -> Names:
     """Return the names of labels, and their colours, that a grid file states."""
-    if find_format(path).key not in NAMING:
+    if find_format(path).key not in ("nrrd", "dicom"):  # others name none
         return {}
     with open_volume(Path(path)) as (volume, _):
         return volume.names

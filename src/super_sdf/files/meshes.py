@@ -22,7 +22,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, cross, unit as of_length_1
+from ..arrays import FloatArray, cross, unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
 from ..surface.mesh import Mesh, check_mesh
@@ -138,16 +138,13 @@ def write_meshes(
 
 def _as_single(mesh: Mesh, origin: Any = 0.0) -> FloatArray:
     """Return vertices, relative to an origin, as float32; FileError if it cannot hold the mesh."""
-
-    def is_flat(points: NDArray[Any]) -> BoolArray:  # triangles with two corners at one place
-        corners = points[mesh.faces]
-        return np.asarray((corners == np.roll(corners, 1, axis=1)).all(2).any(1))
-
     if mesh.vertices.dtype == np.float32 and not np.any(origin):
         return np.asarray(mesh.vertices)
     with np.errstate(over="ignore"):
         rounded = (mesh.vertices - origin).astype(np.float32)
-    if not np.isfinite(rounded).all() or (is_flat(rounded) & ~is_flat(mesh.vertices)).any():
+    corners = (points[mesh.faces] for points in (rounded, mesh.vertices))
+    is_flat, was_flat = ((at == np.roll(at, 1, axis=1)).all(2).any(1) for at in corners)
+    if not np.isfinite(rounded).all() or (is_flat & ~was_flat).any():  # two corners at one place
         said = "the format has single precision, in which vertices of the mesh coincide"
         raise FileError(f"{said}: write .ply or .obj")
     return np.asarray(rounded)

@@ -18,7 +18,7 @@ from typing_extensions import Unpack
 
 from .. import SdfGrid, grid_from_image, reconstruct
 from ..errors import check_modules
-from ..options import AUTO, MesherName, Options, Quality, Values
+from ..options import MesherName, Options, Quality, Values
 
 if TYPE_CHECKING:
     from ..network.contract import Decoder
@@ -66,7 +66,7 @@ class ImageAccessor:
         residuals: bool = False,
         offset: float = 0.0,
         cap: bool = True,
-        mesher: MesherName = AUTO,
+        mesher: MesherName = "auto",
         max_memory: int | None = None,
         progress: Progress | None = None,
         **values: Unpack[Values],

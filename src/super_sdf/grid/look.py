@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
-from .samples import SampleArray, let_go
+from .samples import SampleArray, let_go, over_three
 
 Floats: TypeAlias = NDArray[np.float64]
 Extremes: TypeAlias = tuple[float, float]
@@ -39,7 +39,8 @@ GOLDEN = 0.6180339887  # its multiples, less whole numbers, are spread evenly fr
 
 AXES = np.array([[0, 0, 0], *np.kron(np.eye(3, dtype=int), [[-2], [-1], [1], [2]])])
 ON_LINES = np.array([[1, 2, 0, 3, 4], [5, 6, 0, 7, 8], [9, 10, 0, 11, 12]])
-FACES_OF_5 = np.array([(1, 2, 2), (3, 2, 2), (2, 1, 2), (2, 3, 2), (2, 2, 1), (2, 2, 3)])
+FACES_OF_3 = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
+FACES_OF_5 = FACES_OF_3 + 1
 BOX = np.indices((5, 5, 5)).reshape(3, -1).T - 2
 
 
@@ -280,6 +281,25 @@ def count_valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
         low = (x >= 0) & (x < 0.52) & (before > x) & ((after > x) | ((after == x) & (x > 0.25)))
         count += int(np.count_nonzero(low & (before + after - 2 * x > 0.9)))
     return count, changes
+
+
+def side_of_zeros(look: Look) -> int:
+    """Return the side of samples that are 0: that which has none of its own beside some of them."""
+    zeros, sides = look.part == 0, (look.part < 0, look.part > 0)
+    lone = [np.count_nonzero(zeros & ~over_three(side, np.logical_or)) for side in sides]
+    return int(np.sign(lone[1] - lone[0]))
+
+
+def counted_steps(boxes: Floats) -> float:
+    """Return of how many samples of size 2 the least of 26, or 6, neighbours has size 1; a share.
+
+    It is 1 where values count steps to the surface, as chessboard and city-block distances do.
+    """
+    size = np.nan_to_num(np.abs(boxes), nan=np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(size, (3, 3, 3), axis=(1, 2, 3))
+    around = windows[size[:, 1:4, 1:4, 1:4] == 2].reshape(-1, 27)
+    of_six = around[:, np.ravel_multi_index(FACES_OF_3.T, (3, 3, 3))]
+    return max(float((x.min(1) == 1).mean()) for x in (around, of_six)) if len(around) else 1.0
 
 
 def parting_level(values: Floats) -> float:

@@ -26,7 +26,7 @@ from ..files.output import check_apart, check_free
 from ..files.readers import PLACE, Names as Names
 from ..grid.sdf_grid import describe_place
 from ..network.contract import Decoder
-from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
+from ..options import LABELS, OPTIONS, Options
 from ..surface.mesh import Mesh
 from ..threads import Progress, Steps
 from .reconstruct import find_image, in_order, label_meshes
@@ -65,7 +65,7 @@ def convert_labels(
     defaults.
     """
     watch, options, known = Steps(), options or Options(), names or names_in(source)
-    options = with_numbers(replace(options, labels=options.labels or ALL), known)
+    options = with_numbers(replace(options, labels=options.labels or "all"), known)
     check_mesh_suffix(Path(target), options.unit)
     image = find_image(source, options, [getattr(options, name) for name in PLACE], partly=True)
     called, lacking = names_of(image.volumes, known), names_of(image.missing, known)
@@ -115,7 +115,7 @@ def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:
     """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
-    usual = {name: (OPTIONS[name].default, MARCHING) for name in OPTIONS if name not in LABELS}
+    usual = {name: (OPTIONS[name].default, "marching") for name in OPTIONS if name not in LABELS}
     given = [name for name, values in usual.items() if getattr(options, name) not in values]
     for name in (*given, *more):
         raise OptionError(
@@ -129,7 +129,7 @@ def with_numbers(options: Options, names: Names | None) -> Options:
     if options.labels is None:
         return options
     check_options(options)
-    if options.labels == ALL:
+    if options.labels == "all":
         return options
     numbers: dict[Any, int] = {name: number for number, (name, _) in (names or {}).items()}
     chosen = [numbers.get(label, label) for label in options.labels]

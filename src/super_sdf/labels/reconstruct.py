@@ -40,7 +40,7 @@ SLIGHT, MOST_REPEATS = 0.01, 8  # voxels from planes within which triangles are 
 
 def reconstruct_labels(
     values: ArrayLike | str | PathLike[str],
-    labels: str | Sequence[int] = options.ALL,
+    labels: str | Sequence[int] = "all",
     network: Decoder | None = None,
     factor: int | None = None,
     *,
@@ -131,7 +131,7 @@ def find_image(
 
 def in_order(labels: Any) -> list[int] | None:
     """Return labels in ascending order, each once; None for all."""
-    if labels == options.ALL:
+    if labels == "all":
         return None
     chosen = sorted({options.LABEL.check(label, "--labels") for label in labels})
     if not 0 < len(chosen) <= MOST_LABELS:
@@ -182,7 +182,7 @@ def label_meshes(
         check_modules("simplifying", "simplify")
     grid, factor, voxel = image.grid, asked.factor_for(mask=True), image.grid.voxel_size
     kind = vertex_type(grid, factor)  # raises if not even float64 resolves the vertices
-    adapter, count = adapt(network_for(network, options.MASK)), len(image.volumes)
+    adapter, count = adapt(network_for(network, "mask")), len(image.volumes)
     fields = label_fields(image.numbers, count, grid, adapter, factor, asked.max_memory, progress)
     walls = extract_walls(fields)
     del fields

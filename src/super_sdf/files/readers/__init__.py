@@ -90,12 +90,10 @@ class Request:
         chosen = dict(zip(others, self.numbers))
         for axis in others:
             if chosen.get(axis, shape[axis]) >= shape[axis]:
-                called = (names[axis] if names else "") or axis
+                said = f"{self.path}: its axis {(names[axis] if names else '') or axis} has"
                 name = f"{self.path}:{self.member}" if self.member else self.path
-                raise GridError(
-                    f"{self.path}: its axis {called} has {shape[axis]} entries, from 0 on: choose "
-                    f"one, {name}{'[0]' * len(others)}, say"
-                )
+                say = f"choose one, {name}{'[0]' * len(others)}, say"
+                raise GridError(f"{said} {shape[axis]} entries, from 0 on: {say}")
         whole = slice(None)
         return tuple(whole if n in kept else chosen.get(n, 0) for n in range(len(shape)))
 

@@ -10,7 +10,6 @@ import re
 from typing import Any
 
 from ...errors import FileError
-from ...options import LPS
 from . import PLACE, Axis, Request, Volume, measured, placed, stored, triple
 
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
@@ -28,7 +27,7 @@ def read_hdf5(request: Request) -> Volume:
             datasets[image + name][:] for name in ("Spacing", "Origin", "Directions")
         )
         world = triple(spacing[::-1]), triple(origin), directions.T[:, ::-1]
-        return Volume(*_stored(datasets[image + "VoxelData"]), *world, space=LPS)
+        return Volume(*_stored(datasets[image + "VoxelData"]), *world, space="LPS")
     shapes = {name: values.shape or () for name, values in datasets.items()}
     values = datasets[request.choose_array(shapes)]
     axes, beside = _axes(values), values.file.get(IMARIS, values).attrs

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ...options import LPS, RAS
 from ..formats import check_beside, split_header
 from . import DENSITY, LABELS, Index, Names, Request, Volume, from_affine, kept_of, one_unit, triple
 
-SPACES = {"right-anterior-superior": RAS, "ras": RAS, "left-posterior-superior": LPS, "lps": LPS}
+SPACES = dict.fromkeys(("right-anterior-superior", "ras"), "RAS")
+SPACES |= dict.fromkeys(("left-posterior-superior", "lps"), "LPS")
 # Fields in one spelling of those that the format allows
 SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
 # What a MetaImage file may state: that data is a zlib stream, which byte of a number is first
@@ -168,7 +168,7 @@ def read_metaimage(request: Request) -> Volume:
     steps, origin = (np.array(said)[kept] for said in (reader.GetSpacing(), reader.GetOrigin()))
     direction = np.array(reader.GetDirection()).reshape(len(size), -1)[np.ix_(kept, kept)]
     place = triple(np.abs(steps)), triple(origin), direction * np.sign(steps)
-    return Volume(load, size, dtype, *place, index, space=LPS)
+    return Volume(load, size, dtype, *place, index, space="LPS")
 
 
 def read_nifti(request: Request) -> Volume:
@@ -192,7 +192,7 @@ def read_nifti(request: Request) -> Volume:
         place["notes"] = one_unit([UNITS.get(int(header["xyzt_units"]) & 7, "")])[1]
         place["hint"] = LABELS if int(header["intent_code"]) == INTENT_LABEL else ""
     if is_placed:
-        place |= {**from_affine(header.get_best_affine()), "space": RAS}
+        place |= {**from_affine(header.get_best_affine()), "space": "RAS"}
     else:
         place["spacing"] = triple(np.abs(header.get_zooms()[:3]))
     dtype = np.asarray(proxy[(slice(0, 1),) * len(shape)]).dtype

@@ -26,7 +26,6 @@ OPEN3D = ("key", "voxel_size", "block_resolution", "attr_name_tsdf", "attr_name_
 SDF_HEADER = struct.Struct("<3i6f")
 SDF_TAGGED = re.compile(rb"#sdf 1\r?\ndim +(\d{1,9}) +(\d{1,9}) +(\d{1,9})\s*\ndata\r?\n")
 SDF_TEXT = re.compile(rb"[\s\d.+\-a-zA-Z]+")
-FLOAT = np.dtype("<f4")
 
 
 def read_npy(request: Request) -> Volume:
@@ -92,5 +91,5 @@ def read_sdf(request: Request) -> Volume:
         if min(shape) < 1 or not (high > low).all():
             raise FileError("it is neither SDFGen's text nor a binary grid")
         place = {"spacing": triple((high - low) / shape), "origin": triple(low)}
-    values = np.memmap(path, FLOAT, "r", start)
+    values = np.memmap(path, "<f4", "r", start)
     return Volume(*stored(values.reshape(shape)), **place, is_mapped=True)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ...options import LPS
 from ..formats import check_beside
 from . import LABELS, Index, Names, Request, Volume, triple
 
@@ -152,11 +151,9 @@ def _volume(
     origin = first.corner - planes.min() * shift
     off = [float(np.linalg.norm(f.corner - origin - n * shift)) for f, n in zip(frames, planes)]
     if not max(off) < (EVEN_FRAMES if more else EVEN) * step:
-        raise GridError(
-            f"{frames[int(np.argmax(off))].path.name} is {max(off):.4g} mm off from even steps of "
-            f"{step:.6g}: put all slices of one volume (one time, one echo) into a folder, or "
-            "resample the series"
-        )
+        said = f"{frames[int(np.argmax(off))].path.name} is {max(off):.4g} mm off from even steps"
+        one = "put all slices of one volume (one time, one echo) into a folder"
+        raise GridError(f"{said} of {step:.6g}: {one}, or resample the series")
     shape = int(planes.max() + planes.min()) + 1, *first.shape
 
     def load(index: Index) -> NDArray[Any]:
@@ -170,7 +167,7 @@ def _volume(
     length = float(np.linalg.norm(shift))
     direction = np.column_stack([*first.across, shift / length])
     place = triple((*first.spacing[::-1], length)), triple(origin), direction
-    return Volume(load, shape[::-1], dtype, *place, space=LPS, **more)
+    return Volume(load, shape[::-1], dtype, *place, space="LPS", **more)
 
 
 def _of_images(frames: list[_Frame]) -> Volume:

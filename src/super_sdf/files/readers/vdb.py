@@ -76,13 +76,10 @@ def read_vdb(request: Request) -> Volume:
     low, high = np.min(tree.ends, 0) - margin, np.max(tree.ends, 0) + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
 
-    def load(index: Any) -> NDArray[Any]:
-        voxels = tree.voxels(low, high)
-        return voxels if size == 1 else voxels * voxels.dtype.type(size)
-
     matrix = size * np.column_stack([matrix[:, :3], matrix[:, :3] @ low + matrix[:, 3]])
     return Volume(
-        *(load, tuple((high - low).tolist()), tree.dtype),
+        lambda _: tree.voxels(low, high) * tree.dtype.type(size),
+        *(tuple((high - low).tolist()), tree.dtype),
         **from_affine(matrix),
         hint=DISTANCE if metadata.get("class") == "level set" else "",
         notes=("lengths are in millimetres, as PicoGK states",) * (size != 1),

@@ -53,13 +53,10 @@ def read_vtk(request: Request) -> Volume:
         if len(text[start:].split()) < sum(each.GetNumberOfValues() for each, _ in arrays.values()):
             raise FileError("it is truncated")
     # what has several numbers a sample, and VTK's own marks, is read only if it is named
-    plain = [
-        name
-        for name, (array, _) in arrays.items()
-        if name == request.member
-        or (array.GetNumberOfComponents() == 1 and name.removeprefix("CellData/") not in MARKS)
-    ]
-    name = request.choose(plain or list(arrays), "array of points or cells")
+    single = [name for name, (array, _) in arrays.items() if array.GetNumberOfComponents() == 1]
+    plain = [name for name in single if name.removeprefix("CellData/") not in MARKS]
+    names = plain if plain and request.member not in arrays else list(arrays)
+    name = request.choose(names, "array of points or cells")
     return _volume_of(image, name, *arrays[name], *request.numbers)
 
 
@@ -92,8 +89,7 @@ def _volume_of(image: Any, name: str, array: Any, of_points: bool, *numbers: int
     extent = np.array(image.GetExtent()) if hasattr(image, "GetExtent") else np.zeros(6, int)
     direction, first = XYZ, extent[::2]  # which need not be 0
     if image.IsA("vtkImageData"):
-        matrix = image.GetDirectionMatrix()
-        direction = np.array([[matrix.GetElement(i, j) for j in range(3)] for i in range(3)])
+        direction = np.reshape(image.GetDirectionMatrix().GetData(), (3, 3))
         spacing, origin = image.GetSpacing(), image.GetOrigin()
     elif image.IsA("vtkRectilinearGrid"):
         places = [vtk_to_numpy(getattr(image, f"Get{axis}Coordinates")()) for axis in "XYZ"]

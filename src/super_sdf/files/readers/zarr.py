@@ -43,10 +43,9 @@ def read_zarr(request: Request) -> Volume:
     for metadata in _metadata_in(path):
         for codec in _codecs_in(json.loads(metadata)):
             if codec not in CODECS:
-                raise FileError(
-                    f"{path} names the codec {seen(codec)}, which is not among those that are "
-                    f"read ({', '.join(sorted(CODECS))}): store it with one of these"
-                )
+                known = f"those that are read ({', '.join(sorted(CODECS))})"
+                said = f"{path} names the codec {seen(codec)}, which is not among {known}"
+                raise FileError(f"{said}: store it with one of these")
     if not path.is_dir():
         store = request.files.enter_context(zarr.storage.ZipStore(store, mode="r"))
     root = zarr.open(store, mode="r")
@@ -109,19 +108,17 @@ def _levels(nodes: dict[str, Any]) -> dict[str, tuple[str, Any, Any]]:
 
 def _choose(nodes: dict[str, Any], levels: dict[str, Any], request: Request) -> str:
     """Return the array to read: of an image the finest level, unless another is named."""
-    shapes = {
-        f"/{name}": node.shape for name, node in sorted(nodes.items()) if hasattr(node, "shape")
-    }
-    named = (request.member or "").strip("/")
-    is_group = bool(named) and any(name.startswith(f"/{named}/") for name in shapes)
-    before = f"/{named}/" if is_group else "/"
-    if is_group or request.member is None:
-        for name, (group, *_) in levels.items():
-            if group == before.strip("/"):
+    group = (request.member or "").strip("/")
+    if group in nodes and not hasattr(nodes[group], "shape"):
+        for name, (of_image, *_) in levels.items():
+            if of_image == group:
                 return name
+        before, request = f"/{group}/".replace("//", "/"), replace(request, member=None)
+    else:
+        before = "/"
+    shapes = {f"/{name}": getattr(node, "shape", ()) for name, node in sorted(nodes.items())}
     inner = {name: shape for name, shape in shapes.items() if name.startswith(before)}
-    asked = replace(request, member=None) if is_group else request
-    return asked.choose_array(inner).strip("/")
+    return request.choose_array(inner).strip("/")
 
 
 def _named_axes(nodes: dict[str, Any], name: str) -> list[Axis]:
