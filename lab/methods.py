@@ -26,7 +26,6 @@ from super_sdf.refine.field import FineField
 from super_sdf.refine.nodes import block_ijk, share_parts
 from super_sdf.simplify.simplify import simplify_mesh
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.sampling import grid_points
 
 from .kinds import BY_METHOD, KINDS
 from .ndc import neural_dual_contouring
@@ -132,7 +131,7 @@ def dual_contouring(case: Case, network: Decoder) -> Surface:
     order = np.arange(np.prod(shape)).reshape(shape).ravel(order="F")  # there i varies fastest
     values = np.ravel(case.grid.values).astype(np.float64)[order]
     vertices, quads = dual_contouring_of_signed_distance_data(
-        values, grid_points(case.layout)[order], *shape
+        values, case.grid.to_world(np.argwhere(np.ones(shape)))[order], *shape
     )
     halves = np.asarray(quads, np.int32)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
     return Surface(Mesh(np.asarray(vertices), halves))

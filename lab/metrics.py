@@ -51,7 +51,7 @@ class Comparison:
 
     @cached_property
     def drawn(self) -> SurfacePoints:
-        return samples.sample_surface(self.mesh, self.shape.seed(RESULT_POINTS)).ordered()
+        return samples.sample_surface(self.mesh, self.shape.seed(RESULT_POINTS))
 
     @cached_property
     def solid(self) -> Solid:

@@ -36,10 +36,6 @@ class SurfacePoints:
     def tree(self) -> cKDTree:
         return cKDTree(self.points)
 
-    def ordered(self) -> SurfacePoints:
-        order = order_in_space(self.points)
-        return SurfacePoints(self.points[order], self.normals[order])
-
 
 DOT = SurfacePoints(np.zeros((1, 3)), np.zeros((1, 3)))  # stands for a result without a surface
 
@@ -51,7 +47,10 @@ def face_vectors(mesh: Mesh) -> Points:
 
 
 def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> SurfacePoints:
-    """Return points sampled uniformly by area; of a mesh without area, one dot at the origin."""
+    """Return points sampled uniformly by area, in the order of ``order_in_space``.
+
+    Of a mesh without area it is one dot at the origin.
+    """
     vectors = face_vectors(mesh)
     lengths = np.linalg.norm(vectors, axis=1)
     if not lengths.sum() > 0:
@@ -61,7 +60,8 @@ def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT)
     root, v = np.sqrt(random.random(count)), random.random(count)
     weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)  # uniform in the triangle
     points = np.einsum("nk,nkd->nd", weights, mesh.vertices[mesh.faces[face]])
-    return SurfacePoints(points, vectors[face] / lengths[face, None])
+    order = order_in_space(points)
+    return SurfacePoints(points[order], (vectors[face] / lengths[face, None])[order])
 
 
 def order_in_space(points: Points) -> Indices:

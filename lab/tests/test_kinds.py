@@ -10,9 +10,8 @@ from solids import cube
 
 from lab.kinds import BY_METHOD, KINDS, level_set, samples_of
 from lab.measuring import Task
-from lab.shapes import Case, Setting, Shape
+from lab.shapes import Case, Setting, Shape, normalise
 from super_sdf import load_network
-from super_sdf.truth.solid import normalise
 
 SIDE = 3**-0.5  # of the cube whose box diagonal is 1
 CUBIC = [name for name, kind in KINDS.items() if kind.ratio == 1]

@@ -12,10 +12,9 @@ from solids import cube, saved, torus
 
 from lab import methods
 from lab.measuring import Task, measure_method
-from lab.shapes import Case, Setting, Shape
+from lab.shapes import Case, Setting, Shape, normalise
 from lab.surfaces import interpolate_spline
 from super_sdf import Mesh
-from super_sdf.truth.solid import normalise
 
 TASK = Task(Path(), Setting(8), ())
 

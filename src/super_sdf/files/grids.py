@@ -1,6 +1,6 @@
 """Reading grid files of all formats, and writing ``.npz``.
 
-``formats`` has the table of all formats, ``readers`` a module for each library.
+``formats`` has the table of all formats, ``readers`` calls the library of each.
 """
 
 from __future__ import annotations

@@ -115,5 +115,5 @@ class ImageAccessor:
             from ..check import check_mesh
 
             found = check_mesh(mesh, grid, Options(offset=offset, max_memory=max_memory))
-            surface.point_data["residual"] = found.residuals_at(found.mesh.vertices)
+            surface.point_data["residual"] = found.residuals_at(mesh.vertices)
         return surface

@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +15,10 @@ from ..errors import MeshError, check_modules
 from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import check_fits, give_back, memory_bound
-
-if TYPE_CHECKING:
-    from .measuring import Deviation
+from ..truth.solid import Solid
+from .collapsing import Unsimplified, down_to, within
+from .measuring import Deviation
+from .walls import Walls
 
 # Peak of memory beside the mesh, measured on meshes of 120,000 to 760,000 triangles: 680 to 1,230,
 # with the libraries that it loads.
@@ -87,11 +88,6 @@ def simplify_mesh(
     count, most = len(mesh.faces), memory_bound(OPTIONS["max_memory"].check(max_memory))
     way_out = "use a smaller factor, do not simplify, or allow more (--max-memory)"
     check_fits(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", way_out, most)
-    from ..truth.solid import Solid
-    from .collapsing import Unsimplified, down_to, within  # need the extra
-    from .measuring import Deviation
-    from .walls import Walls
-
     if not count:
         return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
     of, warnings = Unsimplified(Walls.of(mesh)), tuple[str, ...]()

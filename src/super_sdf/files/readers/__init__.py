@@ -1,4 +1,4 @@
-"""The readers of grid files, a module for each library: each turns a Request into a Volume.
+"""The readers of grid files, by libraries that own the formats: each turns a Request into a Volume.
 
 A reader says what the file says, in the world coordinates of the file. Here, and nowhere else, the
 axes of the array are brought into the order and sense in which they lie nearest to the world's. A

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from importlib import import_module
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ def read_vtk(request: Request) -> Volume:
         reader.ReadAllFieldsOn()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     said, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    request.files.callback(vtkOutputWindow.SetInstance, before)
     vtkOutputWindow.SetInstance(said)
     reader.SetFileName(str(request.path))
     reader.UpdateInformation()
@@ -42,7 +44,6 @@ def read_vtk(request: Request) -> Volume:
         extent = np.array(about.Get(key), object)
         request.check_fits(extent[1::2] - extent[::2] + 1, np.dtype("u1"))
     reader.Update()
-    vtkOutputWindow.SetInstance(before)
     image = reader.GetOutputDataObject(0)
     if image is None or "error" in said.GetOutput().lower():
         raise FileError("VTK finds it damaged, or truncated")
@@ -99,6 +100,8 @@ def _volume_of(image: Any, name: str, array: Any, of_points: bool, *numbers: int
         said = f"it holds {image.GetClassName()}, no image data"
         raise GridError(f"{said}: sample its distances on a lattice, and write that as .vti")
     shape = tuple(int(n) for n in extent[1::2] - extent[::2] + of_points)
+    if (count := array.GetNumberOfTuples()) != prod(shape):
+        raise GridError(f"its array {name!r} has {count:,} samples, its shape is {shape}")
     components = array.GetNumberOfComponents()
     if components != 1 and not (len(numbers) == 1 and numbers[0] < components):
         said = f"its array {name!r} has {components} numbers per sample"
