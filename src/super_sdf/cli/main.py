@@ -130,7 +130,7 @@ def chosen_options(given: dict[str, Any]) -> Options:
         from ..labels.files import read_names
 
         given["names"] = read_names(given["names"])
-        numbers = {entry.name: number for number, entry in given["names"].items()}
+        numbers = {name: number for number, (name, _) in given["names"].items()}
         given["label"] = numbers.get(given["label"], given["label"])
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
