@@ -169,13 +169,12 @@ def write_ply(file: IO[bytes], parts: Parts, world: World) -> None:
 def write_stl(file: IO[bytes], parts: Parts, world: World) -> None:
     """Write binary STL: each triangle stores its normal and the positions of its corners."""
     (mesh,) = parts.values()
-    vertices, least = _as_single(mesh), np.finfo(np.float64).tiny
+    vertices = _as_single(mesh)
     file.write(f"made by super-sdf {world.note}".ljust(80).encode("ascii"))
     file.write(struct.pack("<I", len(mesh.faces)))
     for first in range(0, len(mesh.faces), STL_CHUNK):
         corners = vertices[mesh.faces[first : first + STL_CHUNK]]
         sides = corners[:, 1:].astype(np.float64) - corners[:, :1]
-        sides /= np.maximum(np.abs(sides).max((1, 2), keepdims=True), least)  # at any scale
         rows = np.zeros(len(corners), STL_ROW)
         rows["normal"], rows["corners"] = of_length_1(cross(sides[:, 0], sides[:, 1])), corners
         file.write(rows.data)
