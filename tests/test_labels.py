@@ -151,6 +151,21 @@ UNFIT = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("factor", [0.9999999998, 0.988])
+def test_labels_may_be_nearly_whole_and_unknown_in_places(factor, fast):
+    """As nibabel stores them, and resampled atlases; the advice to choose one can be followed."""
+    whole = nested() + 0.0
+    stored = factor * whole
+    stored[0] = np.nan
+    said = refusal(GridError, make_grid, stored, spacing=1)
+    assert said.startswith("no solid is chosen: they look like labels (-3, 0, 7, 9, 40): ")
+    assert (make_grid(stored, spacing=1, label=7).values < 0).sum() == (whole == 7).sum()
+    found, wanted = (reconstruct_labels(x, network=fast, spacing=1) for x in (stored, whole))
+    assert found.keys() == wanted.keys()
+    for label, mesh in found.items():
+        assert np.array_equal(mesh.vertices, wanted[label].vertices)
+
+
 @pytest.mark.parametrize("message", UNFIT)
 def test_wrong_labels_and_values_that_are_none_are_one_line(message):
     with pytest.raises(OptionError if message.startswith("labels ") else GridError) as caught:

@@ -16,7 +16,17 @@ from numpy.typing import ArrayLike
 from ..arrays import Triple
 from ..errors import GridError
 from ..options import Options
-from .look import Extremes, Floats, Look, border_share, look_at, named, typical_slope, which_level
+from .look import (
+    Extremes,
+    Floats,
+    Look,
+    as_labels,
+    border_share,
+    look_at,
+    named,
+    typical_slope,
+    which_level,
+)
 from .recognise import Answer, recognise
 from .samples import (
     LEAST_SPACING,
@@ -132,7 +142,7 @@ def interpret(
     if wanted.inside == "auto" and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
     if wanted.label is not None:
-        samples = labelled(samples, wanted.label)
+        samples = labelled(as_labels(samples), wanted.label)
     if wanted.unknown is not None and samples.dtype.kind != "b":
         value = wanted.unknown
         samples = changed(samples, lambda planes: np.where(planes == value, np.nan, planes))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
-from .samples import SampleArray, let_go, over_three
+from .samples import SampleArray, changed, let_go, over_three
 
 Floats: TypeAlias = NDArray[np.float64]
 Extremes: TypeAlias = tuple[float, float]
@@ -35,6 +35,7 @@ MOST_OUTSIDE = 0.65  # of the border, above a level: maps of noise to .55, dista
 MOST_NAMED = 8  # labels that a message lists
 TRIED = 4096  # samples whose different values are counted first
 BENT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
+NEARLY, FACTOR = 1e-3, 0.05  # off whole numbers, and from 1: nibabel 2e-10, atlases .012
 GOLDEN = 0.6180339887  # its multiples, less whole numbers, are spread evenly from 0 to 1
 
 AXES = np.array([[0, 0, 0], *np.kron(np.eye(3, dtype=int), [[-2], [-1], [1], [2]])])
@@ -266,6 +267,27 @@ def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int
     return kept, np.array([counts[value] for value in values], np.int64)
 
 
+def whole_factor(values: Floats) -> float:
+    """Return the factor near 1 by which values are whole numbers, 0 if they are not."""
+    some = values[np.abs(values) > NEARLY]
+    if not len(some) or np.abs(some).max() < 1 - FACTOR:
+        return 0.0
+    least = float(np.abs(some).min())
+    factor = least / max(round(least), 1)
+    off = np.abs(some / factor - np.rint(some / factor))
+    is_whole = (off <= np.maximum(NEARLY, 1e-9 * np.abs(some))).all()
+    return factor if abs(factor - 1) <= FACTOR and is_whole else 0.0
+
+
+def as_labels(samples: SampleArray) -> SampleArray:
+    """Return labels that were stored as floats as whole numbers, NaN as 0; others as they are."""
+    found = different_values(samples) if samples.dtype.kind == "f" else None
+    factor = 0.0 if found is None else whole_factor(found[0].astype(np.float64))
+    if not factor:
+        return samples
+    return changed(samples, lambda planes: np.where(np.isnan(planes), 0, np.rint(planes / factor)))
+
+
 def count_valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
     """Count valleys of slope, sign * values above 0, where 0 is near and the sign does not change.
 
@@ -389,7 +411,7 @@ def which_level(look: Look, *, signed: bool = False) -> str:
 
 def which_label(samples: SampleArray) -> str:
     """Return the advice to choose a label: the most frequent that is not the border's."""
-    found = different_values(samples)
+    found = different_values(as_labels(samples))
     if found is None:
         return "they are labels: choose one with --label, or some with --labels"
     distinct, counts = found

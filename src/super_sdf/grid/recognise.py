@@ -40,16 +40,15 @@ from .look import (
     typical_slope,
     which_label,
     which_level,
+    whole_factor,
 )
 from .samples import SampleArray
 
 # 2. Labels: share of the samples off the background that equal 4 or more of their 6 neighbours; of
-# neighbours that differ, how many by one rank; by how much labels may be off whole numbers, and
-# whole numbers off those that are stored.
+# neighbours that differ, how many by one rank.
 PLATEAUS = 0.45  # whole images and integer distances to .43, labels from .55
 BY_RANK = 0.99  # integer distances 1, labels to .97, but where one is in the other
 AMID = 0.1  # of these the share that equal all 6: distances 0, labels inside others .3 and more
-NEARLY, FACTOR = 1e-3, 0.05
 FEW_LABELS = 8  # different values: rounded distances and images from 11, lesions and organs to 8
 # 3. Transforms: share of the samples beside the surface that equal others with the same 27 signs.
 # Values that do not jump over 0 need the steps of a mask: a share of these samples with other sides
@@ -160,10 +159,10 @@ def recognise(
 
 
 def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool:
-    if look.infinite or not _are_whole(look.pairs.ravel()):
+    if look.infinite or not whole_factor(look.pairs.ravel()):
         return False
     found = different_values(samples)
-    if found is None or not _are_whole(found[0].astype(np.float64)):
+    if found is None or not whole_factor(found[0].astype(np.float64)):
         return False
     distinct, counts = found
     ranks = np.abs(np.diff(np.searchsorted(distinct, look.pairs), axis=0))
@@ -178,18 +177,6 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
     facts["plateaus"] = float((equal >= 4).mean()) if len(equal) else 1.0
     few = len(distinct) <= FEW_LABELS and look.low >= 0
     return bool(few or facts["plateaus"] >= PLATEAUS)
-
-
-def _are_whole(values: Floats) -> bool:
-    """Return whether all values but 0 are whole numbers, times one factor near 1."""
-    some = values[np.abs(values) > NEARLY]
-    if not len(some) or np.abs(some).max() < 1 - FACTOR:
-        return False
-    least = np.abs(some).min()
-    factor = least / max(np.rint(least), 1)
-    some = some / factor
-    off = np.abs(some - np.rint(some)) <= np.maximum(NEARLY, 1e-9 * np.abs(some))
-    return bool(abs(factor - 1) <= FACTOR and off.all())
 
 
 def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:

@@ -22,7 +22,7 @@ from ..files.grids import read_array
 from ..files.readers import PLACE
 from ..grid.derived import extremes_of_masks
 from ..grid.interpret import mask_field
-from ..grid.look import MOST_LABELS, named
+from ..grid.look import MOST_LABELS, as_labels, named
 from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.contract import Decoder, adapt
@@ -113,7 +113,9 @@ def find_image(
     values, spacing, origin = placed(values, place["spacing"], place["origin"])
     samples = as_samples(values)
     check_kind(samples.dtype, samples.shape)
-    counts, numbers, missing = find_labels(samples, in_order(asked.labels), partly=partly)
+    counts, numbers, missing = find_labels(
+        as_labels(samples), in_order(asked.labels), partly=partly
+    )
     if spacing is None:
         notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
     if origin is None:
@@ -143,7 +145,7 @@ def find_labels(
     samples: Any, wanted: list[int] | None, *, partly: bool
 ) -> tuple[dict[int, int], NDArray[np.int16], list[int]]:
     """Return how many samples each label has, numbers of a ``LabelImage``, and missing labels."""
-    counts = Counter[Any]()
+    counts, samples = Counter[Any](), as_labels(samples)
     for plane in samples:  # to save memory
         values, times = np.unique(plane, return_counts=True)
         odd = values[~np.isfinite(values) | (np.rint(values) != values)]
