@@ -35,8 +35,8 @@ OF_OTHERS = (
     *(*MASKS[:-1], "mc-lewiner", "trilinear", "bspline", "bound"),
     *(FLOOR, "dual-contouring", "ndc"),
 )
-# Folders of the package whose code does not change any surface.
-NOT_THE_METHOD = {"batch", "check", "cli", "labels", "pages"}
+# Folders and modules of the package whose code does not change any surface.
+NOT_THE_METHOD = {"batch", "check.py", "cli", "labels", "pages"}
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ NO_NORMAL_NC, NO_NORMAL_ANGLE = 0.5, 90.0
 class Comparison:
     """A result beside its reference, and what metrics need of both, each computed when asked for.
 
-    P are the points drawn from the reference, Q those from the result; of pairs the first is from
-    the reference to the result. A mesh without faces counts as a dot at the origin.
+    P are the points drawn from the reference, Q those from the result. Of two arrays the first is
+    measured from the reference to the result. A mesh without faces counts as a dot at the origin.
     """
 
     shape: Shape

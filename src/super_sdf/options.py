@@ -2,7 +2,7 @@
 
 ``Options`` holds a value of each and is passed whole. The options of the command line, what a line
 of a batch's list may say, the JSON report and the checks of Python's arguments are made of its
-rows, so a new option is a row here and the line that uses it.
+rows. So a new option is a row here, the line that uses it, and a parameter of ``reconstruct``.
 """
 
 from __future__ import annotations

@@ -294,7 +294,7 @@ def mesh_grid(
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
-    # of voxels that are refined in one piece: none, if the grid is to be cut in any case
+    # so many voxels are refined in one piece; -1: the grid is cut in any case
     most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
     bands = [survey(lattice, chosen.offset, threads=threads, most=most)]
     steps.finish("band")
