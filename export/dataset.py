@@ -111,7 +111,7 @@ def make_sample(
     posed = draw_pose(rng, mesh, sizes, slices)
     shape, first = draw_window(rng, posed)
     truth = solid.Solid(posed)
-    values = sampling.sample_grid(truth, (shape, 1.0, first))
+    values = sampling.sample_solid(truth, (shape, 1.0, first)).values
     window = 2 * values
     voxel_ijk = np.argwhere(np.abs(window) <= band.DECODE_LIMIT)
     if not lowest[0] < values.min() < lowest[1] or not len(voxel_ijk) or (values < 0).all():

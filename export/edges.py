@@ -23,6 +23,7 @@ from export.arguments import Parser, at_least, share
 from export.dataset import draw_mesh, mesh_order
 from export.shapes.solid import random_solid
 from super_sdf import Mesh, load_network, upsample
+from super_sdf.arrays import face_normals, unit
 from super_sdf.errors import SuperSdfError
 from super_sdf.surface import cap, marching
 from super_sdf.surface.sharp import features, patches, planes
@@ -51,7 +52,7 @@ The loss is how far the surface there is from the true one, and turned from it, 
 def rows_of(mesh: Mesh, size: int, network: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence (f, e) and the losses (f, s) of all candidates of a shape."""
     truth = solid.Solid(mesh)
-    grid = sampling.sample_solid(truth, sampling.unit_layout(size))
+    grid = sampling.sample_solid(truth, ((size,) * 3, 1 / size, np.full(3, 0.5 / size - 0.5)))
     field = cap.close(upsample(grid, network, FACTOR), cap=True)
     every, crossings = np.ones(len(field.voxel_ijk), bool), marching.find_crossings(field)
     found, used = patches.find_patches(field, crossings, every)
@@ -73,20 +74,16 @@ def errors_of(truth: solid.Solid, patch: np.ndarray, corners: np.ndarray, count:
 
     Triangles (t, 3, 3) belong to patches (t,); patches without any have 0.
     """
-    normal = normals_of(corners)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1)
     normal /= np.maximum(area, 1e-18)[:, None]
     points = np.einsum("pk,tkd->ptd", AT, corners).reshape(-1, 3)
-    distance = truth.distance(points).reshape(len(AT), -1).mean(0)
-    true = normals_of(truth.mesh.vertices[truth.mesh.faces[truth.nearest(points)[1]]])
-    true /= np.maximum(np.linalg.norm(true, axis=1), 1e-18)[:, None]
+    off, nearest, _ = truth.nearest(points)
+    distance = off.reshape(len(AT), -1).mean(0)
+    true = unit(face_normals(truth.mesh.vertices, truth.mesh.faces[nearest]))
     turned = 1 - np.einsum("ptd,td->pt", true.reshape(len(AT), -1, 3), normal).mean(0)
     sums = [np.bincount(patch, area * error, count) for error in (distance, turned)]
     return np.stack(sums, 1) / np.maximum(np.bincount(patch, area, count), 1e-18)[:, None]
-
-
-def normals_of(corners: np.ndarray) -> np.ndarray:
-    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
 
 def gather(options: argparse.Namespace) -> Rows:
@@ -100,7 +97,9 @@ def gather(options: argparse.Namespace) -> Rows:
         turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
         turn *= np.sign(np.linalg.det(turn))
         try:
-            turned = solid.normalise(mesh.transformed(turn, np.zeros(3)))
+            box = np.array([end(mesh.vertices @ turn.T, axis=0) for end in (np.min, np.max)])
+            size = np.linalg.norm(box[1] - box[0])
+            turned = mesh.transformed(turn / size, -box.mean(0) / size)  # of diagonal 1, centred
             evidence, loss = rows_of(turned, int(rng.choice(SIZES)), network)
         except SuperSdfError:
             continue

@@ -37,8 +37,7 @@ from export.network import Block, SuperSdfNet
 from export.onnx_graph import EARLY, Writer, declared, rows_of
 from export.to_onnx import read_card, read_network, write_model
 from super_sdf import load_network
-from super_sdf.network import contract
-from super_sdf.network import onnx as sessions
+from super_sdf.network import contract, onnx as sessions
 
 LEVELS = 255  # of the inputs of a layer: uint8
 # Two products must fit into 16 bits, in which processors without VNNI add them with saturation.

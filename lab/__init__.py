@@ -2,7 +2,7 @@
 
 ``python -m lab`` lists the commands. It needs the extra ``lab``.
 
-    shapes, kinds -> methods -> measuring (metrics, edges) -> rows -> tables -> documents
+    samples -> shapes, kinds -> methods -> measuring (metrics) -> rows -> tables -> documents
     -> evaluate -> figures (costs)
 """
 

@@ -17,7 +17,7 @@ import numpy as np
 from super_sdf import Mesh, write_mesh
 from super_sdf.errors import SuperSdfError
 from super_sdf.threads import count_cores
-from super_sdf.truth.sampling import sample_solid, unit_layout
+from super_sdf.truth.sampling import sample_solid
 
 from .rows import Row
 from .shapes import Shape
@@ -83,7 +83,8 @@ def timed(words: Sequence[str], runs: int) -> Row:
 
 
 def write_grid(shape: Shape, size: int, folder: Path) -> Path:
-    grid = sample_solid(shape.solid, unit_layout(size), band=np.inf)
+    layout = (size, size, size), 1 / size, np.full(3, 0.5 / size - 0.5)
+    grid = sample_solid(shape.solid, layout, band=np.inf)
     path = folder / f"{size}.npz"
     np.savez(path, values=grid.values, spacing=grid.spacing, origin=grid.origin)
     return path

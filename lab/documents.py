@@ -21,16 +21,18 @@ from typing import Any
 from super_sdf.errors import FileError
 
 from . import parser_of, published, tables
+from .metrics import METRICS, Column, shown_in
 from .rows import Row
-from .tables import Column, label_of, listed, wide
+from .tables import label_of, listed, meanings, wide
 
 FOLDER = Path(__file__).parent / "figures"
 ROOT = Path(__file__).parents[1]
 PLACES = ("README.md", "docs/**/*.md", "src/super_sdf/models/*.md")
 MARKED = re.compile(r"(<!-- figures: ([^>]+?) -->)(.*?)(<!-- /figures -->)", re.DOTALL)
 UNKNOWN = "(not measured)"
-COLUMNS = {**tables.BY_KEY, "peak_mb": tables.PEAK}  # of numbers in sentences
+COLUMNS = {**METRICS, "peak_mb": tables.PEAK}  # of numbers in sentences
 BY_SIZE = ("size", "method")
+QUALITY = "surface summary networks settings"
 SUMMARY = ("mc", "bspline", "ours", "ours-marching", "bound")
 
 
@@ -48,7 +50,7 @@ def among(rows: Iterable[Row], key: str, part: str) -> list[Row]:
 def beside(rows: Sequence[Row], word: str, theirs: Sequence[Row] = ()) -> str:
     """Return the rows of a setting, each value with the published rows."""
     together = sorted([*rows, *theirs], key=lambda row: float(row[word]))
-    return listed(together, tables.SETTINGS, (word, "method"))
+    return listed(together, shown_in("settings"), (word, "method"))
 
 
 def kind_table(rows: Sequence[Row]) -> str:
@@ -59,7 +61,7 @@ def kind_table(rows: Sequence[Row]) -> str:
         mine, mc = found["ours"], found["mc"]
         taken = mine["taken_as"] + (f", told {mine['told']}" if mine["told"] else "")
         taken += f", refused {mine['refused']}" if mine["refused"] else ""
-        voxels = Column("", "voxels", 1, 4)
+        voxels = Column("voxels", digits=4)
         body.append([
             *(kind if name == "shapes" else f"{kind}, CAD parts", taken),
             *(voxels.cell(found.get(method, {})) for method in methods),
@@ -72,18 +74,21 @@ def kind_table(rows: Sequence[Row]) -> str:
 
 
 TABLES: dict[str, Callable[[list[Row]], str]] = {
-    "quality.summary": lambda rows: wide(pick(rows, method=SUMMARY), "method", tables.SHORT),
+    "quality.summary": lambda rows: wide(pick(rows, method=SUMMARY), "method", shown_in("summary")),
     "quality.networks": lambda rows: listed(
-        among(rows, "method", "ours-marching"), tables.NETWORKS, BY_SIZE),
+        among(rows, "method", "ours-marching"), shown_in("networks"), BY_SIZE),
     **{f"quality.{n}": lambda rows, n=n: tables.surface_table(pick(rows, size=n), n)
        for n in (32, 64, 128)},
+    "quality.meaning": lambda rows: meanings(QUALITY),
+    "edges.meaning": lambda rows: meanings("parts peers", but=QUALITY),
     "edges.parts": lambda rows: listed(
-        pick(rows, set="parts"), tables.MESHERS, ("size", "factor", "method")),
+        pick(rows, set="parts"), shown_in("parts"), ("size", "factor", "method")),
     "edges.validation": lambda rows: listed(
-        pick(rows, set="validation"), tables.MESHERS, BY_SIZE),
+        pick(rows, set="validation"), shown_in("parts"), BY_SIZE),
     "peers.contouring": lambda rows: listed(
-        among(rows, "method", "dual-contouring"), tables.PEERS, BY_SIZE),
-    "peers.ndc": lambda rows: listed(among(rows, "method", "ndc"), tables.PEERS, BY_SIZE),
+        among(rows, "method", "dual-contouring"), shown_in("parts peers"), BY_SIZE),
+    "peers.ndc": lambda rows: listed(
+        among(rows, "method", "ndc"), shown_in("parts peers"), BY_SIZE),
     "kinds.distances": lambda rows: kind_table(
         [row for row in rows if row["kind"] != "mask" and "spacing 1" not in row["kind"]]),
     "kinds.masks": lambda rows: kind_table(pick(rows, kind="mask")),
@@ -99,7 +104,7 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
     "noise.table": lambda rows: beside(rows, "noise", published.NOISY),
     "scale.table": lambda rows: beside(rows, "scale", published.SCALED_ROWS),
     "factors.table": partial(beside, word="factor"),
-    "simplify.table": lambda rows: listed(rows, tables.SIMPLIFIED, ("set", "method")),
+    "simplify.table": lambda rows: listed(rows, shown_in("simplify"), ("set", "method")),
 }  # fmt: skip
 
 

@@ -22,35 +22,26 @@ from dataclasses import replace
 from pathlib import Path
 
 from super_sdf.errors import FileError, OptionError, seen
-from super_sdf.options import AUTO, DEFAULT_QUALITY, PRECISIONS
+from super_sdf.options import DEFAULT_QUALITY, PRECISIONS
 from super_sdf.threads import count_cores
 
 from . import parser_of
 from .measuring import NO_SETTING, Task, network_of
 from .methods import BY_NAME, FLOOR, METHODS, OURS
+from .metrics import METRICS, shown_in
 from .ndc import add_ndc
 from .rows import OnTask, Row, Rows, complete
 from .shapes import Setting, find_meshes, spread
-from .tables import EDGES, GAPS, gaps_closed, listed, summary, surface_table
+from .tables import gaps_closed, listed, meanings, summary, surface_table
 
 ROWS = "results.jsonl"
 PROTOCOL_LINES = """\
-Lengths are in units of the reference's box diagonal. 100,000 points are sampled on each surface; CD
-is the sum of the mean squared distances both ways, F1 at 0.003, NC the normal consistency. p2s is
-the mean exact point-to-triangle distance of both directions ("ref to res", "res to ref"); ECD and
-EF1 (at 0.005) compare sharp edges. Field errors are those at the fine nodes of the band. The bound
-is marching cubes of the true distances at the same nodes; the floor compares two independent
-samplings of the reference. A result without a surface counts as a dot at the origin; a shape on
-which a method failed is left out of that table for all methods, and named. Published rows are of
-other shapes (Thingi30)."""
-
-EDGE_LINES = """\
-EFv is the F1 of points on the sharp edges (over 30 degrees) of both meshes, at a tenth of a coarse
-voxel. The edge distance is that of points on the reference's edges to the result's triangles, in
-coarse voxels: its mean. The angles, in degrees, are those between the result's normals and that of
-the nearest triangle of the reference, within a coarse voxel of the reference's edges ("near") and
-beyond. Slivers are triangles with an angle under 5 degrees; the min angle is the mean over the
-shapes of the smallest. Shapes without edges do not count."""
+Lengths are in units of the reference's box diagonal; voxels are those of the coarse grid. 100,000
+points are sampled on each surface. Figures are means over the shapes. The bound is marching cubes
+of the true distances at the fine nodes; the floor compares two independent samplings of the
+reference. A result without a surface counts as a dot at the origin; a shape on which a method
+failed is left out of that table for all methods, and named. Shapes without sharp edges do not count
+in figures of edges. Published rows are of other shapes (Thingi30)."""
 
 
 class Results:
@@ -115,6 +106,7 @@ def results_of(
 def report(results: Results, like: Task) -> str:
     """Return the tables of all settings as Markdown, with what was left out."""
     parts = [f"# Quality of super-sdf on {len(results.floors)} shapes", PROTOCOL_LINES]
+    parts.append(meanings("surface edges"))
     if like.turned is not None:
         parts.append(f"The shapes are turned at random, by seed {like.turned}.")
     parts += [f"Left out, {entry}." for entry in results.left_out]
@@ -124,9 +116,9 @@ def report(results: Results, like: Task) -> str:
         parts += [f"## {setting}", surface_table(means, setting.size)]
         ends = found.get("bspline", []), found.get("bound", [])
         if closed := gaps_closed(found.get(OURS, []), *ends):
-            gaps = (f"{title} {closed[f'gap_{key}']:.0%}" for key, title in GAPS.items())
+            gaps = (f"{METRICS[key[4:]].gap} {share:.0%}" for key, share in closed.items())
             parts.append(f"Of the gap from B-spline to the bound closed: {', '.join(gaps)}.")
-        parts += [f"### Edges and triangles\n\n{EDGE_LINES}", listed(means, EDGES)]
+        parts += ["### Edges and triangles", listed(means, shown_in("edges"))]
     return "\n\n".join(parts) + "\n"
 
 
@@ -159,7 +151,7 @@ def main() -> int:
     parser.add_argument("--limit", type=int, help="use only this many meshes, spread over the list")
     parser.add_argument("--turned", type=int, metavar="SEED", help="turn meshes at random first")
     parser.add_argument("--model", default=DEFAULT_QUALITY, help="shipped network or ONNX file")
-    parser.add_argument("--precision", choices=PRECISIONS, default=AUTO)
+    parser.add_argument("--precision", choices=PRECISIONS, default="auto")
     parser.add_argument("--quiet", action="store_true", help="print errors only")
     add_jobs(parser)
     add_ndc(parser)

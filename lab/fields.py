@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from super_sdf import Mesh, SdfGrid, load_network, reconstruct
-from super_sdf.options import MARCHING, SHARP
 from super_sdf.surface.marching import CAP_HEIGHT
 
 from . import parser_of
@@ -127,7 +126,7 @@ def main() -> int:
     network, faults = load_network("fast", threads=1), list[str]()
     for field in make_fields(words.count, words.seed):
         grid = SdfGrid.trusted(field.values, 1.0)  # they are no distances, and need not be
-        for mesher in (MARCHING, SHARP):
+        for mesher in ("marching", "sharp"):
             mesh = reconstruct(grid, network, field.factor, cap=field.cap, mesher=mesher)
             found = faults_of_mesh(field, mesh)
             faults += [f"{mesher}, {fault}" for fault in found]

@@ -67,12 +67,7 @@ class Bench:
     jobs: int = 1  # processes at a time
     runs: int = 5  # of each that is timed
 
-    def results(
-        self,
-        name: str,
-        settings: Sequence[Setting],
-        methods: Sequence[str],
-    ) -> Results:
+    def results(self, name: str, settings: Sequence[Setting], methods: Sequence[str]) -> Results:
         """Return the measurements of methods on a set, in settings; measure what is missing.
 
         Sets are "validation", "few" of them, "parts", which are turned, and "few parts".
@@ -89,10 +84,7 @@ class Bench:
         return results_of(paths, settings, like, self.rows, self.jobs, progress_lines())
 
     def measured(
-        self,
-        name: str,
-        settings: Sequence[tuple[Words, Setting]],
-        methods: Sequence[str],
+        self, name: str, settings: Sequence[tuple[Words, Setting]], methods: Sequence[str]
     ) -> list[Row]:
         """Return the means of each method in each setting, a row of its words."""
         results = self.results(name, [setting for _, setting in settings], methods)

@@ -19,7 +19,6 @@ from super_sdf.arrays import FloatArray
 from super_sdf.errors import GridError
 from super_sdf.grid.sdf_grid import make_grid
 from super_sdf.network.contract import Decoder
-from super_sdf.options import AUTO, SMOOTH
 from super_sdf.pipeline import reconstruct
 
 from .shapes import FIELD_NOISE, Case
@@ -187,14 +186,14 @@ def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
     values, spacing, origin = samples_of(kind, case)
     placed = {"spacing": spacing, "origin": origin} if kind.unit is None else {}
     refusals = []
-    for told in (AUTO, SMOOTH) if kind.group == "scaled" else (AUTO,):
+    for told in ("auto", "smooth") if kind.group == "scaled" else ("auto",):
         try:
             grid = make_grid(values, field=told, **kind.options, **placed)
             mesh = reconstruct(grid, network, factor=case.factor)
         except GridError as problem:
             refusals.append(str(problem))
         else:
-            facts = {"taken_as": grid.field.kind, "told": told != AUTO}
+            facts = {"taken_as": grid.field.kind, "told": told != "auto"}
             return Surface(mesh if placed else stretched(mesh, 1 / kind.unit, origin), facts=facts)
     return Surface(EMPTY, facts={"refused": refusals[0]})
 

@@ -16,20 +16,13 @@ import numpy as np
 import super_sdf
 from super_sdf.errors import SuperSdfError
 from super_sdf.network.contract import Decoder
-from super_sdf.network.network import (
-    KIND_MODELS,
-    find_model,
-    load_network,
-    shipped_models,
-)
-from super_sdf.options import AUTO, DEFAULT_QUALITY
-from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.solid import Solid
+from super_sdf.network.network import KIND_MODELS, find_model, load_network, shipped_models
+from super_sdf.options import DEFAULT_QUALITY
 
-from . import edges, metrics
 from .kinds import MASKS
 from .methods import FLOOR, ON, make_surface
-from .shapes import RESULT_EDGES, RESULT_POINTS, Case, Setting, Shape
+from .metrics import METRICS, OF_KINDS, Comparison, Measure
+from .shapes import Case, Setting, Shape
 from .surfaces import Surface
 
 Measurement = dict[str, Any]
@@ -37,7 +30,6 @@ Measurement = dict[str, Any]
 
 PROTOCOL = 3  # increase it when a figure changes its meaning: older measurements do not count then
 NO_SETTING = Setting(0, 0)  # of the floor: nothing is sampled
-VOXEL_NUMBERS = ("efv", "edge_distance", "angle_near", "angle_beyond")
 # Methods whose results do not depend on the code and the networks of this package.
 OF_OTHERS = (
     *(*MASKS[:-1], "mc-lewiner", "trilinear", "bspline", "bound"),
@@ -55,14 +47,14 @@ class Task:
     setting: Setting
     methods: tuple[str, ...]  # in the order of measuring
     model: str = DEFAULT_QUALITY
-    precision: str = AUTO
+    precision: str = "auto"
     threads: int = 0  # of the network; 0: one per core
     turned: int | None = None  # seed by which the shape is turned at random
     triangles: tuple[tuple[str, int], ...] = ()  # of methods that were measured before
 
     def network(self, method: str) -> tuple[str, str]:
         model, _, precision = method.partition("@")[2].partition(":")
-        return (model, precision or AUTO) if model else (self.model, self.precision)
+        return (model, precision or "auto") if model else (self.model, self.precision)
 
     def key(self, method: str) -> Measurement:
         """Return the key of a method's measurement: it is valid as long as nothing here changes."""
@@ -103,22 +95,27 @@ def network_of(model: str, precision: str, threads: int) -> Decoder:
 def measure_method(shape: Shape, case: Case | None, method: str, task: Task) -> Measurement:
     """Return a method's figures, or the reason in "error" if it raised an exception.
 
-    A failure is not a score: its cause is the machine or a bug, not the method. ``seconds`` is the
-    time from the grid in memory to the mesh in memory.
+    A failure is not a score: its cause is the machine or a bug, not the method.
     """
     try:
         network = network_of(*task.network(method), task.threads)
         clock = time.perf_counter()
         surface = make_surface(method, case, network) if case else Surface(shape.mesh)
         seconds = time.perf_counter() - clock
-        spacing = case.spacing if case else None
-        figures = measure_mesh(shape, surface.mesh, spacing, ON in method)
-        if case and surface.field:  # at the nodes of the band, each counted once
+        off = np.zeros(0)
+        if case and surface.field:
             off = surface.field()[case.band].astype(np.float64) - case.truth[case.band]
-            figures |= {"field_mse": np.mean(off**2).item(), "field_mae": np.abs(off).mean().item()}
+        spacing = case.spacing if case else None
+        compared = Comparison(shape, surface.mesh, spacing, off, seconds)
+        figures = {key: of(compared) for key, of in measures(method).items()}
     except Exception as problem:  # named in the report; the other shapes still count
         return {"error": reason_of(problem)}
-    return {**figures, **(surface.facts or {}), "seconds": seconds, "error": None}
+    return {**figures, **(surface.facts or {}), "error": None}
+
+
+def measures(method: str) -> dict[str, Measure]:
+    """Return the functions of the metrics that are measured of a method's results."""
+    return OF_KINDS if ON in method else {m.key: m.of for m in METRICS.values() if m.of}
 
 
 def reason_of(problem: Exception) -> str:
@@ -133,41 +130,13 @@ def reason_of(problem: Exception) -> str:
     return f"{type(problem).__name__}: {message}{place}"
 
 
-def measure_mesh(shape: Shape, mesh: Mesh, spacing: float | None, is_kind: bool) -> Measurement:
-    """Return the figures of a result's mesh; a mesh without faces counts as a dot at the origin.
-
-    ``spacing`` is that of the coarse grid; without one, figures in voxels are None. Results on a
-    kind of grid have no table of edges: without edges and angles they take half the time.
-    """
-    result = Solid(mesh)
-    drawn = metrics.sample_surface(mesh, shape.seed(RESULT_POINTS)).ordered()
-    there = metrics.distance_or_dot(result, shape.drawn.points)
-    back, nearest = metrics.nearest_or_dot(shape.solid, drawn.points)
-    figures: Measurement = {
-        **metrics.compare_samples(shape.drawn, drawn),
-        **metrics.compare_distances(there, back),
-        **{"closed": mesh.is_closed(), "outward": mesh.volume() > 0, "faces": len(mesh.faces)},
-    }
-    if is_kind:
-        volume_off = mesh.volume() / shape.mesh.volume() - 1
-        pieces = {"pieces": mesh.components()[0], "pieces_of_reference": shape.pieces}
-        return {**figures, "volume_off": volume_off, **pieces}
-    in_voxels: Measurement = dict.fromkeys(VOXEL_NUMBERS)
-    if spacing is not None:
-        seed = shape.seed(RESULT_EDGES)
-        in_voxels = edges.compare_in_voxels(shape.sharp, result, seed, spacing)
-        in_voxels |= edges.compare_angles(shape.mesh, nearest, shape.sharp, drawn, spacing)
-    figures |= edges.compare_edges(shape.sharp, edges.edge_points(drawn))
-    return {**figures, **in_voxels, **metrics.compare_triangles(mesh)}
-
-
 @cache
 def digest_of_file(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()[:16]
 
 
 @cache
-def digest_of_ours(model: str, precision: str = AUTO) -> str:
+def digest_of_ours(model: str, precision: str = "auto") -> str:
     """Return a hash of a network's file, of those that replace it for a kind, and of the code."""
     network, symmetries = find_model(model, precision)
     digest = hashlib.sha256(str(symmetries).encode())

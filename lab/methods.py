@@ -19,7 +19,6 @@ from super_sdf.arrays import FloatArray
 from super_sdf.errors import NoSurfaceError, OptionError
 from super_sdf.grid.sdf_grid import SdfGrid
 from super_sdf.network.contract import Decoder, adapt
-from super_sdf.options import AUTO, MARCHING, SHARP
 from super_sdf.pipeline import extract_mesh, reconstruct, refine_band
 from super_sdf.refine.band import neighbour_table, survey
 from super_sdf.refine.bounds import SampleSpheres
@@ -27,7 +26,6 @@ from super_sdf.refine.field import FineField
 from super_sdf.refine.nodes import block_ijk, share_parts
 from super_sdf.simplify.simplify import simplify_mesh
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.sampling import grid_points
 
 from .kinds import BY_METHOD, KINDS
 from .ndc import neural_dual_contouring
@@ -67,13 +65,13 @@ def spline_surface(case: Case, network: Decoder, *, order: int) -> Surface:
     return Surface(isosurface(field, case.fine, case.low), lambda: field)
 
 
-def bound_surface(case: Case, network: Decoder, *, mesher: str = MARCHING) -> Surface:
+def bound_surface(case: Case, network: Decoder, *, mesher: str = "marching") -> Surface:
     """Mesh the true distances at the fine nodes: the bound of all upsampling to them."""
-    dense = sharp_isosurface if mesher == SHARP else isosurface
+    dense = sharp_isosurface if mesher == "sharp" else isosurface
     return Surface(dense(case.truth.copy(), case.fine, case.low))
 
 
-def our_surface(case: Case, network: Decoder, *, mesher: str = AUTO) -> Surface:
+def our_surface(case: Case, network: Decoder, *, mesher: str = "auto") -> Surface:
     """Mesh the coarse grid with super-sdf, capped where the surface leaves the grid.
 
     Without a surface the mesh is empty.
@@ -122,7 +120,7 @@ def sharp_isosurface(field: FloatArray, spacing: float, low: float) -> Mesh:
     parts = share_parts(neighbour_table(voxel_ijk, shape))
     grid = SdfGrid.trusted(whole[..., 0, 0, 0], side, low + side / 2)
     fine = FineField(shape, factor, voxel_ijk, blocks, parts, grid, spheres=spheres)
-    return extract_mesh(fine, mesher=SHARP, cap=False)
+    return extract_mesh(fine, mesher="sharp", cap=False)
 
 
 def dual_contouring(case: Case, network: Decoder) -> Surface:
@@ -133,7 +131,7 @@ def dual_contouring(case: Case, network: Decoder) -> Surface:
     order = np.arange(np.prod(shape)).reshape(shape).ravel(order="F")  # there i varies fastest
     values = np.ravel(case.grid.values).astype(np.float64)[order]
     vertices, quads = dual_contouring_of_signed_distance_data(
-        values, grid_points(case.layout)[order], *shape
+        values, case.grid.to_world(np.argwhere(np.ones(shape)))[order], *shape
     )
     halves = np.asarray(quads, np.int32)[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
     return Surface(Mesh(np.asarray(vertices), halves))
@@ -149,8 +147,8 @@ METHODS: dict[str, Method] = {
 }
 BY_NAME: dict[str, Method] = {
     **METHODS,
-    f"{OURS}-{MARCHING}": partial(our_surface, mesher=MARCHING),
-    f"bound-{SHARP}": partial(bound_surface, mesher=SHARP),
+    f"{OURS}-marching": partial(our_surface, mesher="marching"),
+    "bound-sharp": partial(bound_surface, mesher="sharp"),
     "dual-contouring": dual_contouring,
     "ndc": neural_dual_contouring,
 }

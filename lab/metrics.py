@@ -1,177 +1,284 @@
-"""The quality metrics of NMC, NDC, VoroMesh and PoNQ.
+"""The metrics: what is measured of a result, how it is shown, and what it means.
 
-All lengths are in units of the reference's box diagonal. P are points sampled on the reference, Q
-points sampled on the result.
+``METRICS`` is the table. To add a metric, add an entry: its function is given a ``Comparison``, and
+the results, the tables and the explanations in reports and documents are made from the entry.
+Lengths are in units of the reference's box diagonal, but where "voxels" is said: those are of the
+coarse grid.
 
 References
 ----------
-Chen and Zhang, Neural Marching Cubes (2021): F1 at 0.003.
+Chen and Zhang, Neural Marching Cubes (2021): F1 at 0.003; edge points, ECD and EF1 at 0.005.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from super_sdf.arrays import BoolArray
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.solid import Distances, Points, Solid
+from super_sdf.truth.solid import Distances, Solid
 
-SAMPLE_COUNT = 100_000
-F1_DISTANCE = 0.003
+from . import samples
+from .samples import DOT, EdgeCurves, Indices, SurfacePoints, nearest_or_dot
+from .shapes import RESULT_EDGES, RESULT_POINTS, Shape
+
+F1_DISTANCE, EDGE_DISTANCE = 0.003, 0.005
+VOXEL_SHARE = 0.1  # of a voxel: the distance of EFv
 SLIVER_ANGLE = 5.0  # degrees
-
-Numbers = dict[str, float | None]
-Indices = NDArray[np.int64]
+# Of the dot, which has no normal: the means of |n.n'| and of the angle over all directions.
+NO_NORMAL_NC, NO_NORMAL_ANGLE = 0.5, 90.0
 
 
 @dataclass(frozen=True, eq=False)
-class SurfacePoints:
-    """Points (n, 3) sampled on a surface, and the unit normals (n, 3) of their faces."""
+class Comparison:
+    """A result beside its reference, and what metrics need of both, each computed when asked for.
 
-    points: Points
-    normals: Points
+    P are the points drawn from the reference, Q those from the result; of pairs the first is from
+    the reference to the result. A mesh without faces counts as a dot at the origin.
+    """
+
+    shape: Shape
+    mesh: Mesh
+    spacing: float | None = None  # of the coarse grid; None of the floor, which has none
+    field_off: Distances | tuple[()] = ()  # errors at the fine nodes of the band, each counted once
+    seconds: float = 0.0  # from the grid in memory to the mesh in memory
 
     @cached_property
-    def tree(self) -> cKDTree:
-        return cKDTree(self.points)
+    def drawn(self) -> SurfacePoints:
+        return samples.sample_surface(self.mesh, self.shape.seed(RESULT_POINTS))
 
-    def ordered(self) -> SurfacePoints:
-        order = order_in_space(self.points)
-        return SurfacePoints(self.points[order], self.normals[order])
+    @cached_property
+    def solid(self) -> Solid:
+        return Solid(self.mesh)
+
+    @cached_property
+    def near(self) -> tuple[tuple[Distances, Distances], tuple[Indices, Indices]]:
+        """The distances of P to the nearest of Q and of Q to P, and the indices of these points."""
+        p, q = self.shape.drawn, self.drawn
+        (there, in_q), (back, in_p) = q.tree.query(p.points), p.tree.query(q.points)
+        return (there, back), (in_q, in_p)
+
+    @cached_property
+    def cosines(self) -> tuple[Distances, Distances]:
+        """n.n' of each point and the nearest of the other set."""
+        p, q, (in_q, in_p) = self.shape.drawn.normals, self.drawn.normals, self.near[1]
+        return np.einsum("nd,nd->n", p, q[in_q]), np.einsum("nd,nd->n", q, p[in_p])
+
+    @cached_property
+    def there(self) -> Distances:
+        """Distances of P to the nearest triangles of the result."""
+        return nearest_or_dot(self.solid, self.shape.drawn.points)[0]
+
+    @cached_property
+    def back(self) -> tuple[Distances, Indices]:
+        """Distances of Q to the nearest triangles of the reference, and these."""
+        return nearest_or_dot(self.shape.solid, self.drawn.points)
+
+    @cached_property
+    def edges_apart(self) -> tuple[Distances, Distances] | None:
+        """Distances of points on the reference's edges to edge points of Q, and back to edges."""
+        if not self.shape.sharp:
+            return None
+        points = samples.edge_points(self.drawn)
+        points = points if len(points) else DOT.points
+        there = cKDTree(points).query(self.shape.sharp.drawn)[0]
+        return there, self.shape.sharp.distance(points)
+
+    @cached_property
+    def angles(self) -> tuple[Distances, BoolArray]:
+        """Degrees between normals of Q and of the nearest triangles; whether edges are in a voxel.
+
+        Points whose triangle has no area, and so no normal, are left out.
+        """
+        sharp = self.shape.sharp
+        if self.spacing is None:
+            return np.zeros(0), np.zeros(0, bool)
+        if not self.drawn.normals.any():
+            near = np.array([False, True] if sharp else [False])
+            return np.full(len(near), NO_NORMAL_ANGLE), near
+        vectors = samples.face_vectors(self.shape.mesh)[self.back[1]]
+        lengths = np.linalg.norm(vectors, axis=1)
+        known, points = lengths > 0, self.drawn.points
+        cosines = np.einsum("nd,nd->n", vectors, self.drawn.normals)[known] / lengths[known]
+        near = sharp.distance(points) < self.spacing if sharp else np.zeros(len(points), bool)
+        return np.degrees(np.arccos(np.clip(cosines, -1, 1))), near[known]
+
+    @cached_property
+    def least_angles(self) -> Distances:
+        """The smallest angle of each triangle, in degrees; 0 without area."""
+        corners = self.mesh.vertices.astype(np.float64)[self.mesh.faces]  # (m, 3, 3)
+        ahead, back = (np.roll(corners, step, axis=1) - corners for step in (-1, 1))
+        sine = np.linalg.norm(np.cross(ahead, back), axis=2)
+        return np.degrees(np.arctan2(sine, np.einsum("mkd,mkd->mk", ahead, back))).min(axis=1)
 
 
-# Stands for a result without a surface; it has no normal.
-DOT = SurfacePoints(np.zeros((1, 3)), np.zeros((1, 3)))
-# NC of a point without a normal: the mean of |n.n'| over all directions n.
-NO_NORMAL_NC = 0.5
+def mean(values: Distances | BoolArray) -> float | None:
+    return float(values.mean()) if len(values) else None
 
 
-def face_vectors(mesh: Mesh) -> Points:
-    """Return the normal of each face times twice its area, (m, 3), outward if counter-clockwise."""
-    a, b, c = mesh.vertices[mesh.faces.T]
-    return np.cross(b - a, c - a)
+def chamfer(there: Distances, back: Distances) -> float:
+    return float(np.mean(there**2) + np.mean(back**2))
 
 
-def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> SurfacePoints:
-    """Return points sampled uniformly by area; of a mesh without area, one dot at the origin."""
-    vectors = face_vectors(mesh)
-    lengths = np.linalg.norm(vectors, axis=1)
-    if not lengths.sum() > 0:
-        return DOT
-    random = np.random.default_rng(seed)
-    face = draw_index(lengths, random.random(count))
-    root, v = np.sqrt(random.random(count)), random.random(count)
-    weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)  # uniform in the triangle
-    points = np.einsum("nk,nkd->nd", weights, mesh.vertices[mesh.faces[face]])
-    return SurfacePoints(points, vectors[face] / lengths[face, None])
+def f1(there: Distances, back: Distances, reach: float) -> float:
+    """Return the harmonic mean of the shares of distances under a reach, 0 if both are 0."""
+    recall, precision = float(np.mean(there < reach)), float(np.mean(back < reach))
+    return 2 * recall * precision / ((recall + precision) or 1.0)
 
 
-def order_in_space(points: Points) -> Indices:
-    """Return an order, (n,), of points (n, 3) in which neighbours in space follow one another.
+def normal_consistency(c: Comparison) -> float:
+    there, back = (float(np.abs(cosines).mean()) for cosines in c.cosines)
+    return (there + back) / 2 if c.drawn.normals.any() else NO_NORMAL_NC
 
-    A search for each of them then finds what it reads in the cache, and takes a third of the time.
+
+def quantile(distances: Distances) -> float:
+    return float(np.quantile(distances, 0.99))
+
+
+def edge_f1_in_voxels(c: Comparison) -> float | None:
+    """Return EFv, 0 for a result without sharp edges.
+
+    The edge points of EF1 lie up to 0.004 beside an edge: at 64^3 a perfect result would score 0.5.
     """
-    return cKDTree(points).indices
+    reference = c.shape.sharp
+    if c.spacing is None or not reference:
+        return None
+    curves = EdgeCurves.of(c.solid.mesh, c.shape.seed(RESULT_EDGES))
+    if not curves:
+        return 0.0
+    there, back = curves.distance(reference.drawn), reference.distance(curves.drawn)
+    return f1(there, back, VOXEL_SHARE * c.spacing)
 
 
-def draw_index(weights: Distances, uniform: Distances) -> Indices:
-    """Return indices (n,) drawn in proportion to weights (m,), from numbers in [0, 1), (n,)."""
-    cumulative = np.cumsum(weights)
-    index = np.searchsorted(cumulative, uniform * cumulative[-1], side="right")
-    return np.minimum(index, np.flatnonzero(weights)[-1])  # rounding may reach past the last one
+def edge_distance(c: Comparison) -> float | None:
+    if c.spacing is None or not c.shape.sharp:
+        return None
+    return float(nearest_or_dot(c.solid, c.shape.sharp.drawn)[0].mean() / c.spacing)
 
 
-def compare_samples(reference: SurfacePoints, result: SurfacePoints) -> Numbers:
-    """Return CD (sum of mean squares), F1, recall and precision at 0.003, NC and signed NC."""
-    there, there_at = result.tree.query(reference.points)
-    back, back_at = reference.tree.query(result.points)
-    there_nc = normal_agreement(reference.normals, result.normals[there_at])
-    back_nc = normal_agreement(result.normals, reference.normals[back_at])
-    recall, precision = (float(np.mean(far < F1_DISTANCE)) for far in (there, back))
-    return {
-        "cd": float(np.mean(there**2) + np.mean(back**2)),
-        "f1": harmonic_mean(recall, precision),
-        "recall": recall,
-        "precision": precision,
-        "nc": (there_nc[0] + back_nc[0]) / 2,
-        "signed_nc": (there_nc[1] + back_nc[1]) / 2,
-    }
+Measure = Callable[[Comparison], "float | None"]
 
 
-def normal_agreement(normals: Points, others: Points) -> tuple[float, float]:
-    """Return the means of |n.n'| and of n.n' over pairs of normals, (n, 3) each."""
-    dot = np.einsum("nd,nd->n", normals, others)
-    known = normals.any(1) & others.any(1)
-    return float(np.where(known, np.abs(dot), NO_NORMAL_NC).mean()), float(dot.mean())
+@dataclass(frozen=True)
+class Column:
+    """A column of a table: the figure that it shows, its title, scale and rounding."""
+
+    key: str
+    title: str = ""
+    scale: float = 1.0
+    digits: int = 3
+
+    def cell(self, row: Mapping[str, Any]) -> str:
+        """Return the figure of a row as text, "-" if it is unknown."""
+        figure = row.get(self.key)
+        if figure is None or isinstance(figure, str):
+            return figure or "-"
+        return f"{figure * self.scale:,.{self.digits}f}"
 
 
-def harmonic_mean(recall: float, precision: float) -> float:
-    total = recall + precision
-    return float(2 * recall * precision / total) if total > 0 else 0.0
+@dataclass(frozen=True)
+class Metric(Column):
+    """A figure of every result: how it is measured, where it shows, and what it means."""
+
+    of: Measure | None = None  # None: made of other figures, by `evaluate` and `figures`
+    tables: str = ""  # in which it shows; of "surface", "edges" those of `evaluate`
+    meaning: str = ""
+    better: str = "lower"
+    gap: str = ""  # what a report calls it that says how far its gap to the bound is closed
+    counted: bool = False  # whether it is true or false: tables show of how many shapes it is true
+
+    def cell(self, row: Mapping[str, Any]) -> str:
+        if self.counted and self.key in row:
+            return f"{row[self.key]} of {row['shapes']}"
+        return super().cell(row)
 
 
-def compare_distances(there: Distances, back: Distances) -> Numbers:
-    """Return the mean, 99th percentile and maximum of point-to-triangle distances, both ways.
+ALL_METRICS = (
+    Metric("cd", "CD x1e5", 1e5, of=lambda c: chamfer(*c.near[0]), tables="surface settings",
+           meaning="Chamfer distance: mean squared distance to the nearest point, both ways"),
+    Metric("excess_cd", "excess CD x1e5", 1e5, tables="surface",
+           meaning="CD less that of two samplings of the reference"),
+    Metric("f1", "F1", of=lambda c: f1(*c.near[0], F1_DISTANCE), better="higher", gap="F1",
+           tables="surface summary networks settings parts", meaning="harmonic mean of the shares "
+           "of points that are within 0.003 of the other surface"),
+    Metric("recall", of=lambda c: mean(c.near[0][0] < F1_DISTANCE)),
+    Metric("precision", of=lambda c: mean(c.near[0][1] < F1_DISTANCE)),
+    Metric("nc", "NC", digits=4, of=normal_consistency, better="higher", gap="NC",
+           tables="surface summary networks settings parts", meaning="normal consistency: mean "
+           "absolute cosine between a point's normal and that of the nearest point"),
+    Metric("signed_nc", "signed NC", of=lambda c: sum(map(np.mean, c.cosines)) / 2,
+           tables="surface", better="higher", meaning="NC with the sign of the cosine"),
+    Metric("p2s", "p2s x1e4", 1e4, 2, of=lambda c: (c.there.mean() + c.back[0].mean()) / 2,
+           tables="surface settings", gap="point to surface",
+           meaning="mean distance from point to triangle, both ways"),
+    Metric("p2s_there", "ref to res", 1e4, 2, of=lambda c: mean(c.there),
+           tables="surface networks parts simplify",
+           meaning="p2s from the reference to the result"),
+    Metric("p2s_back", "res to ref", 1e4, 2, of=lambda c: mean(c.back[0]),
+           tables="surface networks settings parts simplify", gap="result to reference",
+           meaning="p2s from the result to the reference"),
+    Metric("p99", "p99 x1e4", 1e4, 1, of=lambda c: (quantile(c.there) + quantile(c.back[0])) / 2,
+           tables="surface", meaning="99th percentile of these distances"),
+    Metric("p99_there", of=lambda c: quantile(c.there)),
+    Metric("p99_back", of=lambda c: quantile(c.back[0])),
+    Metric("max", "max x1e4", 1e4, 0, of=lambda c: max(c.there.max(), c.back[0].max()),
+           tables="surface", meaning="largest of these distances"),
+    Metric("max_there", of=lambda c: c.there.max()),
+    Metric("max_back", of=lambda c: c.back[0].max()),
+    Metric("ecd", "ECD x1e5", 1e5, 2, of=lambda c: c.edges_apart and chamfer(*c.edges_apart),
+           tables="surface", meaning="CD of points at sharp edges, those of over 30 degrees"),
+    Metric("ef1", "EF1", of=lambda c: c.edges_apart and f1(*c.edges_apart, EDGE_DISTANCE),
+           tables="surface networks edges parts", better="higher",
+           meaning="F1 of points at sharp edges, within 0.005"),
+    Metric("efv", "EFv", of=edge_f1_in_voxels, tables="edges parts", better="higher",
+           meaning="F1 of points on the sharp edges of both meshes, within a tenth of a voxel"),
+    Metric("edge_distance", "edge distance", of=edge_distance, tables="edges parts",
+           meaning="mean distance of the true sharp edges to the mesh, in voxels"),
+    Metric("angle_near", "angle near", digits=2, of=lambda c: mean(c.angles[0][c.angles[1]]),
+           tables="edges parts", meaning="mean angle between the normals of the mesh and those of "
+           "the nearest true triangles, in degrees, within a voxel of a true sharp edge"),
+    Metric("angle_beyond", "angle beyond", digits=2, of=lambda c: mean(c.angles[0][~c.angles[1]]),
+           tables="edges parts", meaning="the same farther from sharp edges"),
+    Metric("field_mse", "field MSE x1e6", 1e6, of=lambda c: mean(np.square(c.field_off)),
+           tables="surface", meaning="mean squared error of the refined values near the surface"),
+    Metric("field_mae", "field MAE x1e4", 1e4, 2, of=lambda c: mean(np.abs(c.field_off)),
+           tables="surface networks", meaning="mean absolute error of these values"),
+    Metric("left", "triangles left %", 100, 1, tables="simplify"),
+    Metric("faces", "triangles", digits=0, of=lambda c: len(c.mesh.faces), better="-",
+           tables="surface edges parts simplify", meaning="how many the mesh has"),
+    Metric("slivers", "slivers %", 100, 2, of=lambda c: mean(c.least_angles < SLIVER_ANGLE),
+           tables="edges parts simplify",
+           meaning="share of triangles with an angle under 5 degrees"),
+    Metric("min_angle", "min angle", digits=2, better="higher", tables="edges",
+           of=lambda c: c.least_angles.min() if len(c.mesh.faces) else None,
+           meaning="smallest angle of a triangle, in degrees"),
+    Metric("gap_f1", "F1 gap closed %", 100, 0, tables="networks settings", better="higher",
+           meaning="share of the way from B-spline to the bound"),
+    Metric("seconds", "seconds", digits=2, of=lambda c: c.seconds, tables="peers",
+           meaning="time from the grid in memory to the mesh in memory"),
+    Metric("outward", of=lambda c: c.mesh.volume() > 0, counted=True),
+    Metric("closed", "closed", of=lambda c: c.mesh.is_closed(), counted=True, better="higher",
+           tables="surface networks settings edges parts simplify",
+           meaning="meshes without an open edge"),
+)  # fmt: skip
+METRICS = {metric.key: metric for metric in ALL_METRICS}
+# Of results on kinds of grids, which have tables of their own: without edges in half the time.
+OF_KINDS: dict[str, Measure] = {
+    "p2s": METRICS["p2s"].of,
+    "closed": METRICS["closed"].of,
+    "volume_off": lambda c: c.mesh.volume() / c.shape.mesh.volume() - 1,
+    "pieces": lambda c: c.mesh.components()[0],
+    "pieces_of_reference": lambda c: c.shape.pieces,
+}
 
-    ``there`` are those from P to the result's triangles, ``back`` those from Q to the reference's:
-    see ``nearest_or_dot``. Figures without a direction are the mean of both, or the larger maximum.
-    """
-    mean, p99 = (there.mean(), back.mean()), (np.quantile(there, 0.99), np.quantile(back, 0.99))
-    most = there.max(), back.max()
-    whole = {"p2s": float(sum(mean)) / 2, "p99": float(sum(p99)) / 2, "max": float(max(most))}
-    for name, pair in (("p2s", mean), ("p99", p99), ("max", most)):
-        whole |= {f"{name}_there": float(pair[0]), f"{name}_back": float(pair[1])}
-    return whole
 
-
-def nearest_or_dot(solid: Solid, points: Points) -> tuple[Distances, Indices]:
-    """Return the distances of points to a mesh, (n,), and their nearest triangles, (n,).
-
-    If it has no faces, the distances are those to the origin, and the triangles -1.
-    """
-    if not len(solid.mesh.faces):
-        return np.linalg.norm(points, axis=1), np.full(len(points), -1)
-    distances, faces, _ = solid.nearest(points)
-    if not np.isfinite(distances).all():
-        raise ValueError("a point-to-triangle distance is not finite")
-    return distances, faces
-
-
-def distance_or_dot(solid: Solid, points: Points) -> Distances:
-    return nearest_or_dot(solid, points)[0]
-
-
-def distance(truth: Mesh, mesh: Mesh, count: int, within: Points | None = None) -> float:
-    """Return the mean distance between two surfaces, both ways, at points drawn from each.
-
-    NaN without a mesh. ``within``, (3,), leaves out caps: points beside the border of the box from
-    the origin to there.
-    """
-    if not len(mesh.faces):
-        return float("nan")
-    total = 0.0
-    for seed, (one, other) in enumerate(((truth, mesh), (mesh, truth)), 1):
-        points = sample_surface(one, (1, seed), count).points
-        if within is not None:
-            points = points[((points > 0.1) & (points < within - 0.1)).all(1)]
-        total += float(Solid(other).distance(points).mean()) / 2 if len(points) else np.inf
-    return total
-
-
-def compare_triangles(mesh: Mesh) -> Numbers:
-    """Return the smallest angle in degrees, and the share of triangles with one under 5 degrees.
-
-    Both are None for a mesh without faces. A triangle without area has an angle of 0.
-    """
-    if not len(mesh.faces):
-        return {"min_angle": None, "slivers": None}
-    corners = mesh.vertices.astype(np.float64)[mesh.faces]  # (m, 3, 3)
-    ahead, back = (np.roll(corners, step, axis=1) - corners for step in (-1, 1))
-    sine = np.linalg.norm(np.cross(ahead, back), axis=2)
-    cosine = np.einsum("mkd,mkd->mk", ahead, back)
-    angles = np.degrees(np.arctan2(sine, cosine)).min(axis=1)
-    return {"min_angle": float(angles.min()), "slivers": float(np.mean(angles < SLIVER_ANGLE))}
+def shown_in(tables: str) -> list[Metric]:
+    """Return the metrics that show in any of some tables, in their order."""
+    wanted = set(tables.split())
+    return [metric for metric in METRICS.values() if wanted & set(metric.tables.split())]

@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from .metrics import METRICS
+
 PAPER = "SUPER-SDF (paper)"
 COLUMNS = ("cd", "f1", "nc", "field_mse", "field_mae")
 MC, TRILINEAR, SPLINE = (f"{first}marching cubes" for first in ("", "trilinear + ", "B-spline + "))
@@ -44,7 +46,6 @@ SURFACES: dict[int, dict[str, tuple[float, ...]]] = {
         PAPER: (0.638, 0.939, 0.988, 0.030, 1.14),
     },
 }
-SCALES = (1e-5, 1, 1, 1e-6, 1e-4)
 # Supplement, Table 1: F1 at 32^3 by noise in percent, of marching cubes and of the paper's method.
 NOISE = {0: (0.605, 0.820), 20: (0.569, 0.754), 50: (0.430, 0.487), 100: (0.283, 0.286)}
 # Supplement, Table 3: CD x1e5, F1, NC by scale, at 32^3.
@@ -53,8 +54,8 @@ SCALED = {0.25: (13.826, 0.425, 0.871), 0.50: (2.653, 0.701, 0.929), 0.75: (1.25
 
 def row_of(method: str, figures: tuple[float, ...], **words: Any) -> dict[str, Any]:
     """Return published figures as a row of ours, marked as such."""
-    in_units = (figure * scale for figure, scale in zip(figures, SCALES))
-    return {"method": f"*{method}, published*", **words, **dict(zip(COLUMNS, in_units))}
+    in_units = {key: figure / METRICS[key].scale for key, figure in zip(COLUMNS, figures)}
+    return {"method": f"*{method}, published*", **words, **in_units}
 
 
 def surfaces(size: int) -> list[dict[str, Any]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -18,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from .measuring import Measurement, Task, measure_task, reason_of
+from .measuring import Measurement, Task, measure_task, measures, reason_of
 from .shapes import Shape
 
 Key = Mapping[str, Any]
@@ -51,9 +51,10 @@ class Rows:
             return None
         return {**record["key"], **{name: v for name, v in record.items() if name != "key"}}
 
-    def is_final(self, key: Key) -> bool:
-        """Return whether a row need not be measured again; a failure may have a passing cause."""
-        return (self.get(key) or {"error": ""})["error"] is None
+    def is_final(self, key: Key, figures: Iterable[str] = ()) -> bool:
+        """Return whether a row has figures and no error; the cause of a failure may have passed."""
+        row = self.get(key) or {"error": ""}
+        return row["error"] is None and row.keys() >= set(figures)
 
 
 def name_of(key: Key) -> str:
@@ -67,7 +68,7 @@ def complete(
     left = [
         replace(
             task,
-            methods=tuple(m for m in task.methods if not rows.is_final(task.key(m))),
+            methods=tuple(m for m in task.methods if not rows.is_final(task.key(m), measures(m))),
             triangles=tuple((m, row["faces"]) for m in task.methods
                             if "faces" in (row := rows.get(task.key(m)) or {})),
         )

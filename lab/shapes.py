@@ -23,16 +23,13 @@ from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.options import OPTIONS
 from super_sdf.refine.band import is_active, rescale
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.sampling import sample_grid, unit_layout
-from super_sdf.truth.solid import Distances, Solid, load_solid, normalise
+from super_sdf.truth.sampling import sample_solid
+from super_sdf.truth.solid import Distances, Solid, load_solid
 
-from . import metrics
-from .edges import EdgeCurves
+from .samples import EdgeCurves, sample_surface
 
 # Streams of random numbers, each seeded by the shape's name and its own number.
 REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIELD_NOISE = range(7)
-
-
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
 SUFFIXES = (*MESH_SUFFIXES, ".gltf")
 
@@ -58,13 +55,12 @@ class Setting:
 
 
 class Shape:
-    """A normalised reference mesh, and the points that are drawn from it for all methods."""
+    """A reference mesh in its frame, and the points that are drawn from it for all methods."""
 
     def __init__(self, name: str, mesh: Mesh) -> None:
-        self.name = name
-        self.solid = Solid(normalise(mesh))
+        self.name, self.solid = name, Solid(mesh)
         self.mesh = self.solid.mesh
-        self.drawn = metrics.sample_surface(self.mesh, self.seed(REFERENCE_POINTS)).ordered()
+        self.drawn = sample_surface(self.mesh, self.seed(REFERENCE_POINTS))
         self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
         self.pieces = self.mesh.components()[0]
 
@@ -77,10 +73,17 @@ class Shape:
         """
         mesh = load_solid(path)[0].mesh
         turn = np.eye(3) if turned is None else turn_of(path.stem, turned)
-        return cls(path.stem, mesh.transformed(turn, np.zeros(3)))
+        return cls(path.stem, normalise(mesh.transformed(turn, np.zeros(3))))
 
     def seed(self, stream: int) -> tuple[int, int]:
         return name_seed(self.name, stream)
+
+
+def normalise(mesh: Mesh) -> Mesh:
+    """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
+    vertices = mesh.vertices.astype(np.float64)
+    low, high = vertices.min(0), vertices.max(0)
+    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
 
 
 def name_seed(name: str, stream: int) -> tuple[int, int]:
@@ -88,13 +91,11 @@ def name_seed(name: str, stream: int) -> tuple[int, int]:
 
 
 def turn_of(name: str, seed: int) -> NDArray[np.float64]:
-    """Return the rotation matrix, (3, 3), by which a seed turns the shape of a name."""
-    return random_rotation(np.random.default_rng((seed, *name_seed(name, TURN))))
+    """Return the rotation matrix, (3, 3), by which a seed turns the shape of a name.
 
-
-def random_rotation(random: np.random.Generator) -> NDArray[np.float64]:
-    """Return a rotation matrix, (3, 3), all rotations equally likely: of a random quaternion."""
-    quaternion = random.normal(size=4)
+    All rotations are equally likely: it is that of a random quaternion.
+    """
+    quaternion = np.random.default_rng((seed, *name_seed(name, TURN))).normal(size=4)
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
@@ -112,10 +113,11 @@ class Case:
         longest = float(np.ptp(shape.mesh.vertices, axis=0).max())
         self.side = longest / setting.scale if setting.scale else 1.0
         self.low = -self.side / 2
-        self.layout = unit_layout(setting.size, self.side)
-        _, self.spacing, origin = self.layout
+        n, origin = setting.size, np.full(3, (0.5 / setting.size - 0.5) * self.side)
+        self.spacing = self.side / n
         self.fine = self.spacing / self.factor
-        self.coarse = sample_grid(shape.solid, self.layout)
+        layout = (n, n, n), self.spacing, origin
+        self.coarse = sample_solid(shape.solid, layout, band=np.inf).values
         values = self.coarse.astype(np.float32)
         if setting.noise:
             random = np.random.default_rng(shape.seed(NOISE))

@@ -27,7 +27,7 @@ from super_sdf.network.contract import Decoder
 
 from . import parser_of
 from .kinds import without_unknown
-from .metrics import distance
+from .samples import distance
 from .surfaces import closed_isosurface
 
 Array = np.ndarray

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ball, refusal, trilinear
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from test_anisotropic import pear as to_pear
 
 from super_sdf import make_grid, read_grid, reconstruct

@@ -1,6 +1,7 @@
 """What the values of a grid are, and what becomes of masks, densities and smooth fields."""
 
 import re
+from functools import partial
 
 import numpy as np
 import pytest
@@ -69,6 +70,7 @@ def thin_frame() -> np.ndarray:
 MASK = torus() < 0
 OUT, INTO = (ndimage.distance_transform_edt(side) for side in (~MASK, MASK))
 TRANSFORMS = {"both sides": OUT - INTO, "inside only": INTO, "in other units": 0.37 * (OUT - INTO)}
+CHESS, CITY = (partial(ndimage.distance_transform_cdt, metric=m) for m in ("chessboard", "taxicab"))
 WAVES = 1 + 0.5 * np.sin(4 * np.pi * sum(lattice(32)))
 KINDS = {
     "a torus": (torus(), "distance"),
@@ -86,6 +88,8 @@ KINDS = {
     "cut off unevenly": (np.clip(box(), -1, 2.5), "distance"),
     "cut off at 0.5": (np.clip(box(), -0.5, 0.5), "distance"),
     "rounded to tenths": (np.rint(10 * box()) / 10, "distance"),
+    "rounded to whole numbers": (np.rint(torus()), "noisy"),
+    "the whole part": (np.trunc(torus()), "noisy"),
     "noise": (noisy(box()), "noisy"),
     "little noise": (noisy(box(), 0.05), "noisy"),
     "an ellipsoid's polynomial": (ellipsoid() * 32 / 14, "smooth"),
@@ -99,6 +103,8 @@ KINDS = {
     "bytes": (MASK.astype(np.uint8), "mask"),
     "255": (MASK * np.float32(255), "mask"),
     "signs": (np.where(MASK, -1.0, 1.0), "mask"),
+    "chessboard, 0 inside": (CHESS(~MASK) - np.maximum(CHESS(MASK) - 1, 0), "mask"),
+    "city-block, 0 outside": (np.maximum(CITY(~MASK) - 1, 0) - CITY(MASK), "mask"),
     **{f"transform: {name}": (values, "mask") for name, values in TRANSFORMS.items()},
 }
 

@@ -24,8 +24,7 @@ from super_sdf import (
     write_mesh,
 )
 from super_sdf.errors import FileError, OptionError, OptionTypeError, OutOfMemoryError, WriteError
-from super_sdf.files import fields as writing
-from super_sdf.files import meshes
+from super_sdf.files import fields as writing, meshes
 
 NORMAL = np.array([2.0, -1.0, 2.0]) / 3
 SPACING, ORIGIN = 0.3, (7.0, -8.0, 9.0)

@@ -3,14 +3,20 @@
 import numpy as np
 import pytest
 from conftest import ball, count_fans, trilinear, walled
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, reconstruct, upsample
-from super_sdf import threads as limits
+from super_sdf import (
+    Mesh,
+    SdfGrid,
+    extract_mesh,
+    load_network,
+    reconstruct,
+    threads as limits,
+    upsample,
+)
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.bounds import SampleSpheres
 from super_sdf.refine.field import FineField

@@ -19,7 +19,7 @@ from super_sdf.check import check_mesh, examine_surface
 from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
 from super_sdf.grid.sdf_grid import volume_of_samples
 from super_sdf.labels import reconstruct as labelling
-from super_sdf.labels.files import LabelName, read_names
+from super_sdf.labels.files import read_names
 from super_sdf.labels.volumes import keep_volume
 from super_sdf.truth.solid import Solid
 
@@ -151,6 +151,21 @@ UNFIT = {
 }  # fmt: skip
 
 
+@pytest.mark.parametrize("factor", [0.9999999998, 0.988])
+def test_labels_may_be_nearly_whole_and_unknown_in_places(factor, fast):
+    """As nibabel stores them, and resampled atlases; the advice to choose one can be followed."""
+    whole = nested() + 0.0
+    stored = factor * whole
+    stored[0] = np.nan
+    said = refusal(GridError, make_grid, stored, spacing=1)
+    assert said.startswith("no solid is chosen: they look like labels (-3, 0, 7, 9, 40): ")
+    assert (make_grid(stored, spacing=1, label=7).values < 0).sum() == (whole == 7).sum()
+    found, wanted = (reconstruct_labels(x, network=fast, spacing=1) for x in (stored, whole))
+    assert found.keys() == wanted.keys()
+    for label, mesh in found.items():
+        assert np.array_equal(mesh.vertices, wanted[label].vertices)
+
+
 @pytest.mark.parametrize("message", UNFIT)
 def test_wrong_labels_and_values_that_are_none_are_one_line(message):
     with pytest.raises(OptionError if message.startswith("labels ") else GridError) as caught:
@@ -212,7 +227,7 @@ TABLES = {
     "map.tsv": "1\tliver\t221\t130\t101\n5\tleft_kidney\t185\t102\t83\tmore\n",
     "quoted.csv": '"label","name"\n1;"liver";221;130;101\n5;left_kidney;185;102;83;of two\n',
 }
-LIVER, KIDNEY = LabelName("liver", (221, 130, 101)), LabelName("left_kidney", (185, 102, 83))
+LIVER, KIDNEY = ("liver", (221, 130, 101)), ("left_kidney", (185, 102, 83))
 
 
 @pytest.mark.parametrize("name", TABLES)
@@ -230,7 +245,7 @@ def test_names_without_colours(folder):
         name = "names.txt" if content in lines else "names.json"
         Path(name).write_text(content)
         names = read_names(name)
-        assert names[1] == LabelName("liver") and names[5] == LabelName("left kidney")
+        assert names[1] == ("liver", None) and names[5] == ("left kidney", None)
 
 
 @pytest.mark.parametrize(
@@ -313,8 +328,6 @@ def test_labels_are_chosen_by_name(command, boxes):
 
 
 SPACING = (1.5, 1.5, 4.0)
-
-
 MASK = painted((18, 19, 20), (1, 1, 1), [ball((8.3, 9.1, 9.6), 6.7)]) > 0
 
 
@@ -344,6 +357,12 @@ def test_labels_have_the_volumes_of_their_samples_and_share_their_walls():
         assert check_mesh(mesh, grid).surface.faults() == []
     one, other = (set(map(bytes, mesh.vertices)) for mesh in kept.values())
     assert len(one & other) > 200  # the vertices of the wall
+
+
+def test_volumes_on_sheared_axes_are_those_of_sheared_boxes(fast):
+    sheared, more = [[1, 0, 0.6], [0, 1, 0], [0, 0, 0.8]], {"spacing": 1, "keep_volume": True}
+    mesh = reconstruct_labels(MASK, "all", fast, direction=sheared, **more)[1]
+    assert mesh.volume() == pytest.approx(0.8 * MASK.sum(), rel=1e-3)
 
 
 def test_a_volume_that_stays_off_is_noted(tmp_path, command):

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from solids import TORUS, box_distance, cube, inverted, joined, saved, sphere, torus
 
-from super_sdf import Mesh, SuperSdfError, load_network, reconstruct
+from super_sdf import Mesh, SdfGrid, SuperSdfError, load_network, reconstruct
 from super_sdf.truth import sampling
-from super_sdf.truth.sampling import (
-    fitted_layout,
-    grid_points,
-    sample_grid,
-    sample_solid,
-    unit_layout,
-)
+from super_sdf.truth.sampling import fitted_layout, sample_solid
 from super_sdf.truth.solid import Solid, load_solid
+
+CENTRES = (24, 24, 24), 1 / 24, np.full(3, 0.5 / 24 - 0.5)
+
+
+def positions(grid: SdfGrid) -> np.ndarray:
+    return grid.to_world(np.argwhere(np.ones(grid.shape)))
 
 
 def torus_distance(points: np.ndarray) -> np.ndarray:
@@ -37,16 +37,17 @@ SOLIDS = {
 def test_a_sampled_solid_is_exact_everywhere(name):
     mesh, closed_form, chord = SOLIDS[name]
     layout, seen = ((21, 18, 13), 0.071, np.array([-0.71, -0.62, -0.43])), []
-    found = sample_grid(Solid(mesh), layout, progress=lambda *step: seen.append(step)).ravel()
-    np.testing.assert_allclose(found, closed_form(grid_points(layout)), atol=chord + 1e-6)
+    found = sample_solid(Solid(mesh), layout, progress=lambda *step: seen.append(step))
+    wanted = closed_form(positions(found))
+    np.testing.assert_allclose(found.values.ravel(), wanted, atol=chord + 1e-6)
     assert seen[-1] == (18, 18)  # cubes
 
 
 def test_big_grids_are_cut_off_and_make_the_same_mesh(monkeypatch):
-    solid, layout, limit = Solid(torus()), unit_layout(24), 2.0 / 24
+    solid, layout, limit = Solid(torus()), CENTRES, 2.0 / 24
     exact = sample_solid(solid, layout)
     expected = np.clip(exact.values, -limit, limit)
-    np.testing.assert_allclose(sample_grid(solid, layout, band=2), expected, atol=1e-7)
+    np.testing.assert_allclose(sample_solid(solid, layout, band=2).values, expected, atol=1e-7)
     monkeypatch.setattr(sampling, "EXACT_SAMPLES", 1000)
     cut = sample_solid(solid, layout)
     assert not exact.notes and "clamped" in cut.notes[0]
@@ -64,7 +65,7 @@ def test_overlapping_pieces_are_one_solid_and_a_cavity_is_no_overlap():
     expected = (box_distance(points, 0.5) < 0) | (box_distance(points - [0.4, 0, 0], 0.5) < 0)
     assert (both.is_inside(points) == expected).all()
     hollow = Solid(joined(cube(), inverted(Mesh(cube().vertices * 0.5, cube().faces))))
-    assert hollow.is_closed
+    assert hollow.unbalanced_edges == 0
     assert not hollow.is_inside(np.zeros((1, 3)))[0]
 
 
@@ -83,9 +84,9 @@ def test_an_open_mesh_is_refused_or_guessed_at_every_sample(tmp_path, band):
     solid, notes = load_solid(lidless, allow_open=True)
     assert notes == ["open at 4 edges: inside is guessed across the holes"]
     layout = (20, 20, 20), 0.1, np.full(3, -0.97)
-    inside = solid.is_inside(grid_points(layout))
-    assert inside.any()
-    assert ((sample_grid(solid, layout, band=band) < 0).ravel() == inside).all()
+    grid = sample_solid(solid, layout, band=band)
+    inside = solid.is_inside(positions(grid))
+    assert inside.any() and ((grid.values < 0).ravel() == inside).all()
 
 
 @pytest.mark.parametrize("padding", [0.0, 2.0, 3.5])
@@ -116,4 +117,4 @@ def test_numbers_that_make_no_sense_are_refused():
     with pytest.raises(SuperSdfError, match="spacing is nan: it makes nan samples an axis"):
         fitted_layout(cube(), spacing=np.nan)
     with pytest.raises(SuperSdfError, match=r"band is 1: give at least 1\.5 voxels"):
-        sample_solid(Solid(cube()), unit_layout(8), band=1)
+        sample_solid(Solid(cube()), CENTRES, band=1)

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from conftest import ball, refusal, trilinear, walled
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from super_sdf import Mesh, SdfGrid, make_grid, reconstruct

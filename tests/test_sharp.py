@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 from conftest import ball, count_fans, trilinear
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from solids import box_distance
 from test_isosurface import dense_field
 

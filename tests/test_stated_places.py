@@ -143,7 +143,7 @@ def test_one_of_several_arrays_is_named():
     check(read_grid("a.h5:other", axes="xyz"))
     said = "a.h5 holds several arrays, /deep/field, /other: give a.h5:/deep/field, say"
     assert refusal(FileError, read_grid, "a.h5") == said
-    said = "a.h5 has no 3D dataset 'no': it holds /deep/field, /other"
+    said = "a.h5 has no array of three axes 'no': it holds /deep/field, /other"
     assert refusal(FileError, read_grid, "a.h5:no") == said
 
 

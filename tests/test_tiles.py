@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import ball, refusal, trilinear
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from super_sdf import SdfGrid, load_network, make_grid, pipeline, reconstruct, tiles
 from super_sdf.errors import MeshError, OptionError, OutOfMemoryError

@@ -16,9 +16,7 @@ from export.tests.conftest import SMALL
 from export.to_onnx import make_card, noisy_ball, parity, read_network, write_model
 from super_sdf import load_network
 from super_sdf.errors import ModelError
-from super_sdf.network import contract
-from super_sdf.network import network as networks
-from super_sdf.network import onnx as sessions
+from super_sdf.network import contract, network as networks, onnx as sessions
 from super_sdf.refine import band
 
 

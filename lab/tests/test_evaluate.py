@@ -12,6 +12,7 @@ from solids import cube, saved, sphere, torus
 from lab import costs, documents, tables
 from lab.__main__ import main as lab
 from lab.documents import rendered
+from lab.metrics import METRICS, Metric
 from lab.rows import Rows
 from super_sdf import Mesh, SuperSdfError
 from super_sdf.errors import FileError
@@ -57,6 +58,17 @@ def test_killed_and_started_again_it_ends_with_the_same_tables(meshes, tmp_path,
     assert (cut / "report.md").read_text() == (whole / "report.md").read_text()
     code, _, err = command(*words, cut)
     assert (code, err) == (0, "")  # nothing is left to measure
+
+
+def test_a_metric_is_an_entry_of_one_table(meshes, tmp_path, command, monkeypatch):
+    words = ("evaluate", meshes, "--sizes", 8, "--methods", "mc", "--jobs", 0, "--out", tmp_path)
+    command(*words)
+    volume = Metric("volume", "volume %", 100, 0, of=lambda c: c.mesh.volume(), tables="edges",
+                    meaning="of the mesh")  # fmt: skip
+    monkeypatch.setitem(METRICS, "volume", volume)
+    code, text, _ = command(*words)  # rows without it are measured again
+    assert code == 0 and "| volume % | lower | of the mesh |" in text
+    assert "| closed | volume % |\n" in text and "| 3 of 3 | 10 |\n" in text
 
 
 def test_a_bad_shape_is_named_and_the_others_are_measured(meshes, tmp_path, command):

@@ -8,14 +8,9 @@ import numpy as np
 import pytest
 from solids import cube
 
-from lab.kinds import (
-    BY_METHOD,
-    KINDS,
-    level_set,
-    samples_of,
-)
+from lab.kinds import BY_METHOD, KINDS, level_set, samples_of
 from lab.measuring import Task
-from lab.shapes import Case, Setting, Shape
+from lab.shapes import Case, Setting, Shape, normalise
 from super_sdf import load_network
 
 SIDE = 3**-0.5  # of the cube whose box diagonal is 1
@@ -30,7 +25,7 @@ def mesh_of(name, case, network):
 
 @pytest.fixture(scope="module")
 def case() -> Case:
-    return Case(Shape("box", cube()), Setting(16))
+    return Case(Shape("box", normalise(cube())), Setting(16))
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from solids import cube, saved, torus
 
 from lab import methods
 from lab.measuring import Task, measure_method
-from lab.shapes import Case, Setting, Shape
+from lab.shapes import Case, Setting, Shape, normalise
 from lab.surfaces import interpolate_spline
 from super_sdf import Mesh
 
@@ -56,7 +56,7 @@ def test_the_bound_is_better_than_ours_and_ours_than_the_coarse_grid():
 
 
 def shape_and_case(mesh: Mesh, setting: Setting) -> tuple[Shape, Case]:
-    shape = Shape("some", mesh)
+    shape = Shape("some", normalise(mesh))
     return shape, Case(shape, setting)
 
 

@@ -15,21 +15,19 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .errors import SuperSdfError as SuperSdfError
-    from .files.fields import read_field as read_field
-    from .files.fields import write_field as write_field
-    from .files.grids import grid_from_image as grid_from_image
-    from .files.grids import read_grid as read_grid
+    from .files.fields import read_field as read_field, write_field as write_field
+    from .files.grids import grid_from_image as grid_from_image, read_grid as read_grid
     from .files.meshes import write_mesh as write_mesh
     from .functions.function import DistanceFunction as DistanceFunction
-    from .grid.sdf_grid import SdfGrid as SdfGrid
-    from .grid.sdf_grid import make_grid as make_grid
+    from .grid.sdf_grid import SdfGrid as SdfGrid, make_grid as make_grid
     from .labels.reconstruct import reconstruct_labels as reconstruct_labels
     from .network.network import load_network as load_network
-    from .pipeline import extract_mesh as extract_mesh
-    from .pipeline import reconstruct as reconstruct
-    from .pipeline import upsample as upsample
-    from .refine.field import FineField as FineField
-    from .refine.field import fine_grid as fine_grid
+    from .pipeline import (
+        extract_mesh as extract_mesh,
+        reconstruct as reconstruct,
+        upsample as upsample,
+    )
+    from .refine.field import FineField as FineField, fine_grid as fine_grid
     from .simplify.simplify import simplify_mesh as simplify_mesh
     from .surface.mesh import Mesh as Mesh
 

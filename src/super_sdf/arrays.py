@@ -59,7 +59,7 @@ def length(vectors: Vectors) -> Numbers:
 
 def unit(vectors: Vectors) -> Vectors:
     """Return vectors of length 1; 0 stays 0."""
-    return np.asarray(vectors / np.maximum(length(vectors), 1e-12)[..., None])
+    return np.asarray(vectors / np.maximum(length(vectors), 1e-150)[..., None])
 
 
 def sums_at(place: Index, vectors: Vectors, count: int) -> Vectors:

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import CENTRE, BoolArray, FloatArray
+from .arrays import CENTRE, BoolArray, FloatArray, length, sums_at
 from .files.grids import read_grid
 from .grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from .options import LENGTHS, Options
 from .refine.band import Band, no_surface, survey
 from .refine.nodes import VoxelIndex
 from .surface.mesh import Mesh
-from .threads import check_bound, give_back, useful_threads
+from .threads import check_fits, give_back, memory_bound, useful_threads
 from .truth.solid import Points, Solid, merged, read_mesh, smallest_angles
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
@@ -85,7 +85,6 @@ class Certificate:
     or at the band's edge, or noisy, which differ from a neighbour by more than distances can.
     """
 
-    mesh: Mesh  # vertices at the same position are one
     grid: SdfGrid  # on its cubic lattice
     surface: Surface
     samples: dict[str, int]  # exact (n), cut_off, noisy; all 0 where samples are no distances
@@ -99,14 +98,10 @@ class Certificate:
     sample_volume: float | None  # of a mask: of its samples inside, each of which is a box
     volume_ml: float | None  # of the mesh, in millilitres, if its unit is stated
 
-    @property
-    def has_evidence(self) -> bool:
-        """Whether any sample is exact."""
-        return len(self.values) > 0
-
     def figures(self) -> dict[str, Any]:
-        """Return mean, 99th percentile and maximum of the absolute residuals, and where it is."""
-        size = np.abs(self.residuals)
+        """Return mean, quantile and maximum of the absolute residuals; nothing without samples."""
+        if not len(size := np.abs(self.residuals)):
+            return {}
         worst = int(size.argmax())
         return {
             "mean": float(size.mean(dtype=np.float64)),
@@ -123,8 +118,8 @@ class Certificate:
             "voxel_size": self.grid.voxel_size,
             "surface": self.surface.report(),
             "samples": self.samples,
-            "residual": self.figures() if self.has_evidence else None,
-            "wrong_side": int(self.wrong_side.sum()) if self.has_evidence else None,
+            "residual": self.figures() or None,
+            "wrong_side": int(self.wrong_side.sum()) if len(self.values) else None,
             "strays": self.strays,
             "beyond": self.beyond,
             "sample_volume": self.sample_volume,
@@ -153,8 +148,7 @@ class Certificate:
         if any(samples.values()):
             text = "samples: {exact:,} exact near the surface, {cut_off:,} cut off and {noisy:,} "
             lines.append(text.format(**samples) + "noisy left out")
-        if self.has_evidence:
-            figures = self.figures()
+        if figures := self.figures():
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
             largest = figures["largest"] * self.grid.voxel_size
             lines.append(f"largest residual: {largest:.4g} in world units, at ({at})")
@@ -164,10 +158,10 @@ class Certificate:
     def summary(self) -> str:
         """Return the certificate in one line."""
         said = "residual unknown, since no sample is exact"
-        if self.has_evidence:
+        if figures := self.figures():
             said = "residual {mean:.4f} voxels in the mean, {largest_signed:+.4f} at most, "
             said += f"{{share_above_tenth:.2%}} of {len(self.values):,} samples above "
-            said = said.format(**self.figures()) + f"{NOTICEABLE:g}"
+            said = said.format(**figures) + f"{NOTICEABLE:g}"
         elif self.sample_volume:
             share = self.surface.volume / self.sample_volume - 1
             said = f"volume {share:+.2%} off that of the samples, {self.sample_volume:.6g}"
@@ -180,10 +174,9 @@ class Certificate:
         """
         if tolerance is None and max_mean is None:
             return []
-        if not self.has_evidence:
+        if not (figures := self.figures()):
             return ["no sample is exact, so no limit on residuals can be shown to be kept"]
-        figures, found = self.figures(), []
-        largest, mean = figures["largest"] * self.grid.voxel_size, figures["mean"]
+        largest, mean, found = figures["largest"] * self.grid.voxel_size, figures["mean"], []
         if tolerance is not None and not largest <= tolerance:
             said = f"the largest residual is {largest:.4g} in world units"
             found.append(f"{said}, --tolerance is {tolerance:g}")
@@ -235,18 +228,18 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certif
     if not len(band.voxel_ijk):
         raise no_surface(grid, offset)
     need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
-    check_bound(need, f"checking {len(mesh.faces):,} triangles", options.max_memory)
-    surface, found = examine_surface(mesh), touch(Solid(mesh), band, lattice)
+    what, most = f"checking {len(mesh.faces):,} triangles", memory_bound(options.max_memory)
+    check_fits(need, what, "allow more (--max-memory)", most)
+    surface, touched = examine_surface(mesh), touch(Solid(mesh), band, lattice)
     is_mask, nearest = lattice.field.sides_only, np.rint(lattice.to_index(mesh.vertices))
     beyond = ((nearest < 0) | (nearest >= lattice.shape)).any(1)
     away = VoxelIndex(band.voxel_ijk, lattice.shape).find(nearest.astype(np.int64)) < 0
     give_back()
     return Certificate(
-        mesh,
         lattice,
         surface,
-        **found,
-        strays=int((away & ~beyond).sum()) if is_mask or found["samples"]["exact"] else None,
+        *touched,
+        strays=int((away & ~beyond).sum()) if is_mask or touched[0]["exact"] else None,
         beyond=int(beyond.sum()),
         sample_volume=volume_of_samples(grid, offset) if is_mask else None,
         volume_ml=surface.volume * (100 * LENGTHS[options.unit]) ** 3 if options.unit else None,
@@ -258,12 +251,12 @@ def examine_surface(mesh: Mesh) -> Surface:
     whole = Mesh(mesh.vertices, mesh.faces[(mesh.faces != np.roll(mesh.faces, 1, 1)).all(1)])
     opposite, uses, flipped = whole.pair_edges()
     fans = whole.count_fans(opposite)
-    corners, at = whole.vertices[whole.faces].astype(np.float64), whole.faces.ravel()
+    corners, at = whole.vertices.astype(np.float64)[whole.faces], whole.faces.ravel()
     sides = (np.roll(corners, -1, axis=1) - corners).reshape(-1, 3)
-    lengths = np.maximum(np.linalg.norm(sides, axis=1), 1e-300)
+    sides /= np.maximum(length(sides), 1e-300)[:, None]
+    directions = length(sums_at(at.astype(np.int64), sides, len(fans)))
     degrees = np.bincount(at, minlength=len(fans))
-    sums = np.stack([np.bincount(at, side / lengths, len(fans)) for side in sides.T], axis=1)
-    tips = (np.linalg.norm(sums, axis=1) > NEEDLE * degrees) & (degrees > 2)
+    tips = (directions > NEEDLE * degrees) & (degrees > 2)
     return Surface(
         open_edges=int((uses % 2).sum()),
         crowded_edges=int((uses > 2).sum()),
@@ -280,7 +273,9 @@ def examine_surface(mesh: Mesh) -> Surface:
     )
 
 
-def touch(solid: Solid, band: Band, grid: SdfGrid) -> dict[str, Any]:
+def touch(
+    solid: Solid, band: Band, grid: SdfGrid
+) -> tuple[dict[str, int], Points, FloatArray, FloatArray, Points, BoolArray]:
     """Return what ``Certificate`` says of samples: where their balls meet a mesh."""
     values = band.patches[:, CENTRE]
     # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
@@ -297,11 +292,5 @@ def touch(solid: Solid, band: Band, grid: SdfGrid) -> dict[str, Any]:
     wrong[apart] = solid.is_inside(points[apart]) != (values[apart] <= 0)
     are_distances = grid.field.network is not None and not grid.field.sides_only
     counts = {"exact": len(rows), "cut_off": sampled - len(rows) - noisy, "noisy": noisy}
-    return {
-        "samples": {name: count * are_distances for name, count in counts.items()},
-        "points": points,
-        "values": values,
-        "residuals": (distances - size).astype(np.float32),
-        "feet": feet,
-        "wrong_side": wrong,
-    }
+    samples = {name: count * are_distances for name, count in counts.items()}
+    return samples, points, values, (distances - size).astype(np.float32), feet, wrong

@@ -6,26 +6,24 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .files.formats import files_of
 from .files.grids import read_grid
-from .files.meshes import World, check_target, write_meshes
-from .files.output import check_apart
+from .files.meshes import World, check_mesh_suffix, write_meshes
+from .files.output import check_apart, check_free
 from .grid.sdf_grid import SdfGrid, describe_place, mean_spacing, volume_of_samples
 from .pipeline import Result, mesh_grid
-from .threads import TOTAL, Progress, Stopwatch, part_of
+from .threads import STEPS, Progress, Steps
 
 if TYPE_CHECKING:
     from .network.contract import Decoder
     from .options import Options
     from .simplify.simplify import Simplified
     from .surface.mesh import Mesh
-
-READ = 0.1  # of the time of meshing, when the grid is read
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +34,6 @@ class Conversion:
     mesh: Mesh  # as it was written
     facts: dict[str, Any]  # as ``--json`` has them: docs/reference/json.md
     seconds: dict[str, float]  # per stage
-
-    def report(self) -> dict[str, Any]:
-        """Return the result as a dictionary that can be written as JSON."""
-        return self.facts
 
 
 def convert(
@@ -62,43 +56,33 @@ def convert(
 
     SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
     """
-    watch, files, saved = Stopwatch(), files_of(source), dict[str, Any]()
-    check_target(target, force=force, unit=options.unit)
+    steps, files, saved = Steps(progress, STEPS), files_of(source), dict[str, Any]()
+    check_free(check_mesh_suffix(Path(target), options.unit), force=force)
     check_apart(target, files)
-    with _saving(save_field, files, force=force) as write:
+    with ExitStack() as saving:
+        if save_field is not None:
+            from .files.fields import saving_field
+
+            check_apart(save_field, files)
+            write = saving.enter_context(saving_field(save_field, force=force))
+            how["save_field"] = lambda field: saved.update(write(field))
         grid = read_grid(source, **options.reading())
         if options.keep_volume:
             from .labels.volumes import check_has_volume  # imported here, as few need it
 
             check_has_volume(grid, options.offset, cap=options.cap)
-        if write:
-            how["save_field"] = lambda field: saved.update(write(field))
-        watch.lap("read")
-        if progress:
-            progress(round(READ * TOTAL), TOTAL)
-        shown = part_of(progress, READ, 1)
-        made = mesh_grid(grid, network, options, progress=shown, **how)
-        watch.take(made.seconds)
+        steps.finish("read")
+        made = mesh_grid(grid, network, options, steps=steps, **how)
         mesh, simplified, off = _reworked(made.mesh, grid, options)
-        watch.lap("simplify" if simplified else "isosurface")
+        steps.lap("simplify" if simplified else "isosurface")
         world, beside = World(options.unit, grid.space), [Path(save_field)] if save_field else []
         write_meshes({Path(target): {"": mesh}}, force=force, world=world, beside=beside)
-        watch.lap("write")
+        steps.lap("write")
     facts = _facts(grid, mesh, made, options, simplified)
     facts["inferred"] += off
     if saved:
         facts["saved_field"] = saved
-    return Conversion(grid, mesh, facts, watch.seconds)
-
-
-def _saving(path: str | Path | None, others: list[Path], *, force: bool) -> Any:
-    """Return the context of a file for the refined field, apart from others; None if unwanted."""
-    if path is None:
-        return nullcontext()
-    from .files.fields import saving_field
-
-    check_apart(path, others)
-    return saving_field(path, force=force)
+    return Conversion(grid, mesh, facts, steps.seconds)
 
 
 def _reworked(

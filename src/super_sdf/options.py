@@ -31,18 +31,6 @@ Quality = Literal["fast", "base", "best"]
 Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["auto", "float32", "int8"]
 
-ALL: Final = "all"
-AUTO: Final = "auto"
-DISTANCE: Final = "distance"
-NOISY: Final = "noisy"
-MASK: Final = "mask"
-SMOOTH: Final = "smooth"
-RAS: Final = "RAS"  # right, anterior, superior
-LPS: Final = "LPS"  # left, posterior, superior
-MARCHING: Final = "marching"
-SHARP: Final = "sharp"
-FLOAT32: Final = "float32"
-INT8: Final = "int8"
 DEFAULT_QUALITY: Final = "base"
 FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
 PRECISIONS: tuple[Precision, ...] = get_args(Precision)
@@ -138,7 +126,7 @@ def _labels(value: Any) -> str | tuple[int | str, ...]:
         return tuple(each if isinstance(each, str) else _label(each) for each in value)
     parts = [part.strip() for part in value.split(",")]
     is_number = re.compile("[-+]?[0-9]+").fullmatch
-    return ALL if value == ALL else tuple(int(n) if is_number(n) else n for n in parts)
+    return "all" if value == "all" else tuple(int(n) if is_number(n) else n for n in parts)
 
 
 def _bytes(value: Any) -> int:
@@ -157,7 +145,6 @@ FLAG = having(
 )
 PATH = having("the path of a file", lambda value: isinstance(value, (str, PathLike)), Path)
 NETWORK = having("one from load_network()", callable, lambda network: network)
-PROGRESS = having("a function of (done, total), in thousandths", callable, lambda call: call)
 
 
 class Option(NamedTuple):
@@ -227,9 +214,9 @@ class Options:
         "else xyz for NumPy, zyx for the others.")
     space: Space | None = _option(None, GRID, "read list labels", one_of(get_args(Space)),
         "Anatomical space of the mesh, for files that state theirs. Default: that of the file.")
-    inside: Inside = _option(AUTO, VALUES, "read list", one_of(get_args(Inside)),
+    inside: Inside = _option("auto", VALUES, "read list", one_of(get_args(Inside)),
         "Sign of the values inside the solid; auto takes the border of the grid as outside.")
-    field: FieldKind = _option(AUTO, VALUES, "read list", one_of(FIELDS),
+    field: FieldKind = _option("auto", VALUES, "read list", one_of(FIELDS),
         "What the values are: distances, distances with noise, a mask or its transform, or a "
         "smooth field, which has the surface of its own cubic spline; auto goes by the samples.")
     label: int | None = _option(None, VALUES, "read list", LABEL,
@@ -254,7 +241,7 @@ class Options:
     cap: bool = _option(True, MESH, "list", FLAG,
         "Close the surface along the border of the grid (default), or leave it open there, as one "
         "that ends at unknown samples must be.", off="open")
-    mesher: MesherName = _option(AUTO, MESH, "list", one_of(get_args(MesherName)),
+    mesher: MesherName = _option("auto", MESH, "list", one_of(get_args(MesherName)),
         "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
         "them; auto is sharp for distances, marching for masks and noise.")
     simplify: float | None = _option(None, MESH, "list labels",
@@ -279,10 +266,10 @@ class Options:
     model: str | None = _option(None, WORK, "labels",
         Kind(PATH.give, lambda value: str(PATH.make(value))),
         "Use the network in this ONNX file instead of --quality.", metavar="FILE")
-    precision: Precision = _option(AUTO, WORK, "labels", one_of(PRECISIONS),
+    precision: Precision = _option("auto", WORK, "labels", one_of(PRECISIONS),
         "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "
         "it, else float32.")
-    device: Device = _option(AUTO, WORK, "labels", one_of(get_args(Device)),
+    device: Device = _option("auto", WORK, "labels", one_of(get_args(Device)),
         "Where the network runs; auto uses CUDA if it works here, else the CPU.")
     threads: int = _option(0, WORK, "labels",
         number("1 or more, or 0 for one per core", above=-1, step=1),
@@ -302,7 +289,7 @@ class Options:
             some = [f"{flag(n)} {seen(value)}" for n, value in values.items() if value is not None]
             if len(some) > 1:
                 raise OptionError(f"{some[0]} and {some[1]}: give only one of them")
-        if self.label is not None and self.field not in (AUTO, MASK):
+        if self.label is not None and self.field not in ("auto", "mask"):
             said = f"--label {self.label} and --field {self.field}"
             raise OptionError(f"{said}: the samples of a label are a mask")
 
@@ -312,8 +299,8 @@ class Options:
 
     def mesher_for(self, *, exact: bool) -> MesherName:
         """Return the mesher; by itself ``sharp`` if samples are exact: else it finds no edges."""
-        automatic: MesherName = SHARP if exact else MARCHING
-        return automatic if self.mesher == AUTO else self.mesher
+        automatic: MesherName = "sharp" if exact else "marching"
+        return automatic if self.mesher == "auto" else self.mesher
 
     def factor_for(self, *, mask: bool) -> int:
         """Return the factor: masks show no details for which 2 is too few."""
@@ -349,16 +336,9 @@ READ, BATCH_LISTS, LABELS = (
 )
 
 
-def check_path(path: Any, name: str) -> Path:
+def check_path(path: Any, name: str = "path") -> Path:
     """Return an argument as a path; OptionTypeError if it is neither a string nor a path."""
     return Path(PATH.check(path, name))
-
-
-def check_called(network: Any, progress: Any) -> None:
-    """Raise OptionTypeError if a network, or a progress that is not None, cannot be called."""
-    NETWORK.check(network, "network")
-    if progress is not None:
-        PROGRESS.check(progress, "progress")
 
 
 def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:

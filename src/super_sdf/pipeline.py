@@ -27,13 +27,7 @@ from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
 from .options import MesherName, Options
 from .refine import nodes
-from .refine.band import (
-    Band,
-    BandSummary,
-    neighbour_table,
-    no_surface,
-    survey,
-)
+from .refine.band import Band, BandSummary, neighbour_table, no_surface, survey
 from .refine.bounds import SampleSpheres, keep_within_bounds
 from .refine.field import FineField
 from .refine.prediction import interpolate, predict
@@ -41,7 +35,7 @@ from .refine.spheres import fit_to_spheres
 from .surface.cap import check_can_close, seen_octants
 from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
-from .threads import STEPS, Progress, StepCounter, in_words, useful_threads
+from .threads import MESHING, Progress, Steps, in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
 
 if TYPE_CHECKING:
@@ -53,10 +47,10 @@ def refine_band(
     network: Adapter,
     factor: int,
     threads: int = 1,
-    steps: StepCounter | None = None,
+    steps: Steps | None = None,
 ) -> FineField:
     """Return the fine field of a band: the steps from the network to the final values."""
-    steps = steps or StepCounter()
+    steps = steps or Steps()
     grid, patches = band.grid, band.patches
     table = neighbour_table(band.voxel_ijk, grid.shape)
     voxels = np.flatnonzero(band.decoded).astype(np.int32)
@@ -122,8 +116,8 @@ def upsample(
         Values at the nodes of spacing h/K in every voxel that can hold the surface.
     """
     asked = Options(factor, offset=offset)  # checks them
-    lattice, decoder = _prepared(grid, network, asked, progress)
-    steps = StepCounter(progress, [name for name in STEPS if name != "isosurface"])
+    steps = Steps(progress, MESHING[:-1])
+    lattice, decoder = _prepared(grid, network, asked)
     threads = useful_threads(decoder.threads)
     band = survey(lattice, asked.offset, threads=threads)  # Eqs. 2 and 4
     if not band.decoded.any():
@@ -139,7 +133,7 @@ def extract_mesh(
     field: FineField,
     grid: SdfGrid | None = None,
     *,
-    mesher: options.MesherName = options.AUTO,
+    mesher: options.MesherName = "auto",
     cap: bool = True,
 ) -> Mesh:
     """Return the zero level of a field as triangles in world coordinates; a node of 0 is inside.
@@ -176,7 +170,7 @@ def reconstruct(
     threads: int | None = None,
     offset: float = 0.0,
     cap: bool = True,
-    mesher: options.MesherName = options.AUTO,
+    mesher: options.MesherName = "auto",
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
@@ -231,7 +225,7 @@ def reconstruct(
         name = next(iter(asked)).replace("model", "quality")
         raise OptionError(f"a network and {name} are given: give only one of them")
     network = load_network(**asked) if network is None else network
-    mesh = mesh_grid(grid, network, chosen, progress=progress).mesh
+    mesh = mesh_grid(grid, network, chosen, steps=Steps(progress)).mesh
     if exact is None:
         return mesh
     from .functions.zero import put_on_zero
@@ -239,11 +233,9 @@ def reconstruct(
     return put_on_zero(mesh, exact, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
 
 
-def _prepared(
-    grid: SdfGrid, network: Decoder, chosen: Options, progress: Progress | None
-) -> tuple[SdfGrid, Adapter]:
+def _prepared(grid: SdfGrid, network: Decoder, chosen: Options) -> tuple[SdfGrid, Adapter]:
     """Check what is given; return the cubic lattice of a grid, and the network for its field."""
-    options.check_called(network, progress)
+    options.NETWORK.check(network, "network")
     lattice = cubic_grid(check_grid(grid), chosen.offset)
     vertex_type(lattice, chosen.factor_for(mask=grid.field.sides_only))  # raises beyond float64
     return lattice, adapt(network_for(network, grid.field.network))
@@ -259,7 +251,6 @@ class Result:
     # ``band_voxels``, and ``noisy_voxels``, whose samples differ by more than distances can
     counts: dict[str, int]
     leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
-    seconds: dict[str, float]  # by step
     tiles: int
 
 
@@ -286,7 +277,7 @@ def mesh_grid(
     network: Decoder,
     chosen: Options,
     *,
-    progress: Progress | None = None,
+    steps: Steps | None = None,
     save_field: Callable[[FineField], None] | None = None,
     map_tiles: MapTiles | None = None,
     least_tiles: int = 1,
@@ -296,9 +287,9 @@ def mesh_grid(
     ``save_field`` is called with the fine field, which needs one piece. ``map_tiles`` has tiles
     made elsewhere, ``least_tiles`` or more, each within the memory bound.
     """
-    lattice, decoder = _prepared(grid, network, chosen, progress)
+    lattice, decoder = _prepared(grid, network, chosen)
     check_can_close(grid, cap=chosen.cap)
-    steps, factor = StepCounter(progress), chosen.factor_for(mask=grid.field.sides_only)
+    steps, factor = steps or Steps(), chosen.factor_for(mask=grid.field.sides_only)
     mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
@@ -336,14 +327,14 @@ def mesh_grid(
     ends = lattice.field.unseen is not None
     edges = check_closed(mesh, lattice, names, cap=chosen.cap, ends=ends)
     steps.finish("isosurface")
-    return Result(mesh, lattice, edges, counts, leaves, steps.seconds, count)
+    return Result(mesh, lattice, edges, counts, leaves, count)
 
 
 def make_tile(
     task: Task,
     network: Adapter,
     band: Band | None = None,
-    steps: StepCounter | None = None,
+    steps: Steps | None = None,
     save_field: Callable[[FineField], None] | None = None,
 ) -> Part:
     """Return the part of the mesh that belongs to a tile, which may be the whole grid."""

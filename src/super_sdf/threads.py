@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from math import ceil
@@ -18,7 +18,7 @@ from typing import TypeVar
 
 import psutil
 
-from .errors import OptionError, OutOfMemoryError
+from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -130,21 +130,16 @@ def memory_bound(max_memory: int | None = None) -> int:
     return max_memory or held_memory() + int(SHARE * free_memory())
 
 
-def check_fits(need: int, what: str, way_out: str) -> None:
-    """Raise OutOfMemoryError if ``what``, which needs ``need`` bytes, does not fit into memory."""
-    if need > (free := free_memory()):
-        raise OutOfMemoryError(
-            f"{what} needs {in_words(need)} of memory, {in_words(free)} are free; {way_out}"
-        )
+def check_fits(need: int, what: str, way_out: str, most: int | None = None) -> None:
+    """Raise OutOfMemoryError if ``what``, which needs ``need`` bytes, does not fit into memory.
 
-
-def check_bound(need: int, what: str, max_memory: int | None, way_out: str = "") -> None:
-    """Raise OutOfMemoryError if ``need`` bytes beside what is held pass the process's bound."""
-    bound, need = memory_bound(max_memory), need + held_memory()
-    if need > bound:
+    ``most`` is what the process may hold in all, from ``memory_bound``; by default what is free.
+    """
+    free = free_memory() if most is None else max(most - held_memory(), 0)
+    if need > free:
+        allow = "" if most is None else f" of the {in_words(most)} that may be taken in all"
         raise OutOfMemoryError(
-            f"{what} needs {in_words(need)} of memory, {in_words(bound)} may be taken in all; "
-            f"{way_out}allow more (--max-memory)"
+            f"{what} needs {in_words(need)} of memory, {in_words(free)}{allow} are free; {way_out}"
         )
 
 
@@ -179,42 +174,35 @@ If it raises an exception, the work stops with that exception.
 """
 TOTAL = 1000
 # Share of the time that each step takes with a network on a CPU.
-STEPS = {"band": 0.03, "network": 0.45, "nodes": 0.15, "isosurface": 0.37}
+STEPS = {"read": 0.1, "band": 0.03, "network": 0.4, "nodes": 0.14, "isosurface": 0.33}
+MESHING = ("band", "network", "nodes", "isosurface")
 
 
-def part_of(progress: Progress | None, begin: float, end: float) -> Progress | None:
-    """Return a callback for a part of the work, between two shares of it; None without one."""
-    if progress is None:
-        return None
-    return lambda n, total: progress(round(TOTAL * (begin + (end - begin) * n / total)), TOTAL)
+class Steps:
+    """Measures the time of steps, by name, and reports what is done of the work from ``begin``.
 
+    ``names`` are the steps that ``finish`` ends, in order; together they reach the share ``end``.
+    """
 
-class Stopwatch:
-    """Adds up the seconds spent in each stage, by name."""
-
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        progress: Progress | None = None,
+        names: Iterable[str] = MESHING,
+        begin: float = 0.0,
+        end: float = 1.0,
+    ) -> None:
+        if not (progress is None or callable(progress)):
+            said = "give a function of (done, total), in thousandths"
+            raise OptionTypeError(f"progress is {seen(progress)}: {said}")
+        self.progress, self.done, self.clock = progress, begin, time.perf_counter()
         self.seconds: dict[str, float] = {}
-        self.clock = time.perf_counter()
+        lengths = {name: STEPS[name] for name in names}
+        self.lengths = {n: (end - begin) * x / sum(lengths.values()) for n, x in lengths.items()}
 
-    def lap(self, stage: str) -> None:
-        """Add the time since the last lap to a stage."""
-        self.take({stage: time.perf_counter() - self.clock})
-
-    def take(self, seconds: Mapping[str, float]) -> None:
-        """Add times that were measured elsewhere, and restart the clock."""
-        for stage, more in seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + more
-        self.clock = time.perf_counter()
-
-
-class StepCounter(Stopwatch):
-    """Reports progress and measures time, step by step; ``finish`` ends each step."""
-
-    def __init__(self, progress: Progress | None = None, names: Iterable[str] = STEPS) -> None:
-        super().__init__()
-        whole = sum(STEPS[name] for name in names)
-        self.lengths = {name: STEPS[name] / whole for name in names}
-        self.progress, self.done = progress, 0.0
+    def lap(self, name: str) -> None:
+        """Add the time since the last lap to a step."""
+        last, self.clock = self.clock, time.perf_counter()
+        self.seconds[name] = self.seconds.get(name, 0.0) + self.clock - last
 
     def show(self, share: float) -> None:
         """Report the share of all work that is done."""
@@ -225,7 +213,7 @@ class StepCounter(Stopwatch):
         """Report that a step is done, and record its time."""
         self.lap(name)
         self.done += self.lengths[name]
-        self.show(1.0 if name == "isosurface" else self.done)
+        self.show(self.done)
 
     def within(self, name: str) -> Callable[[float], None] | None:
         """Return a callback for the share of a step that starts now; None without ``progress``."""

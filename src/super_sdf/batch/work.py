@@ -69,7 +69,7 @@ def convert_job(
                 label["output"] = Path(label["output"]).relative_to(stage).as_posix()
             names = [label["output"] for label in made.facts["labels"]]
         known = {name: fingerprint(stage / name) for name in names}
-        row |= {"output": known if job.has_label_files else known[job.mesh], **made.report()}
+        row |= {"output": known if job.has_label_files else known[job.mesh], **made.facts}
         row["stages"] = {name: round(seconds, 4) for name, seconds in made.seconds.items()}
         if settings.check or settings.items:
             row["check"] = _check(job, settings, target, made, row["output"]["sha256"])

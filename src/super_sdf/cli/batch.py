@@ -1,4 +1,18 @@
-"""The command ``batch``: many grid files to mesh files."""
+"""Convert many grids to meshes in the folder DIR, each as upsample would.
+
+Each IN is a grid file, a folder (searched with its subfolders), a pattern such as '**/*.npy', or a
+list of inputs: .txt with one path per line, or .jsonl with one object per line such as
+{"in": "a.npy", "out": "a.ply", "spacing": 0.5}. Paths are relative to the list.
+
+Grid files are $grids. FILE:NAME names one of several arrays in a $several file.
+
+A file that fails is reported and does not stop the others. Run the command again to resume
+after an interruption, or with more inputs or other options: only what is missing is done.
+
+  super-sdf batch grids/ --out meshes/
+  super-sdf batch 'scans/**/*.npz' more.txt --out meshes/ --format stl --factor 2
+  super-sdf batch cases/ --out meshes/ --format stl --labels all --names organs.ctbl
+"""
 
 from __future__ import annotations
 
@@ -8,64 +22,41 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-from click import argument, option
+from click import Argument, Choice, Option
 
 from ..errors import check_modules
-from ..files.formats import LISTED, NAMED
 from ..options import MESH_FORMATS, OPTIONS
 from . import main
-from .main import SHARED, table_option
 
 if TYPE_CHECKING:
     from ..batch.inputs import Job
     from ..batch.run import Batch
     from ..batch.work import Settings
 
-HELP = f"""Convert many grids to meshes in the folder DIR, each as upsample would.
-
-Each IN is a grid file, a folder (searched with its subfolders), a pattern such as '**/*.npy', or a
-list of inputs: .txt with one path per line, or .jsonl with one object per line such as
-{{"in": "a.npy", "out": "a.ply", "spacing": 0.5}}. Paths are relative to the list.
-
-Grid files are {LISTED}. FILE:NAME names one of several arrays in a {NAMED} file.
-
-A file that fails is reported and does not stop the others. Run the command again to resume
-after an interruption, or with more inputs or other options: only what is missing is done.
-
-\b
-Examples:
-  super-sdf batch grids/ --out meshes/
-  super-sdf batch 'scans/**/*.npz' more.txt --out meshes/ --format stl --factor 2
-  super-sdf batch cases/ --out meshes/ --format stl --labels all --names organs.ctbl
-"""
 MOST_FAILURES = 20  # printed; the report has all
+STATES = ("done_before", "failed_before", "refused")  # of inputs that are left alone
 
-# fmt: off
 TAKES = (
-    argument("sources", metavar="IN...", nargs=-1, required=True),
-    option("--out", "folder", metavar="DIR", required=True, type=main.FILE,
+    Argument(["sources"], metavar="IN...", nargs=-1, required=True),
+    Option(["--out", "folder"], metavar="DIR", required=True, type=main.FILE,
         help="Folder for the meshes and report.jsonl; subfolders of IN are kept."),
-    option("--format", "kind", type=click.Choice(MESH_FORMATS), default=MESH_FORMATS[0],
+    Option(["--format", "kind"], type=Choice(MESH_FORMATS), default=MESH_FORMATS[0],
         show_default=True, help="Mesh file format."),
-    *map(table_option, OPTIONS),
-    *(SHARED[name] for name in ("names", "cluster", "jobs")),
-    option("--retry", is_flag=True,
-        help="Retry inputs that failed before and have not changed."),
-    option("--dry-run", is_flag=True, help="Show what would be done; write nothing."),
-    *(SHARED[name] for name in ("check", "report")),
-    option("--force", is_flag=True,
+    *OPTIONS,
+    "names", "cluster", "jobs",
+    Option(["--retry"], is_flag=True, help="Retry inputs that failed before and have not changed."),
+    Option(["--dry-run"], is_flag=True, help="Show what would be done; write nothing."),
+    "check", "report",
+    Option(["--force"], is_flag=True,
         help="Convert everything again; replace files that are not as a batch wrote them."),
-    *(SHARED[name] for name in ("json", "quiet")),
-)
-# fmt: on
+    "json", "quiet",
+)  # fmt: skip
 
 
-@main.make_command("Convert many grids; can be stopped and resumed.", HELP, *TAKES)
-def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
+def command(folder: Path, **given: Any) -> None:
     """Find the inputs, convert what is not done yet, print a summary."""
     start, page, quiet = time.perf_counter(), given["report"], given["quiet"]
-    jobs, settings = planned(sources, folder, given)
+    jobs, settings = planned(folder, given)
     from ..batch.record import folder_lock
     from ..batch.run import Batch
 
@@ -94,46 +85,43 @@ def command(sources: tuple[str, ...], folder: Path, **given: Any) -> None:
         sys.exit(1)
 
 
-def planned(
-    sources: tuple[str, ...], folder: Path, given: dict[str, Any]
-) -> tuple[list[Job], Settings]:
+def planned(folder: Path, given: dict[str, Any]) -> tuple[list[Job], Settings]:
     """Check what is given; return the jobs, and how they are to be run."""
-    options, page, items = main.chosen_options(given), given["report"], None
+    options, page, drawn = main.chosen_options(given), given["report"], None
     from ..batch.inputs import find_jobs
     from ..batch.work import Settings
-    from ..labels.files import check_options, read_names
+    from ..labels.files import check_options
 
-    names = read_names(given["names"]) if given["names"] else None
-    jobs = find_jobs(sources, f".{given['kind']}", options, names)
+    jobs = find_jobs(given["sources"], f".{given['kind']}", options, given["names"])
     for job in jobs:
         if job.options.labels is not None:
             check_options(job.options, [name for name in ("check", "report") if given[name]])
         if job.options.goals():  # a list may say so
             check_modules("simplify", "simplify")
     if page:
-        from ..pages.html import is_page
-        from ..pages.items import items_folder
+        from ..pages import html, items
 
         sources, meshes = zip(*((job.source, folder / job.target) for job in jobs))
-        main.check_page("--report", page, sources, meshes, force=given["force"] or is_page(page))
-        items = items_folder(page)
-    some = {name: given[name] for name in ("cluster", "force", "retry", "check")}
-    return jobs, Settings(folder, options, given["jobs"], items=items, names=names, **some)
+        may_replace = given["force"] or html.is_page(page)
+        main.check_page("--report", page, sources, meshes, force=may_replace)
+        drawn = items.items_folder(page)
+    some = {name: given[name] for name in ("cluster", "force", "retry", "check", "names")}
+    return jobs, Settings(folder, options, given["jobs"], items=drawn, **some)
 
 
 def summary(batch: Batch, seconds: float) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
     rows = [job.row for job in batch.of("done", "done_before")]
     failures = batch.listed("failed_before", "refused", "failed")
-    meshes = [(len(row.get("labels", [row])), bool(row["closed"])) for row in rows]
-    states = ("done", "done_before", "failed_before", "refused")
+    meshes = [bool(row["closed"]) for row in rows for _ in row.get("labels", [row])]
     return {
-        **{state: len(batch.of(state)) for state in states},
+        "done": len(batch.of("done")),
+        **{state: len(batch.of(state)) for state in STATES},
         "failed": len(failures),
         "not_begun": len(batch.of("to_do")),
         "warned": sum(bool(row["warnings"] or row.get("beside")) for row in rows),
-        "closed": sum(count for count, is_closed in meshes if is_closed),
-        "open": sum(count for count, is_closed in meshes if not is_closed),
+        "closed": meshes.count(True),
+        "open": meshes.count(False),
         "seconds": round(seconds, 3),
         "failures": failures,
         "report": str(batch.record.path),
@@ -152,14 +140,12 @@ def sentence(facts: dict[str, Any]) -> str:
 
 def print_plan(batch: Batch, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
-    states = ("to_do", "done_before", "failed_before", "refused")
-    plan = {state: batch.listed(state) for state in states}
+    plan = {state: batch.listed(state) for state in ("to_do", *STATES)}
     if as_json:
         main.print_stdout(plan)
     for state, rows in plan.items() if not as_json else ():
         for row in rows:
             end = row.get("reason") or f"-> {batch.settings.folder / row['out']}"
-            said = f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}"
-            main.print_stdout(main.printable(said))
+            main.print_stdout(f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}")
     counts = [f"{len(rows)} {kind.replace('_', ' ')}" for kind, rows in plan.items() if rows]
     main.print_stderr(", ".join(counts) or "nothing to do")

@@ -1,20 +1,4 @@
-"""The command ``check``: whether a mesh is valid and fits the samples of its grid."""
-
-from __future__ import annotations
-
-import sys
-from pathlib import Path
-from typing import Any
-
-import click
-from click import argument, option
-
-from ..errors import check_modules
-from ..options import READ, Options
-from . import main
-from .main import SHARED, table_option
-
-HELP = """Check the mesh file MESH against the signed distance grid GRID that it was made from.
+"""Check the mesh file MESH against the signed distance grid GRID that it was made from.
 
 The true surface is not needed. Every exact sample is the radius of an empty ball that touches the
 surface; its residual is its distance to the mesh minus that radius, in voxels: positive if the mesh
@@ -24,34 +8,41 @@ oriented and manifold, and for self-intersections.
 MESH is any mesh file that trimesh reads; vertices at the same position count as one. GRID is what
 upsample takes. The exit code is 1 if a limit is exceeded.
 
-\b
-Examples:
   super-sdf check part.ply part.npz
   super-sdf check part.ply part.npz --max-mean 0.01 --no-faults
 """
 
-# fmt: off
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from click import Argument, FloatRange, Option
+
+from ..errors import check_modules
+from ..options import READ, Options
+from . import main
+
 TAKES = (
-    argument("mesh", metavar="MESH", type=main.FILE),
-    argument("grid", metavar="GRID", type=main.FILE),
-    option("--tolerance", type=click.FloatRange(0), metavar="D",
+    Argument(["mesh"], metavar="MESH", type=main.FILE),
+    Argument(["grid"], metavar="GRID", type=main.FILE),
+    Option(["--tolerance"], type=FloatRange(0), metavar="D",
         help="Fail if the largest residual of a sample is above D, in world units."),
-    option("--max-mean", type=click.FloatRange(0), metavar="VOXELS",
+    Option(["--max-mean"], type=FloatRange(0), metavar="VOXELS",
         help="Fail if the mean residual is above this."),
-    option("--no-faults", is_flag=True,
+    Option(["--no-faults"], is_flag=True,
         help="Fail if the mesh is open, not manifold, not oriented outward, intersects itself, has "
         "samples on the wrong side, or vertices where the grid has no surface."),
-    *map(table_option, READ),
-    table_option("offset", "The --offset that the mesh was made with."),
-    table_option("unit", "The unit of the mesh: of a .glb, and for volumes in ml."),
-    table_option("max_memory", "Memory limit of the process, such as 1500M or 4G. Default: 60 % of "
-        "the free memory. Larger meshes are refused."),
-    *(SHARED[name] for name in ("json", "quiet")),
-)
-# fmt: on
+    *READ,
+    main.table_option("offset", "The --offset that the mesh was made with."),
+    main.table_option("unit", "The unit of the mesh: of a .glb, and for volumes in ml."),
+    main.table_option("max_memory", "Memory limit of the process, such as 1500M or 4G. Default: "
+        "60 % of the free memory. Larger meshes are refused."),
+    "json", "quiet",
+)  # fmt: skip
 
 
-@main.make_command("Check a mesh against the grid that it was made from.", HELP, *TAKES)
 def command(mesh: Path, grid: Path, **given: Any) -> None:
     """Check the mesh, print the certificate, and fail where it exceeds a limit."""
     check_modules("check", "report", ("igl",))
@@ -59,14 +50,13 @@ def command(mesh: Path, grid: Path, **given: Any) -> None:
 
     options = Options(**{name: given[name] for name in (*READ, "offset", "max_memory", "unit")})
     found = check_mesh(*read_for_check(mesh, grid, options), options)
-    faults = found.faults() if given["no_faults"] else []
     failed = found.exceeded(given["tolerance"], given["max_mean"])
-    failed += [f"the mesh has {fault}" for fault in faults]
+    failed += [f"the mesh has {each}" for each in found.faults() if given["no_faults"]]
     if given["as_json"]:
         said = {"mesh": str(mesh), "grid": str(grid), **found.report(), "limits_exceeded": failed}
         main.print_stdout(said)
     elif not given["quiet"]:
-        main.print_stdout("\n".join(found.lines()))
+        main.print_stdout(*found.lines())
     main.print_stderr(*(f"Note: {note}" for note in found.grid.notes if not given["quiet"]))
     main.print_stderr(*(f"Limit exceeded: {sentence}" for sentence in failed))
     if failed:

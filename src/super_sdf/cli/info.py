@@ -1,4 +1,12 @@
-"""The command ``info``: what is installed, and with ``--check`` whether it works."""
+"""Show versions, devices, networks, and extras with the command that installs those missing.
+
+With --check, each network also refines a ball on the CPU and on CUDA. With GRID, show instead what
+that grid file states: shape, type, spacing and origin.
+
+  super-sdf info --check
+  super-sdf info --check --device cuda
+  super-sdf info scan.zarr
+"""
 
 from __future__ import annotations
 
@@ -8,36 +16,24 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from click import argument, option
+from click import Argument, Option
 
 from .. import __version__, errors
-from ..options import FLOAT32, MASK, OPTIONS, Device
+from ..options import OPTIONS, Device
 from . import main
-from .main import SHARED, table_option
 
-HELP = """Show versions, devices, networks, and extras with the command that installs those missing.
-
-With --check, each network also refines a ball on the CPU and on CUDA. With GRID, show instead what
-that grid file states: shape, type, spacing and origin.
-
-\b
-Examples:
-  super-sdf info --check
-  super-sdf info --check --device cuda
-  super-sdf info scan.zarr
-"""
 OK, MISSING, FAILED = "ok", "missing", "failed"
+SAID = {float: "{:.10g}", int: "{:,}", type(None): "not stated"}  # how facts are shown
 CENTRE, RADIUS = 15.63, 12.0  # of a ball, in voxels; the centre is on no sample
 MOST_OFF, MOST_OFF_OF_MASK = 0.05, 0.6  # voxels; a mask shows the surface to half a voxel
 TAKES = (
-    argument("source", metavar="[GRID]", required=False),
-    option("--check", is_flag=True, help="Also run the networks."),
-    table_option("device", "cpu skips CUDA; cuda makes it a failure if CUDA fails."),
-    SHARED["json"],
-)
+    Argument(["source"], metavar="[GRID]", required=False),
+    Option(["--check"], is_flag=True, help="Also run the networks."),
+    main.table_option("device", "cpu skips CUDA; cuda makes it a failure if CUDA fails."),
+    "json",
+)  # fmt: skip
 
 
-@main.make_command("Show what is installed, or describe a grid file.", HELP, *TAKES)
 def command(source: str | None, check: bool, device: Device, as_json: bool) -> None:
     """Print findings as they come; the exit code is 1 if something failed."""
     OPTIONS["device"].check(device)
@@ -45,7 +41,7 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
         from ..files.grids import describe_grid_file
 
         facts = describe_grid_file(source)
-        main.print_stdout(facts if as_json else "\n".join(in_words(facts)))
+        main.print_stdout(*([facts] if as_json else in_words(facts)))
         return
     findings = []
     for state, what, says in run_checks(device, check):
@@ -62,18 +58,12 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
 def in_words(facts: dict[str, Any]) -> Iterator[str]:
     """Yield facts as lines: a line each, and one for each note."""
     for key, value in facts.items():
-        values = value if isinstance(value, (list, tuple)) else [value]
+        values = value if isinstance(value, list) else [value]
+        words = [SAID.get(type(each), "{}").format(each) for each in values]
         if key == "notes":
-            yield from (f"note: {note}" for note in values)
-        elif values:
-            yield f"{key.replace('_', ' ')}: {', '.join(map(in_word, values))}"
-
-
-def in_word(value: Any) -> str:
-    """Return a value of a fact as text."""
-    if isinstance(value, float):
-        return f"{value:.10g}"
-    return "not stated" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
+            yield from (f"note: {note}" for note in words)
+        elif words:
+            yield f"{key.replace('_', ' ')}: {', '.join(words)}"
 
 
 def run_checks(device: Device, check: bool) -> Iterator[tuple[str, str, str]]:
@@ -108,10 +98,10 @@ def check_network(name: str, device: Device) -> tuple[str, str, str]:
     from .. import load_network, make_grid, reconstruct
 
     values: Any = np.linalg.norm(np.indices((32, 32, 32)) - CENTRE, axis=0) - RADIUS
-    is_mask, what = name.startswith(MASK), f"network {name} on {device}"
+    is_mask, what = name.startswith("mask"), f"network {name} on {device}"
     grid = make_grid(values < 0 if is_mask else values, spacing=1.0, origin=0.0)
-    try:
-        network = load_network(name, device=device, precision=FLOAT32)  # its own file
+    try:  # float32, as its file for int8 is a network of its own
+        network = load_network(name, device=device, precision="float32")
         found = reconstruct(grid, network, mesher="marching").vertices
     except errors.SuperSdfError as error:
         return FAILED, what, error.flagged

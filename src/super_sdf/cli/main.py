@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
+from string import Template
 from types import FrameType
 from typing import Any
 
@@ -20,23 +21,29 @@ import click
 
 from .. import __version__
 from ..errors import OptionError, SuperSdfError, check_modules, flag, in_a_line
-from ..options import GRID, MESH, OPTIONS, VALUES, WORK, Options
+from ..files.formats import LISTED, NAMED, files_of
+from ..options import GRID, MESH, MESH_FORMATS, OPTIONS, VALUES, WORK, Options
 
-COMMANDS = ("upsample", "batch", "check", "sample", "view", "info")
+COMMANDS = {
+    "upsample": "Refine a grid and write its surface as a mesh.",
+    "batch": "Convert many grids; can be stopped and resumed.",
+    "check": "Check a mesh against the grid that it was made from.",
+    "sample": "Sample a closed mesh as a signed distance grid.",
+    "view": "Look at meshes and grids in the browser.",
+    "info": "Show what is installed, or describe a grid file.",
+}
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 OUTPUT = "Output"
-HEADINGS = {"names": VALUES} | dict.fromkeys(("cluster", "jobs", "retry", "dry_run"), WORK)
-"""Those of options that are not in the table; the others are about the output."""
+HEADINGS = {name: row.group for name, row in OPTIONS.items()} | {"names": VALUES}
+HEADINGS |= dict.fromkeys(("cluster", "jobs", "retry", "dry_run"), WORK)
 FILE = click.Path(path_type=Path)
 
 Paths = Iterable[str | Path]
-Decorator = Callable[[Any], Any]
-"""Adds options to a command."""
 
 
 class Commands(click.Group):
-    """The commands, each in a module of its name that is imported when it is used."""
+    """Commands in modules of their names: the docstring is the help, ``TAKES`` are parameters."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of the commands, in the order of the help."""
@@ -46,8 +53,18 @@ class Commands(click.Group):
         """Return a command; None if there is none of this name."""
         if cmd_name not in COMMANDS:
             return None
-        found: click.Command = import_module(f"..{cmd_name}", __name__).command
-        return found
+        module: Any = import_module(f"..{cmd_name}", __name__)
+        meshes = ", ".join(f".{name}" for name in MESH_FORMATS)
+        text = Template(module.__doc__ or "").substitute(grids=LISTED, several=NAMED, meshes=meshes)
+        text, _, examples = text.partition("\n  super-sdf")
+        return Command(
+            cmd_name,
+            callback=module.command,
+            params=[SHARED.get(each, each) for each in module.TAKES],
+            help=text,
+            epilog=f"\b\nExamples:\n  super-sdf{examples}",
+            short_help=COMMANDS[cmd_name],
+        )
 
 
 @click.group(cls=Commands, context_settings=CONTEXT, invoke_without_command=True)
@@ -56,7 +73,7 @@ class Commands(click.Group):
 def cli(context: click.Context) -> None:
     """Turn coarse signed distance grids into fine meshes."""
     if context.invoked_subcommand is None:
-        print_stdout(context.get_help())
+        click.echo(context.get_help())
 
 
 class Command(click.Command):
@@ -67,70 +84,54 @@ class Command(click.Command):
         rows: dict[str, list[Any]] = {name: [] for name in (GRID, VALUES, MESH, WORK, OUTPUT)}
         for param in self.get_params(ctx):
             if isinstance(param, click.Option) and (record := param.get_help_record(ctx)):
-                name = str(param.name)
-                group = OPTIONS[name].group if name in OPTIONS else HEADINGS.get(name, OUTPUT)
-                rows[group].append(record)
+                rows[HEADINGS.get(str(param.name), OUTPUT)].append(record)
         headings = [heading for heading, some in rows.items() if some]
         for heading in headings:
             with formatter.section(heading if len(headings) > 1 else "Options"):
                 formatter.write_dl(rows[heading])
 
 
-def make_command(short: str, text: str, *takes: Decorator) -> Decorator:
-    """Return what makes a command of a function; examples in its text go below the options."""
-    text, _, examples = text.partition("\b")
-
-    def make(function: Callable[..., Any]) -> Command:
-        for take in reversed(takes):
-            function = take(function)
-        told = {"help": text, "epilog": f"\b{examples}", "short_help": short}
-        return click.command(None, Command, context_settings=CONTEXT, **told)(function)
-
-    return make
-
-
-def table_option(name: str, text: str = "") -> Decorator:
-    """Return what adds an option of the table to a command, maybe with another help text."""
+def table_option(name: str, text: str = "") -> click.Option:
+    """Return an option of the table, maybe with another help text."""
     row, word = OPTIONS[name], flag(name)
     more: dict[str, Any] = {"help": text or row.help, "default": row.default}
     if isinstance(row.default, bool):
-        return click.option(f"{word}/--{row.off}" if row.off else word, is_flag=True, **more)
+        return click.Option([f"{word}/--{row.off}" if row.off else word], is_flag=True, **more)
     choices = f"[{'|'.join(row.kind.choices)}]" if row.kind.choices else None
     more |= {"show_default": row.default is not None, "metavar": row.metavar or choices}
-    return click.option(word, type=click.UNPROCESSED, **more)
+    return click.Option([word], type=click.UNPROCESSED, **more)
 
 
-# fmt: off
-SHARED = {
-    "names": click.option("--names", type=FILE, metavar="TABLE",
+SHARED: dict[Any, click.Option] = {  # options of several commands, by their names
+    "names": click.Option(["--names"], type=FILE, metavar="TABLE",
         help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP "
         "or FreeSurfer, CSV, or JSON such as nnU-Net's. --label and --labels take names then."),
-    "cluster": click.option("--cluster", metavar="ADDRESS",
+    "cluster": click.Option(["--cluster"], metavar="ADDRESS",
         help="Convert on the workers of the Dask scheduler at ADDRESS, each within --max-memory, "
         "or with 'local' on Dask workers of this machine. Needs the extra cluster."),
-    "jobs": click.option("--jobs", type=click.IntRange(0), default=0, metavar="N",
+    "jobs": click.Option(["--jobs"], type=click.IntRange(0), default=0, metavar="N",
         help="Worker processes of a batch, or of --cluster local; 0 means one per core, or a "
         "single one on CUDA."),
-    "check": click.option("--check", is_flag=True,
+    "check": click.Option(["--check"], is_flag=True,
         help="Check each mesh against its samples, as check does. Needs the extra report."),
-    "report": click.option("--report", type=FILE, metavar="PAGE.html",
+    "report": click.Option(["--report"], type=FILE, metavar="PAGE.html",
         help="Also write a page for the browser, with figures, warnings, a check and a 3-D view of "
         "each mesh. The check needs the extra report."),
-    "force": click.option("--force", is_flag=True, help="Replace output files that exist."),
-    "json": click.option("--json", "as_json", is_flag=True, help="Print results as JSON."),
-    "quiet": click.option("-q", "--quiet", is_flag=True, help="Print errors only."),
-}
-# fmt: on
-"""Options of several commands that are not about a conversion."""
+    "force": click.Option(["--force"], is_flag=True, help="Replace output files that exist."),
+    "json": click.Option(["--json", "as_json"], is_flag=True, help="Print results as JSON."),
+    "quiet": click.Option(["-q", "--quiet"], is_flag=True, help="Print errors only."),
+}  # fmt: skip
+SHARED |= {name: table_option(name) for name in OPTIONS}
 
 
 def chosen_options(given: dict[str, Any]) -> Options:
-    """Return the options of a conversion, from all options of a command that may go with them."""
-    if given.get("names") and given["label"] is not None:
+    """Return the options of a conversion, of all options of a command; read a table of names."""
+    if given.get("names"):
         from ..labels.files import read_names
 
-        numbers = {entry.name: number for number, entry in read_names(given["names"]).items()}
-        given = {**given, "label": numbers.get(given["label"], given["label"])}
+        given["names"] = read_names(given["names"])
+        numbers = {name: number for number, (name, _) in given["names"].items()}
+        given["label"] = numbers.get(given["label"], given["label"])
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
         check_modules(flag(name), "simplify")
@@ -145,7 +146,6 @@ def chosen_options(given: dict[str, Any]) -> Options:
 
 def check_page(word: str, page: Path, sources: Paths, others: Paths, *, force: bool) -> None:
     """Raise if a page cannot be written, is a file that a source is read from, or an output."""
-    from ..files.formats import files_of
     from ..files.output import check_apart, check_free
 
     if page.suffix.lower() not in (".html", ".htm"):
@@ -164,21 +164,17 @@ def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None]
         yield lambda done, total: shown.update(1000 * done // total - shown.pos)
 
 
-def printable(line: str) -> str:
-    """Return a line with escapes in place of what names of files may hold, such as line breaks."""
-    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-
-
 def print_stderr(*lines: str) -> None:
     """Print lines to stderr, if that can be written."""
     with suppress(OSError):
-        for line in lines:
-            click.echo(printable(line), err=True)
+        print_stdout(*lines, err=True)
 
 
-def print_stdout(text: str | dict[str, Any]) -> None:
-    """Print a result, a dictionary as JSON."""
-    click.echo(text if isinstance(text, str) else json.dumps(text, indent=2))
+def print_stdout(*lines: str | dict[str, Any], err: bool = False) -> None:
+    """Print lines, with escapes for what names may hold, such as line breaks, or JSON."""
+    for line in lines:
+        text = (c if c.isprintable() else ascii(c)[1:-1] for c in line)
+        click.echo(json.dumps(line, indent=2) if isinstance(line, dict) else "".join(text), err=err)
 
 
 def main() -> None:
@@ -215,7 +211,7 @@ def main() -> None:
                 stream.flush()
         except OSError:  # Python would complain at its end about what is left
             os.dup2(os.open(os.devnull, os.O_WRONLY), number)
-    if isinstance(code, int) and code:
+    if code:
         sys.exit(code)
 
 

@@ -1,4 +1,11 @@
-"""The command ``sample``: a closed mesh to a signed distance grid."""
+"""Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
+
+MESH is any mesh file that trimesh reads. OUT is a .npz file (keys values, spacing, origin); its
+values are in the units of the mesh and negative inside.
+
+  super-sdf sample part.stl part.npz -n 64
+  super-sdf sample part.stl part.npz --spacing 0.5 --padding 4
+"""
 
 from __future__ import annotations
 
@@ -6,44 +13,27 @@ import time
 from pathlib import Path
 from typing import Any
 
-import click
-from click import argument, option
+from click import Argument, FloatRange, IntRange, Option
 
 from ..errors import OptionError, check_modules
 from . import main
-from .main import SHARED
 
-HELP = """Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
-
-MESH is any mesh file that trimesh reads. OUT is a .npz file (keys values, spacing, origin); its
-values are in the units of the mesh and negative inside.
-
-\b
-Examples:
-  super-sdf sample part.stl part.npz -n 64
-  super-sdf sample part.stl part.npz --spacing 0.5 --padding 4
-"""
-
-# fmt: off
 TAKES = (
-    argument("source", metavar="MESH", type=main.FILE),
-    argument("target", metavar="OUT", type=main.FILE),
-    option("-n", "samples", type=click.IntRange(2), help="Samples along the longest axis."),
-    option("--spacing", type=click.FloatRange(0, min_open=True), metavar="H",
+    Argument(["source"], metavar="MESH", type=main.FILE),
+    Argument(["target"], metavar="OUT", type=main.FILE),
+    Option(["-n", "samples"], type=IntRange(2), help="Samples along the longest axis."),
+    Option(["--spacing"], type=FloatRange(0, min_open=True), metavar="H",
         help="World distance between samples, instead of -n."),
-    option("--padding", type=click.FloatRange(0), metavar="VOXELS",
+    Option(["--padding"], type=FloatRange(0), metavar="VOXELS",
         help="Voxels between the bounding box of the mesh and the last samples. Default: 2.37."),
-    option("--band", type=click.FloatRange(1.5), metavar="VOXELS",
+    Option(["--band"], type=FloatRange(1.5), metavar="VOXELS",
         help="Exact distances up to this many voxels from the surface, clamped beyond. Default: "
         "exact everywhere up to 256^3 samples, within 4 voxels in larger grids."),
-    option("--allow-open", is_flag=True, help="Accept a mesh with holes; its inside is a guess."),
-    SHARED["force"],
-    SHARED["quiet"],
-)
-# fmt: on
+    Option(["--allow-open"], is_flag=True, help="Accept a mesh with holes; its inside is a guess."),
+    "force", "quiet",
+)  # fmt: skip
 
 
-@main.make_command("Sample a closed mesh as a signed distance grid.", HELP, *TAKES)
 def command(source: Path, target: Path, **given: Any) -> None:
     """Check the numbers, load the mesh, sample it and write the grid."""
     check_modules("sample", "eval")
@@ -52,13 +42,12 @@ def command(source: Path, target: Path, **given: Any) -> None:
     from ..truth.sampling import PADDING, fitted_layout, sample_solid
     from ..truth.solid import load_solid
 
-    start, padding = time.perf_counter(), given["padding"]
-    count, spacing = given["samples"], given["spacing"]
+    start, count, spacing = time.perf_counter(), given["samples"], given["spacing"]
     check_grid_target(target, force=given["force"])
     check_apart(target, [source])
     if (count is None) == (spacing is None):
         raise OptionError("give either -n (samples along the longest axis) or --spacing")
-    padding = PADDING if padding is None else padding
+    padding = PADDING if given["padding"] is None else given["padding"]
     solid, notes = load_solid(source, allow_open=given["allow_open"])
     layout = fitted_layout(solid.mesh, n=count, spacing=spacing, padding=padding)
     with main.progress_bar("sampling", given["quiet"]) as progress:

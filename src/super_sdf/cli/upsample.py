@@ -1,4 +1,15 @@
-"""The command ``upsample``: one grid file to one mesh file, or an image to the meshes of labels."""
+"""Refine the signed distance grid IN and write its surface as the mesh OUT.
+
+IN is a grid file: $grids. FILE:NAME names one of several arrays in a $several
+file. An .npz file has the keys values, spacing, origin and direction.
+
+OUT is a mesh file: one of $meshes.
+
+  super-sdf upsample part.npz part.ply
+  super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
+  super-sdf upsample scan.h5:/distance part.ply --spacing 0.5
+  super-sdf upsample organs.nii.gz organs.glb --labels all
+"""
 
 from __future__ import annotations
 
@@ -6,58 +17,39 @@ import time
 from contextlib import ExitStack
 from typing import Any
 
-from click import argument, option
+from click import Argument, Option
 
 from .. import __version__
-from ..files.formats import LISTED, NAMED
-from ..options import MESH_FORMATS, OPTIONS, Options
+from ..options import OPTIONS, Options
 from . import main
-from .main import SHARED, table_option
 
-HELP = f"""Refine the signed distance grid IN and write its surface as the mesh OUT.
-
-IN is a grid file: {LISTED}. FILE:NAME names one of several arrays in a {NAMED}
-file. An .npz file has the keys values, spacing, origin and direction.
-
-OUT is a mesh file: {", ".join(f".{name}" for name in MESH_FORMATS[:-1])} or .{MESH_FORMATS[-1]}.
-
-\b
-Examples:
-  super-sdf upsample part.npz part.ply
-  super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
-  super-sdf upsample scan.h5:/distance part.ply --spacing 0.5
-  super-sdf upsample organs.nii.gz organs.glb --labels all
-"""
 MANY = 50_000  # triangles of which simplifying is worth a hint
 TILES_PER_THREAD = 2  # of a cluster: one that dies costs little
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
-# fmt: off
 TAKES = (
-    argument("source", metavar="IN"),
-    argument("target", metavar="OUT"),
-    *map(table_option, OPTIONS),
-    *(SHARED[name] for name in ("names", "cluster", "jobs", "check")),
-    option("--save-field", metavar="FIELD",
+    Argument(["source"], metavar="IN"),
+    Argument(["target"], metavar="OUT"),
+    *OPTIONS,
+    "names", "cluster", "jobs", "check",
+    Option(["--save-field"], metavar="FIELD",
         help="Also write the refined field: .npz for the values near the surface, .vdb for a level "
         "set of OpenVDB, .npy or .vti (extra vti) for the whole fine lattice."),
-    *(SHARED[name] for name in ("report", "force", "json", "quiet")),
-)
-# fmt: on
+    "report", "force", "json", "quiet",
+)  # fmt: skip
 
 
-@main.make_command("Refine a grid and write its surface as a mesh.", HELP, *TAKES)
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
     start, options, page = time.perf_counter(), main.chosen_options(given), given["report"]
     if page:
-        others = [name for name in (target, given["save_field"]) if name]
-        main.check_page("--report", page, [source], others, force=given["force"])
+        outputs = [name for name in (target, given["save_field"]) if name]
+        main.check_page("--report", page, [source], outputs, force=given["force"])
     from ..network.network import load_network
 
     network, certificate = load_network(**options.network()), None
     seconds = {"load network": time.perf_counter() - start}
-    done = converted(source, target, network, options, given)
+    done = converted(source, target, network, options, **given)
     report = {
         "input": source,
         "output": target,
@@ -67,7 +59,7 @@ def command(source: str, target: str, **given: Any) -> None:
         "precision": network.precision,
         "device": network.device,
         "device_notes": list(network.notes),
-        **done.report(),
+        **done.facts,
     }
     seconds, start = seconds | done.seconds, time.perf_counter()
     if given["as_json"] or page:
@@ -80,37 +72,32 @@ def command(source: str, target: str, **given: Any) -> None:
         certificate = check_mesh(*read_for_check(target, source, options, done), options)
         report["check"] = certificate.report()
         seconds["check"] = time.perf_counter() - start
+    report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
     if page:
         from ..pages.html import page_of_conversion, write_page
 
-        facts = {**report, "seconds": seconds, "notes": network.notes}
-        text = page_of_conversion(facts, options, done, certificate)
+        text = page_of_conversion({**report, "notes": network.notes}, options, done, certificate)
         write_page(text, page, force=given["force"])
-    report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
     if given["as_json"]:
         main.print_stdout(report)
     if not given["quiet"]:
-        lines = lines_of(report, [*report["inferred"], *network.notes])
-        lines += [f"Check: {certificate.summary()}"] if certificate else []
-        main.print_stderr(*lines, *[f"Report: {page}"] * bool(page))
+        checked = [f"Check: {certificate.summary()}"] if certificate else []
+        main.print_stderr(*lines_of(report), *checked, *[f"Report: {page}"] * bool(page))
 
 
-def converted(
-    source: str, target: str, network: Any, options: Options, given: dict[str, Any]
-) -> Any:
+def converted(source: str, target: str, network: Any, options: Options, **given: Any) -> Any:
     """Return the conversion of a grid, here or on a cluster, or that of the labels of an image."""
     with ExitStack() as stack:
         bar = main.progress_bar("upsampling", given["quiet"])
-        both: Any = {"progress": stack.enter_context(bar), "force": given["force"]}
+        how: Any = {"progress": stack.enter_context(bar), "force": given["force"]}
         if options.labels is not None:
-            from ..labels.files import check_options, convert_labels, read_names
+            from ..labels.files import check_options, convert_labels
 
             check_options(options, [name for name in NOT_WITH_LABELS if given[name]])
-            how: Any = {"names": given["names"] and read_names(given["names"])}
-            return convert_labels(source, target, network, options, **how, **both)
+            return convert_labels(source, target, network, options, names=given["names"], **how)
         from ..convert import convert
 
-        how = {"save_field": given["save_field"]}
+        how["save_field"] = given["save_field"]
         if given["cluster"]:
             from ..batch.cluster import connect, tiles_on
 
@@ -118,18 +105,17 @@ def converted(
             client: Any = stack.enter_context(to)
             least = TILES_PER_THREAD * sum(client.nthreads().values())
             how |= {"map_tiles": tiles_on(client), "least_tiles": least}
-        return convert(source, target, network, options, **how, **both)
+        return convert(source, target, network, options, **how)
 
 
-def lines_of(report: dict[str, Any], notes: list[str]) -> list[str]:
+def lines_of(report: dict[str, Any]) -> list[str]:
     """Return lines on a result: notes and warnings, and what was written."""
-    lines = [f"Note: {note}" for note in notes]
+    lines = [f"Note: {note}" for note in (*report["inferred"], *report["device_notes"])]
     lines += [f"Warning: {warning}" for warning in report.get("warnings", ())]
     seconds = f"{sum(report['seconds'].values()):.1f} s"
     for row in report.get("labels", ()):
-        volumes = f"volume {row['volume']:.6g}, of its samples {row['sample_volume']:.6g}"
-        named = f"{row['output']}: {row['name']}"
-        lines.append(f"{named}, {row['triangles']:,} triangles, {volumes}")
+        line = f"{row['output']}: {row['name']}, {row['triangles']:,} triangles, volume "
+        lines.append(f"{line}{row['volume']:.6g}, of its samples {row['sample_volume']:.6g}")
     if "labels" in report:
         return [*lines, f"{len(report['labels'])} labels, {seconds}"]
     few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
@@ -144,10 +130,8 @@ def lines_of(report: dict[str, Any], notes: list[str]) -> list[str]:
         shape = " x ".join(map(str, field["shape"]))
         lines.append(f"{field['path']}: the refined field, lattice {shape}")
     if few:
-        off, count = few["deviation"], few["triangles_before"]
-        lines.append(
-            f"Simplified: from {count:,} to {triangles:,} triangles; largest distance "
-            f"{off['largest']:.4f} voxels from the unsimplified mesh to this one, "
-            f"{off['largest_back']:.4f} back"
-        )
+        off = few["deviation"]
+        line = f"Simplified: from {few['triangles_before']:,} to {triangles:,} triangles; largest "
+        line += f"distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
+        lines.append(f"{line}{off['largest_back']:.4f} back")
     return lines

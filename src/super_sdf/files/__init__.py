@@ -1,1 +1,1 @@
-"""Grid files in, mesh files and refined fields out: one module a library, complete files only."""
+"""Grid files in, mesh files and refined fields out: complete files only."""

@@ -108,11 +108,8 @@ FIELD_TABLE: dict[str, Callable[[FineField, Path], None]] = {
 def saving_field(
     path: str | Path, *, force: bool = False
 ) -> Iterator[Callable[[FineField], dict[str, Any]]]:
-    """Yield what writes a field to a file, and returns what was written, for JSON.
-
-    The file appears at the end of the block, if that succeeds.
-    """
-    path = check_path(path, "path")
+    """Yield what writes a field, and returns facts of the file, which appears after the block."""
+    path = check_path(path)
     kind = path.suffix.lower()
     if kind not in FIELD_TABLE:
         raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_TABLE)}")
@@ -174,7 +171,7 @@ def read_field(path: str | Path) -> FineField:
     FileError
         If the file is missing, damaged, or holds something else.
     """
-    path = check_regular_file(check_path(path, "path"))
+    path = check_regular_file(check_path(path))
     try:
         with path.open("rb") as file, NpzFile(file) as archive:
             if (version := archive["version"]) != VERSION:
@@ -204,18 +201,11 @@ def _field_of(arrays: dict[str, Any]) -> FineField:
     if any((np.diff(numbers) <= 0).any() for numbers in (*flat, samples)):
         raise ValueError("its voxels are not in order")
     values = arrays["values"].reshape(len(voxels), (factor + 1) ** 3)
-    field = FineField(
-        shape,
-        factor,
-        voxels,
-        np.ascontiguousarray(values.T, np.float32),
-        share_parts(neighbour_table(voxels, shape)),
-        grid,
-        float(arrays["offset"]),
-        SampleSpheres(shape, samples, distances.reshape(len(samples))),
-        bool(arrays["leaves"]),
-        border,
-    )
+    blocks = np.ascontiguousarray(values.T, np.float32)
+    parts = share_parts(neighbour_table(voxels, shape))
+    spheres = SampleSpheres(shape, samples, distances.reshape(len(samples)))
+    offset, leaves = float(arrays["offset"]), bool(arrays["leaves"])
+    field = FineField(shape, factor, voxels, blocks, parts, grid, offset, spheres, leaves, border)
     if not (field.values[field.numbers] == values).all():  # the mesh of others would have holes
         raise ValueError("blocks differ at nodes that they share")
     return field

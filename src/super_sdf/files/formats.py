@@ -36,7 +36,7 @@ MRC = (".mrc", ".map", ".ccp4", ".rec", ".mrc.gz", ".map.gz", ".ccp4.gz")
 FORMATS = (
     GridFormat("npy", "NumPy", (".npy",), "numpy", axes="xyz"),
     GridFormat("npz", "NumPy", (".npz",), "numpy", axes="xyz", has_members=True),
-    GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "nibabel", "nifti"),
+    GridFormat("nifti", "NIfTI", (".nii", ".nii.gz"), "headers", "nifti"),
     GridFormat("nrrd", "NRRD", (".nrrd", ".nhdr"), "headers", "nrrd"),
     GridFormat("metaimage", "MetaImage", (".mha", ".mhd"), "headers", "metaimage"),
     GridFormat("vtk", "VTK image data", (".vti",), "vtk", "vti", has_members=True),
@@ -45,9 +45,9 @@ FORMATS = (
     GridFormat("zarr", "Zarr", (".zarr", ".zarr.zip"), "zarr", "zarr", "zyx", True),
     GridFormat("vdb", "OpenVDB", (".vdb",), "vdb", "vdb", has_members=True),
     GridFormat("sdf", "SDFGen", (".sdf",), "numpy"),
-    GridFormat("mgh", "FreeSurfer", (".mgz", ".mgh"), "nibabel", "nifti"),
-    GridFormat("analyze", "Analyze", (".hdr",), "nibabel", "nifti"),
-    GridFormat("mrc", "MRC", MRC, "mrcfile", "mrc"),
+    GridFormat("mgh", "FreeSurfer", (".mgz", ".mgh"), "headers", "nifti"),
+    GridFormat("analyze", "Analyze", (".hdr",), "headers", "nifti"),
+    GridFormat("mrc", "MRC", MRC, "headers", "mrc"),
     GridFormat("vtk", "legacy VTK", (".vtk",), "vtk", "vti", has_members=True),
     GridFormat("vtk", "VTKHDF", (".vtkhdf",), "vtk", "vti", has_members=True),
     GridFormat("netcdf", "NetCDF", (".nc", ".nc4", ".cdf"), "h5py", "netcdf", "zyx", True),
@@ -134,10 +134,7 @@ DATA = re.compile(rb"^[ \t]*(?:ElementDataFile *[=:]|data ?file[ \t]*:=?) *([^\n
 
 
 def check_regular_file(path: str | Path) -> Path:
-    """Return the path if it is a regular file, or a link to one, else raise FileError.
-
-    The file is not opened, so this never blocks. An empty file is refused, too.
-    """
+    """Return the path of a regular file that is not empty, never opened; else raise FileError."""
     try:
         state = os.stat(path)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
@@ -158,12 +155,11 @@ def reason_of(error: OSError | ValueError) -> str:
 
 
 def check_beside(path: Path, name: str) -> Path:
-    """Return the file that another one, or a folder, names as part of it: in the folder, or below.
+    """Return the file that another file, or a folder, names as part of it.
 
-    A file that is a link may have its parts beside the file that it leads to. Raises FileError if
-    it is anywhere else, or no regular file.
+    FileError if it is no regular file, or neither in the folder nor below.
     """
-    homes = (path,) if path.is_dir() else (path.parent, path.resolve().parent)
+    homes = (path,) if path.is_dir() else (path.parent, path.resolve().parent)  # of links, too
     other = homes[0] / name
     if not any(other.resolve().is_relative_to(home.resolve()) for home in homes):
         said = f"{path} names the file {seen(name)}, which is not in its folder"
@@ -172,10 +168,7 @@ def check_beside(path: Path, name: str) -> Path:
 
 
 def split_header(path: Path) -> tuple[bytes, str, int]:
-    """Return the header of a MetaImage or NRRD file before the entry that names its data file.
-
-    And this name, and where in the file the entry ends: 0 if there is none.
-    """
+    """Return a MetaImage or NRRD header before the name of its data file, it, and where it ends."""
     with path.open("rb") as file:
         text = file.read(LONGEST_HEADER)
     if path.suffix.lower() in (".nrrd", ".nhdr"):  # after a blank line there is data
@@ -192,10 +185,7 @@ def is_store(path: str | Path) -> bool:
 
 
 def files_of(path: str | Path) -> list[Path]:
-    """Return the files that are read for a grid: itself, and those that it names.
-
-    Of a Zarr folder they are all in it; of what cannot be read it is the file itself.
-    """
+    """Return the files that are read for a grid: itself, and those that it names or holds."""
     file, _ = split_member(path)
     if is_store(file):
         return sorted(Path(at, name) for at, _, names in os.walk(file) for name in names)

@@ -1,6 +1,6 @@
 """Reading grid files of all formats, and writing ``.npz``.
 
-``formats`` has the table of all formats, ``readers`` a module for each library.
+``formats`` has the table of all formats, ``readers`` calls the library of each.
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ from .readers import Names, Request, Volume, axes_direction, find_placement
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
-
-NAMING = ("nrrd", "dicom")  # formats of which a file may name its labels
 
 
 def read_grid(
@@ -87,7 +85,7 @@ def read_array(
     max_memory: int | None,
 ) -> dict[str, Any]:
     """Return values, place (unless ``given``), hint, space and notes: see ``read_grid``."""
-    path, direction = check_path(path, "path"), given["direction"]
+    path, direction = check_path(path), given["direction"]
     with open_volume(path, axes, max_memory, direction) as (volume, request):
         volume = volume.in_space(space, str(path))
         if direction is not None:  # of x, y and z
@@ -98,7 +96,7 @@ def read_array(
 
 def names_in(path: str | Path) -> Names:
     """Return the names of labels, and their colours, that a grid file states."""
-    if find_format(path).key not in NAMING:
+    if find_format(path).key not in ("nrrd", "dicom"):  # others name none
         return {}
     with open_volume(Path(path)) as (volume, _):
         return volume.names
@@ -106,16 +104,9 @@ def names_in(path: str | Path) -> Names:
 
 @contextmanager
 def open_volume(
-    path: Path,
-    axes: str | None = None,
-    max_memory: int | None = None,
-    direction: Any = None,
+    path: Path, axes: str | None = None, max_memory: int | None = None, direction: Any = None
 ) -> Iterator[tuple[Volume, Request]]:
-    """Yield the volume in a file, and what was asked for.
-
-    Whatever a library raises in the block becomes a FileError of one line, and what it says
-    meanwhile is dropped.
-    """
+    """Yield the volume in a file, and what was asked for; all errors become those of a line."""
     format_, (file, named) = find_format(path), split_member(path)
     if format_ is not DICOM and not is_store(file):
         check_regular_file(file)
@@ -153,13 +144,12 @@ def open_volume(
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
     """Return values (nx, ny, nz), place and hint of a volume, for ``make_grid``."""
     check_kind(volume.dtype, volume.shape)
-    order, steps, place = find_placement(volume, given)
+    order, backwards, place = find_placement(volume, given)
     place["hint"] = volume.hint
-    is_ordered = order == (0, 1, 2) and all(step.step > 0 for step in steps)
-    if volume.is_mapped and is_ordered:
+    if volume.is_mapped and order == (0, 1, 2) and not backwards:
         return {"values": volume.read(), **place}
     request.check_fits(volume.shape, volume.dtype)
-    values = volume.read()[steps].transpose(order)
+    values = np.flip(volume.read().transpose(order), backwards)
     return {"values": np.ascontiguousarray(values, values.dtype.newbyteorder("=")), **place}
 
 
@@ -202,13 +192,11 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     No sample is read where the format allows it. What the file does not state is None or missing.
     Raises as ``read_grid``.
     """
-    path = check_path(path, "path")
+    path = check_path(path)
     with open_volume(path) as (volume, _):
         order, _, place = find_placement(volume, {})
     shape = [volume.shape[axis] for axis in order]
-    facts = {
-        k: at if at is None else np.ravel(at).astype(float).tolist() for k, at in place.items()
-    }
+    facts = {k: None if at is None else np.ravel(at).tolist() for k, at in place.items()}
     if facts["direction"] in (None, np.eye(3).ravel().tolist()):
         del facts["direction"]
     return {

@@ -22,8 +22,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, cross
-from ..arrays import unit as of_length_1
+from ..arrays import FloatArray, cross, unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
 from ..surface.mesh import Mesh, check_mesh
@@ -63,19 +62,14 @@ def has_parts(path: str | Path) -> bool:
     return Path(path).suffix.lower() in SCENES
 
 
-def check_target(path: str | Path, *, force: bool = False, unit: str | None = None) -> Path:
-    """Return the path if a mesh file can be written there; called before the work starts."""
-    check_mesh_suffix(Path(path), unit)
-    return check_free(Path(path), force=force)
-
-
-def check_mesh_suffix(path: Path, unit: str | None = None) -> None:
-    """Raise OptionError if the suffix is not that of a mesh format, or of none that has a unit."""
+def check_mesh_suffix(path: Path, unit: str | None = None) -> Path:
+    """Return the path of a mesh file; OptionError for another suffix, or if it states no unit."""
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
     if unit and not has_parts(path):
         stating = " or ".join(SCENES)
         raise OptionError(f"unit is {unit}: {path} can state none, give {stating}, or no unit")
+    return path
 
 
 def write_mesh(
@@ -113,9 +107,8 @@ def write_mesh(
         mesh; if the file cannot be written, or its format cannot hold the mesh: a coordinate is not
         finite, or corners of a triangle would coincide.
     """
-    path = check_path(path, "path")
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
-    check_target(path, force=force, unit=world.unit)
+    path = check_free(check_mesh_suffix(check_path(path), world.unit), force=force)
     write_meshes({path: {"": mesh}}, force=force, world=world)
 
 
@@ -128,8 +121,7 @@ def write_meshes(
 ) -> None:
     """Write files of meshes, by path and name: all of them, or none.
 
-    A format of one mesh takes the only one of its file. None is written if a file ``beside`` them,
-    which is to appear next, cannot be.
+    None is written, either, if a file ``beside`` them, which is to appear next, cannot be.
     """
     with ExitStack() as stack:
         for path, parts in files.items():
@@ -146,16 +138,13 @@ def write_meshes(
 
 def _as_single(mesh: Mesh, origin: Any = 0.0) -> FloatArray:
     """Return vertices, relative to an origin, as float32; FileError if it cannot hold the mesh."""
-
-    def is_flat(points: NDArray[Any]) -> BoolArray:  # triangles with two corners at one place
-        corners = points[mesh.faces]
-        return np.asarray((corners == np.roll(corners, 1, axis=1)).all(2).any(1))
-
     if mesh.vertices.dtype == np.float32 and not np.any(origin):
         return np.asarray(mesh.vertices)
     with np.errstate(over="ignore"):
         rounded = (mesh.vertices - origin).astype(np.float32)
-    if not np.isfinite(rounded).all() or (is_flat(rounded) & ~is_flat(mesh.vertices)).any():
+    corners = (points[mesh.faces] for points in (rounded, mesh.vertices))
+    is_flat, was_flat = ((at == np.roll(at, 1, axis=1)).all(2).any(1) for at in corners)
+    if not np.isfinite(rounded).all() or (is_flat & ~was_flat).any():  # two corners at one place
         said = "the format has single precision, in which vertices of the mesh coincide"
         raise FileError(f"{said}: write .ply or .obj")
     return np.asarray(rounded)
@@ -180,13 +169,12 @@ def write_ply(file: IO[bytes], parts: Parts, world: World) -> None:
 def write_stl(file: IO[bytes], parts: Parts, world: World) -> None:
     """Write binary STL: each triangle stores its normal and the positions of its corners."""
     (mesh,) = parts.values()
-    vertices, least = _as_single(mesh), np.finfo(np.float64).tiny
+    vertices = _as_single(mesh)
     file.write(f"made by super-sdf {world.note}".ljust(80).encode("ascii"))
     file.write(struct.pack("<I", len(mesh.faces)))
     for first in range(0, len(mesh.faces), STL_CHUNK):
         corners = vertices[mesh.faces[first : first + STL_CHUNK]]
         sides = corners[:, 1:].astype(np.float64) - corners[:, :1]
-        sides /= np.maximum(np.abs(sides).max((1, 2), keepdims=True), least)  # at any scale
         rows = np.zeros(len(corners), STL_ROW)
         rows["normal"], rows["corners"] = of_length_1(cross(sides[:, 0], sides[:, 1])), corners
         file.write(rows.data)
@@ -219,11 +207,7 @@ def _lines(line: str, rows: NDArray[Any], first: int = 0) -> Iterator[bytes]:
 
 
 def write_glb(file: IO[bytes], parts: Parts, world: World) -> None:
-    """Write binary glTF, a node for each part.
-
-    Vertices are float32, of float64 meshes relative to the middle of their box; the nodes move them
-    there, and scale them from the unit to metres, those of glTF.
-    """
+    """Write binary glTF, whose unit is the metre: a node for each part, which moves it there."""
     import trimesh
 
     library: Any = trimesh  # parts of it have no types
@@ -272,10 +256,7 @@ COMPRESSION = 1  # the fastest level: higher ones save a tenth and take three ti
 
 
 def write_3mf(target: IO[bytes], parts: Parts, world: World) -> None:
-    """Write 3MF, an object for each part, in a unit or the format's default, the millimetre.
-
-    Members opened by name have no date, so the same mesh always gives the same file.
-    """
+    """Write 3MF, an object for each part; members have no date: a mesh gives the same bytes."""
     with ZipFile(target, "w", ZIP_DEFLATED, compresslevel=COMPRESSION) as archive:
         for member, text in MEMBERS.items():
             with archive.open(member, "w") as file:

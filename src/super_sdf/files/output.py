@@ -22,10 +22,9 @@ LONGEST = 50  # characters of a name that the name of its part has: file systems
 
 
 def check_free(path: Path, *, force: bool = False) -> Path:
-    """Return the path if a file can be created there; raise WriteError if not.
+    """Return the path if a file can be created there, or with ``force`` replaced; else WriteError.
 
-    Without ``force`` no file may exist. A link counts as its target; a dangling link counts as an
-    existing file.
+    A link counts as its target, a dangling link as an existing file.
     """
     try:
         mode = path.stat().st_mode

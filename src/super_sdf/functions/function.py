@@ -1,37 +1,29 @@
-"""Signed distances by a function of points, and its samples on a lattice.
-
->>> from super_sdf import reconstruct
->>> mesh = reconstruct(function=f, bounds=(-1, 1), spacing=0.05)   # doctest: +SKIP
-"""
+"""Signed distances by a function of points, and its samples on a lattice."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import partial
 from numbers import Real
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import CORNERS, FloatArray, without_device
+from ..arrays import CORNERS, FloatArray, IntArray, Numbers, Vectors, without_device
 from ..errors import GridError, OptionError, OptionTypeError, seen
 from ..grid.interpret import ORDINARY
 from ..grid.samples import as_triple, check_spacing
 from ..grid.sdf_grid import SdfGrid, check_grid, make_grid
 
-Points = NDArray[np.float64]  # (n, 3)
-Numbers = NDArray[np.float64]  # (n,)
-
 BATCH = 1 << 18  # points of a call at most
 MOST_SAMPLES = 1 << 31
 REACH = 4  # spacings from the surface: the network sees samples that are 3.2 off
-STRIDE = 8  # spacings along the largest cells of a function; a power of two
+STRIDES = (8, 4, 2)  # spacings along the cells of a function, from the largest
 STEEPER = 1.25  # than seen between samples may the function be
 
-At: TypeAlias = Callable[[NDArray[Any]], NDArray[Any]]
-Cells: TypeAlias = NDArray[np.int32]  # (n, 3) the lowest sample of each
+At: TypeAlias = Callable[[NDArray[Any]], Numbers]
+"""Takes indices of samples, (n, 3), and returns the values there, (n,)."""
 
 
 class DistanceFunction:
@@ -56,24 +48,29 @@ class DistanceFunction:
         If it is not callable; in a call, if it does not return one number for each point.
     """
 
-    def __init__(self, function: Callable[[Points], Any]) -> None:
+    def __init__(self, function: Callable[[Vectors], Any]) -> None:
         if not callable(function):
             raise OptionTypeError(f"function is {seen(function)}: give a function of points (n, 3)")
         self.function, self.evaluations = function, 0
 
-    def __call__(self, points: Points) -> Numbers:
+    def __call__(self, points: Vectors) -> Numbers:
         """Return the distances at points (n, 3), (n,)."""
         found = [np.zeros(0)]
         for start in range(0, len(points), BATCH):
             batch = points[start : start + BATCH]
             self.evaluations += len(batch)
-            values = as_numbers(self.function(batch))
-            if values.size != len(batch):
-                raise OptionTypeError(
-                    f"the function returns an array of shape {values.shape} for {len(batch)} "
-                    "points: return one number for each"
-                )
-            found.append(values.reshape(-1))
+            values = self.function(batch)
+            try:
+                array = np.asanyarray(without_device(values))
+                if array.dtype.kind not in "fiub" and array.dtype.name != "bfloat16":
+                    raise TypeError  # float64 would take None for NaN
+                array = np.ma.filled(array.astype(np.float64), np.nan)  # what is masked is unknown
+                found.append(array.reshape(len(batch)))
+            except (TypeError, ValueError):
+                shape = tuple(getattr(values, "shape", ()))
+                said = f"an array of shape {shape}" if shape else seen(values)
+                said += f" for {len(batch)} points: return a real number for each"
+                raise OptionTypeError(f"the function returns {said}") from None
         return np.concatenate(found)
 
     def sample(self, bounds: ArrayLike, spacing: ArrayLike, reach: float | None = None) -> SdfGrid:
@@ -99,26 +96,31 @@ class DistanceFunction:
         GridError
             If no sample is inside, or none is outside; else as in ``make_grid``.
         """
-        low, high = corners_of(bounds)
+        try:
+            low, high = (np.array(as_triple(corner, "bounds")) for corner in cast(Any, bounds))
+            if not (low < high).all():
+                raise ValueError
+        except (TypeError, ValueError):
+            give = "(lowest, highest), numbers or points, of a box that is not empty"
+            raise OptionError(f"bounds are {seen(bounds)}: give {give}") from None
         step = np.array(check_spacing(spacing))
-        shape = np.ceil((high - low) / step - 1e-9).astype(np.int64) + 1
-        if np.prod(shape.astype(float)) > MOST_SAMPLES:
+        shape = np.ceil((high - low) / step - 1e-9) + 1
+        if np.prod(shape) > MOST_SAMPLES:
             raise OptionError(f"spacing is {seen(spacing)}: the box takes more than 2^31 samples")
         reach = REACH * float(step.max()) if reach is None else reach
         if not isinstance(reach, Real) or not reach > 0:
             raise OptionError(f"reach is {seen(reach)}: give a number greater than 0, or infinity")
-
-        corners = self(low + step * (np.array(shape) - 1) * CORNERS)
+        corners = self(low + step * (shape - 1) * CORNERS)
         largest = np.abs(corners[np.isfinite(corners)]).max(initial=0)
         scale = largest if largest and not ORDINARY[0] < largest < ORDINARY[1] else 1.0
 
         def at(indices: NDArray[Any]) -> Numbers:
-            """Return the values at samples (n, 3) of the lattice, in numbers of usual size."""
-            return self(low + step * indices) / scale
+            return self(low + step * indices) / scale  # numbers of usual size
 
-        samples, cut = sample_near(at, tuple(shape), step, float(reach))
-        if not ((samples < 0).any() and (samples > 0).any()):  # it may be steeper than seen
-            samples, cut = sample_near(at, tuple(shape), step, np.inf)
+        for distance in (float(reach), np.inf):  # the function may be steeper than seen
+            samples, cut = sample_near(at, shape.astype(np.int32), step, distance)
+            if (samples < 0).any() and (samples > 0).any():
+                break
         known = samples[np.isfinite(samples)]
         if not len(known):
             raise GridError("the function has no finite value at any sample: give other bounds")
@@ -130,16 +132,16 @@ class DistanceFunction:
                 "bounds"
             )
         np.clip(samples, -cut, cut, out=samples)
-        make = partial(make_grid, samples, spacing=spacing, origin=low)
+        place: Any = {"spacing": spacing, "origin": low}
         try:
-            return make()
+            return make_grid(samples, **place)
         except GridError:  # the spacing is right: what contradicts it is no distance
             with suppress(GridError):
-                return make(field="smooth")
+                return make_grid(samples, **place, field="smooth")
             raise
 
 
-Function: TypeAlias = DistanceFunction | Callable[[Points], Any]
+Function: TypeAlias = DistanceFunction | Callable[[Vectors], Any]
 """A function of points; one that counts what it is asked, or any other."""
 
 
@@ -155,13 +157,10 @@ def sampled(
     spacing: ArrayLike | None,
     offset: float,
 ) -> SdfGrid:
-    """Return the grid, or samples of the function as far as an offset needs if there is none.
-
-    OptionError unless either a grid is given, or a function with bounds and spacing.
-    """
+    """Return the grid, or the samples that an offset needs of a function in bounds."""
     if grid is not None or function is None:
         if bounds is not None or spacing is not None:
-            raise OptionError("bounds and spacing are for a function without a grid: give that")
+            raise OptionError("bounds and spacing are those of a function's samples: give function")
         return check_grid(grid)
     if bounds is None or spacing is None:
         raise OptionError("a function needs bounds and spacing, or a grid of its samples")
@@ -169,66 +168,24 @@ def sampled(
     return function.sample(bounds, spacing, reach)
 
 
-def corners_of(bounds: ArrayLike) -> tuple[Points, Points]:
-    """Return the lowest and highest corners, (3,) each, of bounds; OptionError if there is none."""
-    try:
-        low, high = cast("Iterable[Any]", bounds)
-        corners = [np.array(as_triple(corner, "bounds")) for corner in (low, high)]
-    except (TypeError, ValueError, GridError):
-        raise OptionError(
-            f"bounds are {seen(bounds)}: give (lowest, highest), numbers or points"
-        ) from None
-    if not (corners[0] < corners[1]).all():
-        raise OptionError(f"bounds are {seen(bounds)}: the box is empty, give (lowest, highest)")
-    return corners[0], corners[1]
-
-
-def as_numbers(values: Any) -> Numbers:
-    """Return an array or a tensor of any library as float64."""
-    try:
-        array = np.asanyarray(without_device(values))
-        if array.dtype.kind not in "fiub" and array.dtype.name != "bfloat16":  # None is no NaN
-            raise TypeError
-        if hasattr(array, "mask"):  # what is masked is unknown
-            array = np.ma.filled(array.astype(np.float64), np.nan)
-        return np.asarray(array, np.float64)
-    except (TypeError, ValueError):
-        raise OptionTypeError(f"the function returns {seen(values)}: return numbers") from None
-
-
-def sample_near(
-    at: At, shape: tuple[int, ...], step: NDArray[Any], reach: float
-) -> tuple[FloatArray, float]:
+def sample_near(at: At, shape: IntArray, step: Numbers, reach: float) -> tuple[FloatArray, float]:
     """Return the samples of a function near its surface, and its value at ``reach`` from there.
 
     Cells of 8^3 spacings are asked first, then their eighths. A cell is left out, infinite with its
     sign, if even the steepest slope seen would not bring the values at its corners down to those of
     ``reach`` within it (Kalra and Barr, "Guaranteed ray intersections with implicit surfaces",
     1989).
-
-    Parameters
-    ----------
-    at : callable
-        Takes indices of samples, (n, 3), and returns the values there, (n,).
-    shape : three int
-        Samples along each axis.
-    step : array, (3,)
-        World distance between neighbouring samples along each axis.
-    reach : float
-        World distance from the surface; infinite for all samples.
     """
-    samples = np.full(shape, np.nan, np.float32)
-    last = np.array(shape, np.int32) - 1
-    cells = (STRIDE * np.argwhere(np.ones(-(-last // STRIDE), bool))).astype(np.int32)
-    stride, steepest = STRIDE, _steepest_at(samples, at, cells, step)
-    while len(cells):
+    samples, last = np.full(shape, np.nan, np.float32), shape - 1
+    cells = (STRIDES[0] * np.argwhere(np.ones(-(-last // STRIDES[0]), bool))).astype(np.int32)
+    steepest = _steepest_at(samples, at, cells, step)
+    for stride in STRIDES:
         sizes = np.minimum(stride, last - cells)  # on the border cells are smaller
-        _evaluate(samples, at, (cells + sizes * corner for corner in CORNERS))
-        if stride == 1:
-            break
         corners = [cells + sizes * corner for corner in CORNERS]
+        _evaluate(samples, at, corners)
         values = np.stack([samples[tuple(corner.T)] for corner in corners], 1)
-        rises = [np.diff(values.reshape(-1, 2, 2, 2), axis=axis) for axis in (1, 2, 3)]
+        with np.errstate(invalid="ignore"):  # between samples that were left out
+            rises = [np.diff(values.reshape(-1, 2, 2, 2), axis=axis) for axis in (1, 2, 3)]
         rise = np.stack([np.abs(each).max((1, 2, 3)) for each in rises], 1) / (sizes * step)
         slopes = np.sqrt((rise**2).sum(1))  # along each edge of a cell, and so in any direction
         steepest = max(steepest, float(slopes[np.isfinite(slopes)].max(initial=0)))
@@ -238,25 +195,25 @@ def sample_near(
             places = np.minimum(cells[far] + np.array(offset, np.int32), last)
             new = np.isnan(samples[tuple(places.T)])
             samples[tuple(places[new].T)] = np.copysign(np.inf, values[far, 0])[new]
-        stride //= 2
-        cells = (cells[~far, None] + stride * CORNERS).reshape(-1, 3)
+        cells = (cells[~far, None] + stride // 2 * CORNERS).reshape(-1, 3)
         cells = cells[(cells < last).all(1)]
+    _evaluate(samples, at, (cells + corner for corner in CORNERS))
     return samples, steepest * reach if steepest else np.inf
 
 
-def _steepest_at(samples: FloatArray, at: At, cells: Cells, step: NDArray[Any]) -> float:
+def _steepest_at(samples: FloatArray, at: At, cells: IntArray, step: Numbers) -> float:
     """Return the largest slope at the lowest samples of cells, by their neighbours on either side.
 
     Of the two slopes of a sample the lesser counts: beside a kink the other one is too large.
     """
     last, axes = np.array(samples.shape, np.int32) - 1, np.eye(3, dtype=np.int32)
-    sides = [[np.clip(cells + side * axis, 0, last) for axis in axes] for side in (-1, 1)]
-    _evaluate(samples, at, [cells, *sides[0], *sides[1]])
-    rises = [[samples[tuple(c.T)] - samples[tuple(cells.T)] for c in side] for side in sides]
+    beside = [np.clip(cells + side * axis, 0, last) for side in (-1, 1) for axis in axes]
+    _evaluate(samples, at, [cells, *beside])
     with np.errstate(invalid="ignore"):
-        slopes = [np.linalg.norm(np.stack(rise, 1) / step, axis=1) for rise in rises]
+        rises = [samples[tuple(places.T)] - samples[tuple(cells.T)] for places in beside]
+    slopes = np.linalg.norm(np.stack(rises, 1).reshape(-1, 2, 3) / step, axis=2)
     on_border = ((cells == 0) | (cells == last)).any(1)  # has no neighbour on one side
-    slope = np.where(on_border, np.maximum(*slopes), np.minimum(*slopes))
+    slope = np.where(on_border, slopes.max(1), slopes.min(1))
     return float(slope[np.isfinite(slope)].max(initial=0))
 
 

@@ -11,25 +11,18 @@ entry point ``pyvista.accessors`` of the package.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import pyvista
+from typing_extensions import Unpack
 
 from .. import SdfGrid, grid_from_image, reconstruct
-from ..errors import FileError, check_modules, how_to_install
-from ..options import AUTO, MesherName, Options, Quality, Values
+from ..errors import check_modules
+from ..options import MesherName, Options, Quality, Values
 
 if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
     from ..network.contract import Decoder
     from ..threads import Progress
-
-if not hasattr(pyvista, "register_dataset_accessor"):
-    raise FileError(
-        f"super_sdf.functions.pyvista needs PyVista 0.48 or later, this is {pyvista.__version__}: "
-        f"{how_to_install('pyvista')}"
-    )
 
 
 @pyvista.register_dataset_accessor("super_sdf", pyvista.ImageData)
@@ -73,7 +66,7 @@ class ImageAccessor:
         residuals: bool = False,
         offset: float = 0.0,
         cap: bool = True,
-        mesher: MesherName = AUTO,
+        mesher: MesherName = "auto",
         max_memory: int | None = None,
         progress: Progress | None = None,
         **values: Unpack[Values],
@@ -117,12 +110,10 @@ class ImageAccessor:
             max_memory=max_memory,
             progress=progress,
         )
-        faces: Any = mesh.faces  # PyVista takes them with any integers
-        surface = pyvista.PolyData.from_regular_faces(mesh.vertices, faces)
+        surface = pyvista.PolyData.from_regular_faces(mesh.vertices, cast(Any, mesh.faces))
         if residuals:
             from ..check import check_mesh
 
-            options = Options(offset=offset, max_memory=max_memory)
-            found = check_mesh(mesh, grid, options)
-            surface.point_data["residual"] = found.residuals_at(found.mesh.vertices)
+            found = check_mesh(mesh, grid, Options(offset=offset, max_memory=max_memory))
+            surface.point_data["residual"] = found.residuals_at(mesh.vertices)
         return surface

@@ -36,15 +36,15 @@ FLAT = 1e-6  # twice the area of triangles, in squared fine spacings, whose vert
 COMPARED, MOST_OTHER = 1000, 0.25  # samples at which function and grid are compared
 DISTANCES, HALVINGS = (0.5, 1.0, 2.0, 4.0), 10  # fine spacings to a surface farther off, and then
 ROUNDS = 4  # of steps along the gradient
-LEAST_SLOPE = 1e-9
 REACHED = 0.25  # of the value at the start, above which the surface is not in reach
-TURNED = 0.866  # cosine of 30 degrees
+TURNED = 0.96592  # cosine of 15 degrees: triangles at 30 are half of it from their mean
 LEAST_AREA = 0.02  # of triangles whose normals count, in squared fine spacings
 STAY = 1e-3  # weight of the vertex itself beside that of a plane, in least squares
 EXACT_TO = 2.0  # spacings from the surface: values that are cut off farther away are distances
 NEAR = 0.05  # fine spacings from the surface at which the planes' point is taken
 
 
+@np.errstate(invalid="ignore", over="ignore", divide="ignore")  # values may be infinite
 def put_on_zero(
     mesh: Mesh, function: DistanceFunction, grid: SdfGrid, factor: int, offset: float = 0.0
 ) -> Mesh:
@@ -54,27 +54,24 @@ def put_on_zero(
     """
     if offset and not grid.field.has_exact:
         raise OptionError(f"offset is {offset:g}: the function is no distance, leave it out")
-    fine, scale = grid.voxel_size / factor, unit_of(function, grid)
-    middle, kind = grid.to_world((np.array(grid.shape) - 1) / 2), mesh.vertices.dtype
+    fine, scale, shape = grid.voxel_size / factor, unit_of(function, grid), np.array(grid.shape)
+    middle, kind = grid.to_world((shape - 1) / 2), mesh.vertices.dtype
 
     def value(points: Vectors) -> Numbers:
         """Return values at points, both in fine spacings, so that slopes of distances are 1."""
         return (function(middle + fine * points) / scale - offset) / fine
 
-    def rounded(points: Vectors) -> Vectors:
-        """Return points as they will be written."""
-        return ((middle + fine * points).astype(kind) - middle) / fine
+    def written(points: Vectors) -> NDArray[Any]:
+        return (middle + fine * points).astype(kind)
 
     start = (mesh.vertices - middle) / fine
-    index, last = grid.to_index(mesh.vertices), np.array(grid.shape) - 0.5
-    margin = REACH / factor  # from the border of the grid, in spacings
-    free: BoolArray = np.all((index > margin - 0.5) & (index < last - margin), axis=1)
-    with np.errstate(invalid="ignore", over="ignore"):  # where the function is not finite
-        is_exact = np.abs(grid.field.exact).min() > EXACT_TO * grid.voxel_size
-        points = put_on_surface(value, start, mesh.faces, free, exact=is_exact)
-        points = put_on_edges(value, points, mesh.faces, free)
-    points = without_folds(points, start, mesh.faces, rounded)
-    return Mesh((middle + fine * points).astype(kind), mesh.faces)
+    from_border = shape / 2 - np.abs(grid.to_index(mesh.vertices) - (shape - 1) / 2)
+    free: BoolArray = np.all(from_border > REACH / factor, axis=1)
+    exact = np.abs(grid.field.exact).min() > EXACT_TO * grid.voxel_size
+    points = put_on_surface(value, start, mesh.faces, free, exact=exact)
+    points = put_on_edges(value, points, mesh.faces, free)
+    points = without_folds(points, start, mesh.faces, lambda p: (written(p) - middle) / fine)
+    return Mesh(written(points), mesh.faces)
 
 
 def unit_of(function: DistanceFunction, grid: SdfGrid) -> float:
@@ -82,14 +79,12 @@ def unit_of(function: DistanceFunction, grid: SdfGrid) -> float:
 
     OptionError if it has another side than many of the samples near the surface.
     """
-    values = grid.values
-    near = np.argwhere(np.abs(values) < 2 * grid.voxel_size)
+    near = np.argwhere(np.abs(grid.values) < 2 * grid.voxel_size)
     near = near[:: max(len(near) // COMPARED, 1)]
-    known = values[tuple(near.T)].astype(np.float64)
-    found = function(grid.to_world(near))
-    some = np.isfinite(found) & (known != 0)
-    ratio = float(np.median(found[some] / known[some])) if some.any() else 1.0
-    other = float(np.mean(found[some] / known[some] * np.sign(ratio) < 0)) if some.any() else 0.0
+    ratios = function(grid.to_world(near)) / grid.values[tuple(near.T)]
+    ratios = ratios[np.isfinite(ratios)]
+    ratio = float(np.median(ratios)) if len(ratios) else 1.0
+    other = np.count_nonzero(ratios * np.sign(ratio) < 0) / max(len(ratios), 1)
     if other > MOST_OTHER or ratio == 0:
         raise OptionError(
             f"function has another side than the grid at {other:.0%} of the samples near the "
@@ -102,18 +97,19 @@ def put_on_surface(
     value: Value, start: Vectors, faces: NDArray[Any], free: BoolArray, *, exact: bool
 ) -> Vectors:
     """Return points (n, 3), the ``free`` ones where the values are 0, if that is in reach."""
-    points, rows, normals = start.copy(), np.flatnonzero(free), vertex_normals(start, faces)
-    before, slope = value(start[rows]), np.ones(len(rows))
+    rows, normals = np.flatnonzero(free), np.repeat(face_normals(start, faces), 3, axis=0)
+    normals = unit(sums_at(faces.ravel(), normals, len(start)))[rows]
+    points, start = start.copy(), start[rows]
+    before, slope = value(start), np.ones(len(rows))
     if not exact:
-        slope = (value(start[rows] + STEP * normals[rows]) - before) / STEP
-    found, off = step_along(value, start[rows], before, normals[rows], slope)
+        slope = (value(start + STEP * normals) - before) / STEP
+    found, off = step_along(value, start, before, normals, slope)
     left = np.abs(off) > GOOD * np.abs(slope)
     if not exact:  # saturated values show from afar to half a spacing only where the surface is
-        far = np.flatnonzero(np.abs(off) > REACHED * np.abs(before))
-        points[rows[far]] = cross_over(value, start[rows[far]], before[far], normals[rows[far]])
-        left[far] = False
-    near = np.flatnonzero(left)
-    found[near], off[near] = step_down(value, start[rows[near]], before[near])
+        far = np.abs(off) > REACHED * np.abs(before)
+        points[rows[far]] = cross_over(value, start[far], before[far], normals[far])
+        left &= ~far
+    found[left], off[left] = step_down(value, start[left], before[left])
     reached = np.abs(off) <= REACHED * np.abs(before)
     points[rows[reached]] = found[reached]
     return points
@@ -127,10 +123,9 @@ def step_along(
     ``before`` are the values at the start. A Newton step with a ``slope`` along the direction, then
     a secant step from both values.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        way = np.clip(np.nan_to_num(-before / slope), -REACH, REACH)
-        after = value(start + way[:, None] * direction)
-        second = np.clip(np.nan_to_num(way - after * way / (after - before)), -REACH, REACH)
+    way = np.clip(np.nan_to_num(-before / slope), -REACH, REACH)
+    after = value(start + way[:, None] * direction)
+    second = np.clip(np.nan_to_num(way - after * way / (after - before)), -REACH, REACH)
     again = np.flatnonzero(np.abs(after) > GOOD * np.abs(slope))
     last = value(start[again] + second[again, None] * direction[again])
     closer = np.abs(last) < np.abs(after[again])
@@ -143,18 +138,17 @@ def cross_over(value: Value, start: Vectors, before: Numbers, normals: Vectors) 
 
     The surface is sought in doubled steps, to the side that the sign says, and then by halving.
     """
-    ways = -np.sign(before)[:, None] * normals
+    ways, points = -np.sign(before)[:, None] * normals, start.copy()
     low, high = np.zeros(len(start)), np.full(len(start), np.nan)
     for distance in DISTANCES:
-        left = np.flatnonzero(np.isnan(high))
-        crossed = value(start[left] + distance * ways[left]) * before[left] <= 0
-        high[left[crossed]], low[left[~crossed]] = distance, distance
+        rows = np.flatnonzero(np.isnan(high))
+        crossed = value(start[rows] + distance * ways[rows]) * before[rows] <= 0
+        high[rows[crossed]], low[rows[~crossed]] = distance, distance
     rows = np.flatnonzero(~np.isnan(high))
     for _ in range(HALVINGS):
         middle = (low[rows] + high[rows]) / 2
         crossed = value(start[rows] + middle[:, None] * ways[rows]) * before[rows] <= 0
         high[rows[crossed]], low[rows[~crossed]] = middle[crossed], middle[~crossed]
-    points = start.copy()
     points[rows] += (low[rows] + high[rows])[:, None] / 2 * ways[rows]
     return points
 
@@ -167,7 +161,7 @@ def step_down(value: Value, start: Vectors, before: Numbers) -> tuple[Vectors, N
     at, now = start.copy(), before.copy()
     for _ in range(ROUNDS):
         slopes = gradient(value, at, now)
-        way = np.clip(-now / np.maximum(length(slopes), LEAST_SLOPE), -REACH, REACH)
+        way = np.clip(np.nan_to_num(-now / length(slopes)), -REACH, REACH)
         shift = at + way[:, None] * unit(slopes) - start
         new = start + np.minimum(length(shift), REACH)[:, None] * unit(shift)
         there = value(new)
@@ -186,14 +180,12 @@ def put_on_edges(value: Value, points: Vectors, faces: NDArray[Any], free: BoolA
     known, beside = np.unique(other[pairs], return_inverse=True)
     normals = unit(gradient(value, points[known], value(points[known])))[beside]
     heights = dot(normals, points[known][beside] - points[rows][at])
-    matrix = np.zeros((len(rows), 3, 3)) + STAY * np.eye(3)
-    np.add.at(matrix, at, normals[:, :, None] * normals[:, None])
-    vector = np.zeros((len(rows), 3))
-    np.add.at(vector, at, heights[:, None] * normals)
+    squares = (normals[:, :, None] * normals[:, None]).reshape(-1, 9)
+    matrix = sums_at(at, squares, len(rows)).reshape(-1, 3, 3) + STAY * np.eye(3)
+    vector = sums_at(at, heights[:, None] * normals, len(rows))
     shift = np.linalg.solve(matrix, vector[..., None])[..., 0]
-    moved = points[rows] + shift
+    moved, points = points[rows] + shift, points.copy()
     better = (np.abs(value(moved)) < NEAR) & (np.abs(shift).max(1) < REACH)
-    points = points.copy()
     points[rows[better]] = moved[better]
     return points
 
@@ -204,10 +196,8 @@ def is_on_edge(points: Vectors, faces: NDArray[Any]) -> BoolArray:
     large = length(normals) > 2 * LEAST_AREA
     corners, normals = faces[large].ravel(), np.repeat(unit(normals[large]), 3, axis=0)
     mean = unit(sums_at(corners, normals, len(points)))
-    # Two that turn by an angle are at most half of it from their mean.
-    least = np.ones(len(points))
-    np.minimum.at(least, corners, dot(normals, mean[corners]))
-    turned: BoolArray = least < np.sqrt((1 + TURNED) / 2)
+    turned: BoolArray = np.zeros(len(points), bool)
+    turned[corners[dot(normals, mean[corners]) < TURNED]] = True
     return turned
 
 
@@ -231,10 +221,8 @@ def without_folds(
         back = back[(points[back] != before[back]).any(1)]
         if not len(back):
             break
-        way = 0.5 if turn < HALF_WAY else 1.0
-        points[back] += way * (before[back] - points[back])
-        suspect = np.zeros(len(points), bool)
-        suspect[back] = True
+        points[back] += (0.5 if turn < HALF_WAY else 1.0) * (before[back] - points[back])
+        suspect = np.isin(np.arange(len(points)), back)
     return points
 
 
@@ -261,9 +249,3 @@ def overlapping_in_plane(points: Vectors, first: NDArray[Any], second: NDArray[A
 def gradient(value: Value, points: Vectors, values: Numbers) -> Vectors:
     """Return the gradient at points (n, 3) with values (n,), by forward differences."""
     return np.stack([(value(points + STEP * axis) - values) / STEP for axis in np.eye(3)], 1)
-
-
-def vertex_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
-    """Return unit normals at points (n, 3), means of the triangles' weighted by their areas."""
-    normals = np.repeat(face_normals(points, faces), 3, axis=0)
-    return unit(sums_at(faces.ravel(), normals, len(points)))

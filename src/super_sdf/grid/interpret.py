@@ -15,8 +15,18 @@ from numpy.typing import ArrayLike
 
 from ..arrays import Triple
 from ..errors import GridError
-from ..options import AUTO, DISTANCE, MASK, NOISY, SMOOTH, Options
-from .look import Extremes, Floats, Look, border_share, look_at, named, typical_slope, which_level
+from ..options import Options
+from .look import (
+    Extremes,
+    Floats,
+    Look,
+    as_labels,
+    border_share,
+    look_at,
+    named,
+    typical_slope,
+    which_level,
+)
 from .recognise import Answer, recognise
 from .samples import (
     LEAST_SPACING,
@@ -48,10 +58,10 @@ ORDINARY = 1e-100, 1e100  # sizes whose squares are numbers, too
 class Field:
     """What the values of a grid are, and what the steps may do with them."""
 
-    kind: str = DISTANCE
+    kind: str = "distance"
     given: bool = False  # whether the user said so; otherwise it was recognised
     exact: Extremes = (-np.inf, np.inf)  # samples between these may be exact, negative inside
-    network: str | None = DISTANCE  # that refines them; None: their own cubic spline is the field
+    network: str | None = "distance"  # that refines them; None: their own cubic spline is the field
     own_lattice: bool = False  # refined on the lattice of the samples, in steps of the finest one
     sides_only: bool = False  # only on which side the samples are is known
     has_jumps: bool = False  # where the spline would swing, values are interpolated linearly
@@ -84,7 +94,7 @@ class Case:
 
     def choose_side(self) -> bool:
         """Whether values are positive inside; unless it is said, the border is outside."""
-        if self.wanted.inside != AUTO:
+        if self.wanted.inside != "auto":
             return self.wanted.inside == "positive"
         if self.look.is_one_sided:
             return self.look.low < 0
@@ -129,10 +139,10 @@ def interpret(
     steps = None if spacing is None else check_spacing(spacing)
     check_kind(samples.dtype, samples.shape)
     notes: list[str] = []
-    if wanted.inside == AUTO and (wanted.label is not None or wanted.level is not None):
+    if wanted.inside == "auto" and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
     if wanted.label is not None:
-        samples = labelled(samples, wanted.label)
+        samples = labelled(as_labels(samples), wanted.label)
     if wanted.unknown is not None and samples.dtype.kind != "b":
         value = wanted.unknown
         samples = changed(samples, lambda planes: np.where(planes == value, np.nan, planes))
@@ -154,16 +164,16 @@ def interpret(
         check_infinite(samples)
     if wanted.level is not None:
         return _of_level(case, given)
-    if wanted.field == MASK:
+    if wanted.field == "mask":
         return _of_sides(case if look.is_finite else _with_known(case), {}, given)
     steps_given = None if steps is None else np.array(steps_of(steps))
     answer = Answer(wanted.field, "", {"cut": look.cut, "spacing": steps_given})
-    if wanted.field == AUTO:
+    if wanted.field == "auto":
         answer = recognise(samples, look, steps_given, hint)
     elif look.is_two:
-        answer = Answer(MASK, "there are two values", answer.facts)
+        answer = Answer("mask", "there are two values", answer.facts)
     if answer.refusal and not (
-        answer.kind == DISTANCE and wanted.inside != AUTO and look.is_one_sided
+        answer.kind == "distance" and wanted.inside != "auto" and look.is_one_sided
     ):
         raise _refused(answer, look, given if wanted.scale else None)
     return _as_recognised(case, answer, given)
@@ -200,11 +210,11 @@ def _as_recognised(case: Case, answer: Answer, given: SampleArray) -> dict[str, 
     wanted, facts = case.wanted, answer.facts
     if not case.look.is_finite or "unknown_values" in facts:
         case = _with_known(case, facts.get("unknown_values", ()))
-    if answer.kind == MASK:
+    if answer.kind == "mask":
         if "two values" not in answer.why:
             case.notes.append(f"the values are {answer.why}")
         return _of_sides(case, facts, given)
-    if answer.kind == SMOOTH:
+    if answer.kind == "smooth":
         if answer.why:
             case.notes.append(
                 f"values taken as smooth (--field smooth), since {answer.why}: the surface is that "
@@ -214,11 +224,11 @@ def _as_recognised(case: Case, answer: Answer, given: SampleArray) -> dict[str, 
     if case.spacing is None:
         case = replace(case, spacing=_estimated(case, facts))
     assert case.spacing is not None
-    if answer.kind == NOISY:
+    if answer.kind == "noisy":
         said = f", of about {facts['noise']:.2g} voxels" if "noise" in facts else ""
-        if wanted.field != NOISY:
+        if wanted.field != "noisy":
             case.notes.append(f"values taken as noisy (--field noisy): {answer.why}{said}")
-        return case.taken(case.spacing, Field(NOISY, exact=NONE_EXACT, network=NOISY), facts)
+        return case.taken(case.spacing, Field("noisy", exact=NONE_EXACT, network="noisy"), facts)
     if slope := facts.get("slope"):
         case.notes.append(
             f"the values change by {slope:.4g} of a spacing from sample to sample, distances by 1: "
@@ -273,7 +283,7 @@ def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
 def _of_sides(case: Case, facts: dict[str, Any], given: SampleArray) -> dict[str, Any]:
     """Return the mask that the sides of values make; 0 is on the side ``zeros``, else inside."""
     look, wanted, samples = case.look, case.wanted, case.samples
-    if look.is_two and 0 in (look.low, look.high) and wanted.inside == AUTO:
+    if look.is_two and 0 in (look.low, look.high) and wanted.inside == "auto":
         # the other value is inside, wherever it is
         case = replace(case, wanted=replace(wanted, inside="positive"))
         return _of_mask(case, changed(samples, partial(np.not_equal, 0), np.bool_), facts)
@@ -288,7 +298,7 @@ def _of_sides(case: Case, facts: dict[str, Any], given: SampleArray) -> dict[str
         spacing = case.spacing_or(facts["step"], "the step of the transform")
         case = replace(case, spacing=spacing)
     below, zeros = border_share(look, lambda x: x < 0), facts.get("zeros", 0)
-    is_positive = below > 0.5 if wanted.inside == AUTO else wanted.inside == "positive"
+    is_positive = below > 0.5 if wanted.inside == "auto" else wanted.inside == "positive"
     with_zeros = look.high == 0 or zeros > 0 or (look.low < 0 and zeros == 0 and is_positive)
     above = partial(np.less_equal if with_zeros else np.less, 0)
     return _of_mask(case, changed(samples, above, np.bool_), facts)
@@ -299,7 +309,7 @@ def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None)
     from .derived import extremes_of_masks, mask_planes
 
     positive = case.wanted.inside == "positive"
-    if case.wanted.inside == AUTO:  # the border is outside
+    if case.wanted.inside == "auto":  # the border is outside
         above = float(look_at(mask).faces.mean())
         positive, share = above < 0.5, max(above, 1 - above)
         if share < 1:
@@ -322,7 +332,7 @@ def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None)
 def mask_field(spacing: Triple) -> Field:
     """Return what a mask is taken as."""
     own = not is_cubic(spacing)
-    return Field(MASK, exact=NONE_EXACT, network=MASK, sides_only=True, own_lattice=own)
+    return Field("mask", exact=NONE_EXACT, network="mask", sides_only=True, own_lattice=own)
 
 
 # Densities, and fields with the surface of their spline
@@ -337,7 +347,7 @@ def _of_level(case: Case, given: SampleArray) -> dict[str, Any]:
             f"no value is {'above' if look.high <= 0 else 'below'} the level {wanted.level:g} "
             f"(they go from {before.low:.6g} to {before.high:.6g}): {which_level(before)}"
         )
-    if look.is_two or wanted.field == MASK:
+    if look.is_two or wanted.field == "mask":
         return _of_mask(case, changed(case.samples, partial(np.less, 0), np.bool_))
     if not look.is_finite:
         case = _with_known(case)
@@ -346,7 +356,7 @@ def _of_level(case: Case, given: SampleArray) -> dict[str, Any]:
 
 
 def _of_spline(
-    case: Case, facts: dict[str, Any], given: SampleArray, kind: str = SMOOTH
+    case: Case, facts: dict[str, Any], given: SampleArray, kind: str = "smooth"
 ) -> dict[str, Any]:
     """Return values in steps of their slope beside the surface, to be meshed by their spline."""
     if case.look.is_one_sided:
@@ -359,7 +369,7 @@ def _of_spline(
         exact=NONE_EXACT,
         network=None,
         own_lattice=not is_cubic(spacing),
-        has_jumps=bool(facts.get("cut")) and kind == SMOOTH,
+        has_jumps=bool(facts.get("cut")) and kind == "smooth",
     )
     extremes = case.look.low / slope, case.look.high / slope
     values: SampleArray = changed(case.samples, lambda planes: planes / slope)

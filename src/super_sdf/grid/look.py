@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
-from .samples import SampleArray, let_go
+from .samples import SampleArray, changed, let_go, over_three
 
 Floats: TypeAlias = NDArray[np.float64]
 Extremes: TypeAlias = tuple[float, float]
@@ -35,11 +35,13 @@ MOST_OUTSIDE = 0.65  # of the border, above a level: maps of noise to .55, dista
 MOST_NAMED = 8  # labels that a message lists
 TRIED = 4096  # samples whose different values are counted first
 BENT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
+NEARLY, FACTOR = 1e-3, 0.05  # off whole numbers, and from 1: nibabel 2e-10, atlases .012
 GOLDEN = 0.6180339887  # its multiples, less whole numbers, are spread evenly from 0 to 1
 
 AXES = np.array([[0, 0, 0], *np.kron(np.eye(3, dtype=int), [[-2], [-1], [1], [2]])])
 ON_LINES = np.array([[1, 2, 0, 3, 4], [5, 6, 0, 7, 8], [9, 10, 0, 11, 12]])
-FACES_OF_5 = np.array([(1, 2, 2), (3, 2, 2), (2, 1, 2), (2, 3, 2), (2, 2, 1), (2, 2, 3)])
+FACES_OF_3 = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
+FACES_OF_5 = FACES_OF_3 + 1
 BOX = np.indices((5, 5, 5)).reshape(3, -1).T - 2
 
 
@@ -265,6 +267,27 @@ def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int
     return kept, np.array([counts[value] for value in values], np.int64)
 
 
+def whole_factor(values: Floats) -> float:
+    """Return the factor near 1 by which values are whole numbers, 0 if they are not."""
+    some = values[np.abs(values) > NEARLY]
+    if not len(some) or np.abs(some).max() < 1 - FACTOR:
+        return 0.0
+    least = float(np.abs(some).min())
+    factor = least / max(round(least), 1)
+    off = np.abs(some / factor - np.rint(some / factor))
+    is_whole = (off <= np.maximum(NEARLY, 1e-9 * np.abs(some))).all()
+    return factor if abs(factor - 1) <= FACTOR and is_whole else 0.0
+
+
+def as_labels(samples: SampleArray) -> SampleArray:
+    """Return labels that were stored as floats as whole numbers, NaN as 0; others as they are."""
+    found = different_values(samples) if samples.dtype.kind == "f" else None
+    factor = 0.0 if found is None else whole_factor(found[0].astype(np.float64))
+    if not factor:
+        return samples
+    return changed(samples, lambda planes: np.where(np.isnan(planes), 0, np.rint(planes / factor)))
+
+
 def count_valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
     """Count valleys of slope, sign * values above 0, where 0 is near and the sign does not change.
 
@@ -280,6 +303,25 @@ def count_valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
         low = (x >= 0) & (x < 0.52) & (before > x) & ((after > x) | ((after == x) & (x > 0.25)))
         count += int(np.count_nonzero(low & (before + after - 2 * x > 0.9)))
     return count, changes
+
+
+def side_of_zeros(look: Look) -> int:
+    """Return the side of samples that are 0: that which has none of its own beside some of them."""
+    zeros, sides = look.part == 0, (look.part < 0, look.part > 0)
+    lone = [np.count_nonzero(zeros & ~over_three(side, np.logical_or)) for side in sides]
+    return int(np.sign(lone[1] - lone[0]))
+
+
+def counted_steps(boxes: Floats) -> float:
+    """Return of how many samples of size 2 the least of 26, or 6, neighbours has size 1; a share.
+
+    It is 1 where values count steps to the surface, as chessboard and city-block distances do.
+    """
+    size = np.nan_to_num(np.abs(boxes), nan=np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(size, (3, 3, 3), axis=(1, 2, 3))
+    around = windows[size[:, 1:4, 1:4, 1:4] == 2].reshape(-1, 27)
+    of_six = around[:, np.ravel_multi_index(FACES_OF_3.T, (3, 3, 3))]
+    return max(float((x.min(1) == 1).mean()) for x in (around, of_six)) if len(around) else 1.0
 
 
 def parting_level(values: Floats) -> float:
@@ -369,7 +411,7 @@ def which_level(look: Look, *, signed: bool = False) -> str:
 
 def which_label(samples: SampleArray) -> str:
     """Return the advice to choose a label: the most frequent that is not the border's."""
-    found = different_values(samples)
+    found = different_values(as_labels(samples))
     if found is None:
         return "they are labels: choose one with --label, or some with --labels"
     distinct, counts = found

@@ -24,29 +24,31 @@ import numpy as np
 
 from .look import (
     BOX,
+    FACES_OF_3,
     Floats,
     Look,
     border_share,
     count_valleys,
+    counted_steps,
     different_values,
     equal_neighbours,
     last_digit,
     parting_level,
+    side_of_zeros,
     smooth_gradients,
     steps_by_axis,
     typical_slope,
     which_label,
     which_level,
+    whole_factor,
 )
-from .samples import SampleArray, over_three
+from .samples import SampleArray
 
 # 2. Labels: share of the samples off the background that equal 4 or more of their 6 neighbours; of
-# neighbours that differ, how many by one rank; by how much labels may be off whole numbers, and
-# whole numbers off those that are stored.
+# neighbours that differ, how many by one rank.
 PLATEAUS = 0.45  # whole images and integer distances to .43, labels from .55
 BY_RANK = 0.99  # integer distances 1, labels to .97, but where one is in the other
 AMID = 0.1  # of these the share that equal all 6: distances 0, labels inside others .3 and more
-NEARLY, FACTOR = 1e-3, 0.05
 FEW_LABELS = 8  # different values: rounded distances and images from 11, lesions and organs to 8
 # 3. Transforms: share of the samples beside the surface that equal others with the same 27 signs.
 # Values that do not jump over 0 need the steps of a mask: a share of these samples with other sides
@@ -57,6 +59,7 @@ ZEROS = 0.25  # share of samples at 0 beside the surface: sides that start at 0 
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
 NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
 ROUGH = 1.0  # fourth differences over slopes: lattices of short periods to .5, transforms from 4.7
+COUNTED = 0.99  # whole numbers one step apart: transforms 1, rounded distances to .976
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
 # 4. Unknown samples: steps to a frequent value over the steepest ones; how many of them jump.
 JUMP = 1.5  # cut off 1.0, sentinels from 2
@@ -97,7 +100,6 @@ VALLEY = 0.2, 1.5  # unsigned distances .3 to .6; densities .05, noise 3
 ENOUGH = 20  # samples from which a share is evidence
 
 CENTRE_OF_5 = 62  # of the samples in a box of 5 x 5 x 5
-FACES_OF_3 = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
 TRANSFORM = "a distance transform, so only their sign says something"
 
 
@@ -126,7 +128,7 @@ def recognise(
     follow = not hint and _follow_from_signs(look, given, facts)
     is_sure = follow and (facts["shape"] >= FOLLOW or facts["zeros"] >= ZEROS)
     if (is_sure and facts["stepped"]) or (follow and _jump_over_0(look)):
-        return Answer("mask", TRANSFORM, facts | {"zeros": _side_of_zeros(look)})
+        return Answer("mask", TRANSFORM, facts | {"zeros": side_of_zeros(look)})
     signs = look
     look = _without_sentinels(look, facts)
     unit = _unit_of_distances(look, given, facts)
@@ -137,7 +139,7 @@ def recognise(
         if (unit := _unit_of_distances(others, given, known)) is not None:
             return _distances(others, unit, given, known)
     if follow and facts["stepped"]:
-        return Answer("mask", TRANSFORM, facts | {"zeros": _side_of_zeros(signs)})
+        return Answer("mask", TRANSFORM, facts | {"zeros": side_of_zeros(signs)})
     if hint == "density":
         return Answer("density", "", facts, which_level(look))
     if look.is_one_sided:
@@ -157,10 +159,10 @@ def recognise(
 
 
 def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool:
-    if look.infinite or not _are_whole(look.pairs.ravel()):
+    if look.infinite or not whole_factor(look.pairs.ravel()):
         return False
     found = different_values(samples)
-    if found is None or not _are_whole(found[0].astype(np.float64)):
+    if found is None or not whole_factor(found[0].astype(np.float64)):
         return False
     distinct, counts = found
     ranks = np.abs(np.diff(np.searchsorted(distinct, look.pairs), axis=0))
@@ -175,18 +177,6 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
     facts["plateaus"] = float((equal >= 4).mean()) if len(equal) else 1.0
     few = len(distinct) <= FEW_LABELS and look.low >= 0
     return bool(few or facts["plateaus"] >= PLATEAUS)
-
-
-def _are_whole(values: Floats) -> bool:
-    """Return whether all values but 0 are whole numbers, times one factor near 1."""
-    some = values[np.abs(values) > NEARLY]
-    if not len(some) or np.abs(some).max() < 1 - FACTOR:
-        return False
-    least = np.abs(some).min()
-    factor = least / max(np.rint(least), 1)
-    some = some / factor
-    off = np.abs(some - np.rint(some)) <= np.maximum(NEARLY, 1e-9 * np.abs(some))
-    return bool(abs(factor - 1) <= FACTOR and off.all())
 
 
 def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
@@ -224,6 +214,8 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
             facts.update(follow=share, shape=shape, stairs=stairs, step=typical)
             is_many = patterns > min(PATTERNS, OF_ALL * most)
             facts["stepped"] = stairs > STAIRS and is_many and len(cut) < 2
+    if facts["zeros"] and facts.get("by_rank", 0) >= BY_RANK:  # rounded distances may be so, too
+        return counted_steps(look.boxes) >= COUNTED
     if facts["follow"] < FOLLOW or (look.is_one_sided and _fades_out(look, given, facts)):
         return False
     rough = np.abs(np.diff(look.box_lines, 4)[..., 0]).sum(1)
@@ -252,13 +244,6 @@ def _jump_over_0(look: Look) -> bool:
     one, other = look.pairs
     size, over = np.abs(one - other), (one > 0) != (other > 0)
     return bool(over.sum() > ENOUGH and size[over].min() > JUMPS * size[~over].max(initial=0))
-
-
-def _side_of_zeros(look: Look) -> int:
-    """Return the side of samples that are 0: that which has none of its own beside some of them."""
-    zeros, sides = look.part == 0, (look.part < 0, look.part > 0)
-    lone = [np.count_nonzero(zeros & ~over_three(side, np.logical_or)) for side in sides]
-    return int(np.sign(lone[1] - lone[0]))
 
 
 # Question 4: unknown samples
@@ -308,10 +293,7 @@ def _unit_of_distances(look: Look, given: Floats | None, facts: dict[str, Any]) 
 
 
 def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> Any:
-    """Return how much values change from sample to sample, by axis if they differ; None if unclear.
-
-    It is the commonest slope of the smooth samples; with a spacing it is in this, 1 for distances.
-    """
+    """Return the commonest slope, per sample or spacing, by axis if they differ, or None."""
     gradients, fourth = smooth_gradients(inner)
     facts["smooth"] = len(gradients) / max(len(inner), 1)
     facts["slopes"] = 0.0
@@ -436,7 +418,7 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
     values = values[np.isfinite(values)]
     digit = float(np.diff(values).min())
     if np.ptp(values) < IMAGE * digit:
-        steps = _before_rounding(look, digit, given)
+        steps = _before_rounding(look, digit, given, facts)
         if steps is not None:
             facts["noise"] = digit / float(steps.max()) / 12**0.5  # standard deviation
             why = f"distances rounded to {digit:.3g}"
@@ -456,9 +438,13 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
     return Answer("smooth", "the slope is not that of a distance everywhere", facts)
 
 
-def _before_rounding(look: Look, digit: float, given: Floats | None) -> Floats | None:
+def _before_rounding(
+    look: Look, digit: float, given: Floats | None, facts: dict[str, Any]
+) -> Floats | None:
     """Return the steps of distances that were rounded to a digit; None if these are none."""
     steps = np.ones(3) if given is None else given
+    if facts.get("by_rank", 0) >= BY_RANK and abs(steps.max() - 1) < SLOPE_OFF:
+        return steps  # whole numbers, of neighbours one apart
     slope = typical_slope(look, steps)
     if given is None:
         steps = steps * slope

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
-from ..options import AUTO, DISTANCE, NOISY, FieldKind, Inside, Options
+from ..options import FieldKind, Inside, Options
 from .interpret import NONE_EXACT, Field, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
 from .samples import (
@@ -150,7 +150,7 @@ class SdfGrid:
         low, high = extremes
         axes, field = check_direction(direction), field or Field()
         if is_sheared(axes) and not field.own_lattice:
-            if field.network in (DISTANCE, NOISY):
+            if field.network in ("distance", "noisy"):
                 raise GridError(
                     f"direction is {in_rows(axes)}: its axes are not at right angles, and there "
                     "distances are not refined; resample the grid, or mesh the spline of the "
@@ -250,8 +250,8 @@ def make_grid(
     spacing: ArrayLike | None = None,
     origin: ArrayLike | None = None,
     direction: ArrayLike | None = None,
-    inside: Inside = AUTO,
-    field: FieldKind = AUTO,
+    inside: Inside = "auto",
+    field: FieldKind = "auto",
     label: int | None = None,
     level: float | None = None,
     scale: float | None = None,

@@ -15,21 +15,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 
 from ..arrays import CORNERS, IntArray
-from ..surface.cell_cases import EDGE_BETWEEN, segments, triangulate
-from ..surface.marching import EDGE_AXIS, EDGE_START, FACES
+from ..surface.cell_cases import EDGE_BETWEEN, triangulate
+from ..surface.marching import FACES
 
 # The numbers of points: first those of the twelve edges, then those on faces, then in the cell.
 FACE_POINTS, CELL_POINTS, MOST_POINTS = 12, 18, 26
-ON_EDGES = 2 * CORNERS[list(EDGE_START)] + np.eye(3, dtype=np.int32)[list(EDGE_AXIS)]
+EDGE_ENDS = np.array([sorted(ends) for ends in EDGE_BETWEEN]).T  # corners, (2, 12)
 ON_FACES = [CORNERS[list(face)].sum(0) // 2 for face in FACES]
-IN_CELL = np.ones((MOST_POINTS - CELL_POINTS, 3), np.int32)
+IN_CELL = np.ones((MOST_POINTS - CELL_POINTS, 3), int)
 # Where the points are in a cell of two steps along each axis, (26, 3).
-PLACES: IntArray = np.concatenate([ON_EDGES, ON_FACES, IN_CELL]).astype(np.int32)
+PLACES = np.concatenate([CORNERS[EDGE_ENDS].sum(0), ON_FACES, IN_CELL])
 
 Segment = tuple[int, int, int, int]
 """Two points, and the labels inside and outside: the higher is inside, counter-clockwise."""
@@ -41,43 +40,14 @@ Sides = dict[tuple[int, int], int]
 def walls_of_cell(ranks: int, joined: int) -> IntArray:
     """Return the triangles of a case, (n, 5): three points, and a corner on either side.
 
-    Of ``ranks`` three bits are for each corner: how many labels at corners are lower. ``joined``
+    Of ``ranks`` three bits are for each corner: how many corners have a lower label. ``joined``
     has a bit for each face with two labels at the ends of its diagonals: whether it joins those of
     the higher. Triangles are counter-clockwise seen from the second corner, whose label is lower.
     A point in the cell is the last of its triangle.
     """
     label = [ranks >> 3 * corner & 7 for corner in range(8)]
     rows = [row for n in range(6) for row in _segments_on(n, label, joined >> n & 1)]
-    faces = [(*abc, label.index(high), label.index(low)) for *abc, high, low in _triangles(rows)]
-    return np.array(faces, np.int32).reshape(-1, 5)
-
-
-def _segments_on(n: int, label: list[int], joined: int) -> Iterator[Segment]:
-    """Yield the segments on a face of a cell with these labels at its corners."""
-    of = [label[corner] for corner in FACES[n]]
-    edge = [EDGE_BETWEEN[frozenset((FACES[n][at - 1], FACES[n][at]))] for at in range(4)]
-    if len(set(of)) == 2:
-        inside = tuple(int(x == max(of)) for x in of)
-        for start, end in segments(n, inside, joined).items():
-            yield start, end, max(of), min(of)
-        return
-    if of[0] == of[2] or of[1] == of[3]:
-        first = int(of[0] == of[2])  # the first corner that is cut off
-        cut = (first, first + 2) if len(set(of)) > 2 else ()
-        found = [(edge[at], edge[(at + 1) % 4], of[at], of[at - 1]) for at in cut]
-    else:
-        found = [
-            (edge[at], FACE_POINTS + n, of[at], of[at - 1])
-            for at in range(4)
-            if of[at] != of[at - 1]
-        ]
-    for start, end, one, other in found:
-        yield (start, end, one, other) if one > other else (end, start, other, one)
-
-
-def _triangles(rows: list[Segment]) -> Iterator[tuple[int, ...]]:
-    """Yield triangles, and the labels inside and outside, of the segments on a cell."""
-    free = CELL_POINTS
+    found, free = list[tuple[int, ...]](), iter(range(CELL_POINTS, MOST_POINTS))
     while rows:
         loop, points, some = [rows[-1][0]], {rows[-1][0]}, []
         while more := [row for row in rows if points & set(row[:2])]:  # all that hang together
@@ -85,53 +55,70 @@ def _triangles(rows: list[Segment]) -> Iterator[tuple[int, ...]]:
             points |= {point for row in more for point in row[:2]}
             rows = [row for row in rows if row not in more]
         if max(points) >= FACE_POINTS:
-            made = list(_joined(some, free))
-            free = 1 + max(third for _, _, third, *_ in made)
-            yield from made
+            found += _joined(some, free)
             continue
         after = {start: end for start, end, *_ in some}
         while (point := after[loop[-1]]) != loop[0]:
             loop.append(point)
-        yield from ((*triangle, *some[0][2:]) for triangle in triangulate(tuple(loop)))
+        found += [(*triangle, *some[0][2:]) for triangle in triangulate(tuple(loop))]
+    faces = [(*abc, label.index(high), label.index(low)) for *abc, high, low in found]
+    return np.array(faces, np.int32).reshape(-1, 5)
 
 
-def _joined(rows: list[Segment], point: int) -> Iterator[tuple[int, ...]]:
-    """Yield the triangles of segments that are joined to points in the cell, from ``point`` on."""
+def _segments_on(n: int, label: list[int], joined: int) -> Iterator[Segment]:
+    """Yield the segments on a face of a cell with these labels at its corners."""
+    a, b, c, d = of = [label[corner] for corner in FACES[n]]
+    edge = [EDGE_BETWEEN[frozenset((FACES[n][at - 1], FACES[n][at]))] for at in range(4)]
+    crossed = [at for at in range(4) if of[at] != of[at - 1]]
+    if a == c or b == d:  # two corners are joined, and each of the others is cut off
+        first = int(a == c and (b != d or (b > a) != joined))
+        cut = sorted((first, first + 2), key=lambda at: (at + joined) % 4)
+        found = [(edge[at], edge[(at + 1) % 4], at) for at in cut if at in crossed]
+    elif len(crossed) == 2:
+        found = [(edge[crossed[0]], edge[crossed[1]], crossed[0])]
+    else:
+        found = [(edge[at], FACE_POINTS + n, at) for at in crossed]
+    for start, end, at in found:
+        one, other = of[at], of[at - 1]
+        yield (start, end, one, other) if one > other else (end, start, other, one)
+
+
+def _joined(rows: list[Segment], free: Iterator[int]) -> Iterator[tuple[int, ...]]:
+    """Yield triangles, and the labels beside them, that join segments to ``free`` points."""
     sides: Sides = {}
     for start, end, one, other in rows:
         sides[start, end], sides[end, start] = one, other
     while region := _region_to_cut(sides):
-        around = list(zip(region, region[1:] + region[:1]))
-        inside, beside = sides[around[0]], [sides[end, start] for start, end in around]
-        for (start, end), outside in zip(around, beside):
+        inside, point = sides[region[0]], next(free)
+        beside = [sides[end, start] for start, end in region]
+        for at, (start, end) in enumerate(region):
+            outside, before = beside[at], beside[at - 1]
             del sides[start, end], sides[end, start]
             ends = (start, end) if inside > outside else (end, start)
             yield (*ends, point, max(inside, outside), min(inside, outside))
-        # what is left beside the region meets at its point
-        for at, outside in enumerate(beside):
-            if beside[at - 1] != outside:
-                sides[point, region[at]], sides[region[at], point] = outside, beside[at - 1]
-        point += 1
+            if before != outside:  # what is left beside the region meets at its point
+                sides[point, start], sides[start, point] = outside, before
+    point = next(free)
     for (start, end), one in sides.items():
         if one > (other := sides[end, start]):
             yield start, end, point, one, other
 
 
-def _region_to_cut(sides: Sides) -> list[int] | None:
-    """Return the points round the smallest region that has to be cut off, and can be."""
+def _region_to_cut(sides: Sides) -> list[tuple[int, int]]:
+    """Return the segments round the smallest region that has to be cut off, and can be, if any."""
     after = {(label, start): end for (start, end), label in sides.items()}
-    regions: dict[int, list[list[int]]] = {}
+    regions: dict[int, list[list[tuple[int, int]]]] = {}
     while after:
         (label, first), point = after.popitem()
-        region = [first]
+        region = [(first, point)]
         while point != first:
-            region.append(point)
-            point = after.pop((label, point))
+            region.append((point, after.pop((label, point))))
+            point = region[-1][1]
         regions.setdefault(label, []).append(region)
     several = [region for some in regions.values() if len(some) > 1 for region in some]
     for region in sorted(several, key=len):
-        beside = [sides[end, start] for start, end in pairwise([*region, region[0]])]
+        beside = [sides[end, start] for start, end in region]
         runs = sum(beside[at - 1] != outside for at, outside in enumerate(beside))
         if runs == len(set(beside)) > 1:
             return region
-    return None
+    return []

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,14 +21,14 @@ from typing import Any, NamedTuple
 from ..errors import FileError, MeshError, OptionError, flag
 from ..files.formats import check_regular_file, files_of
 from ..files.grids import names_in
-from ..files.meshes import World, check_mesh_suffix, check_target, has_parts, write_meshes
-from ..files.output import check_apart
-from ..files.readers import PLACE
-from ..grid.sdf_grid import SdfGrid, describe_place
+from ..files.meshes import World, check_mesh_suffix, has_parts, write_meshes
+from ..files.output import check_apart, check_free
+from ..files.readers import PLACE, Names as Names
+from ..grid.sdf_grid import describe_place
 from ..network.contract import Decoder
-from ..options import ALL, LABELS, MARCHING, OPTIONS, Options
+from ..options import LABELS, OPTIONS, Options
 from ..surface.mesh import Mesh
-from ..threads import Progress, Stopwatch
+from ..threads import Progress, Steps
 from .reconstruct import find_image, in_order, label_meshes
 from .volumes import volume_notes
 
@@ -38,26 +38,11 @@ RGB = r"(?:[ \t,;]+(\d{1,3})[ \t,;]+(\d{1,3})[ \t,;]+(\d{1,3})(?:[ \t,;].*)?|[\t
 LINE = re.compile(rf'^[ \t]*([-+]?\d+)[ \t,;]+"?([^",;\t\n]*?)"?{RGB}[ \t]*$', re.MULTILINE)
 
 
-class LabelName(NamedTuple):
-    """A name, and a colour in red, green and blue from 0 to 255 if the table has one."""
-
-    name: str
-    colour: tuple[int, int, int] | None = None
-
-
-Names = dict[int, LabelName]
-
-
 class LabelConversion(NamedTuple):
     """The result of a conversion of a label image, as ``convert.Conversion`` of one mesh."""
 
-    grid: SdfGrid
     facts: dict[str, Any]  # as ``--json`` has them
     seconds: dict[str, float]  # per stage
-
-    def report(self) -> dict[str, Any]:
-        """Return the result as a dictionary that can be written as JSON."""
-        return self.facts
 
 
 def convert_labels(
@@ -79,55 +64,50 @@ def convert_labels(
     the errors are those of ``convert``; options besides ``options.LABELS`` must have their
     defaults.
     """
-    watch, options = Stopwatch(), options or Options()
-    known = names or {n: LabelName(*each) for n, each in names_in(source).items()}
-    options = with_numbers(replace(options, labels=options.labels or ALL), known)
+    watch, options, known = Steps(), options or Options(), names or names_in(source)
+    options = with_numbers(replace(options, labels=options.labels or "all"), known)
     check_mesh_suffix(Path(target), options.unit)
-    wanted, place = in_order(options.labels), {name: getattr(options, name) for name in PLACE}
-    image = find_image(source, wanted, place, options.axes, options.max_memory, options.space)
-    called, lacking = names_of(image.labels, known), names_of(image.missing, known)
+    image = find_image(source, options, [getattr(options, name) for name in PLACE], partly=True)
+    called, lacking = names_of(image.volumes, known), names_of(image.missing, known)
     paths = paths_of(Path(target), called, known)
-    for path in dict.fromkeys(paths):
-        check_target(path, force=force)
+    for path in set(paths):
+        check_free(path, force=force)
         check_apart(path, files_of(source))
     watch.lap("read")
     meshes, notes, warnings = label_meshes(image, network, options, progress)
     watch.lap("mesh")
     files: dict[Path, dict[str, Mesh]] = {path: {} for path in paths}
-    rows, colours = list[dict[str, Any]](), dict[str, tuple[int, int, int]]()
-    for path, (n, entry), mesh, volume in zip(paths, called.items(), meshes, image.volumes):
-        if mesh.open_edges():
-            raise MeshError(f"the mesh of label {n} is torn: run it again, and report it")
-        files[path][entry.name] = mesh
-        if entry.colour:
-            colours[entry.name] = entry.colour
-        row: dict[str, Any] = {"label": n, "name": entry.name, "output": str(path)}
-        row |= {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-        row |= {"volume": mesh.volume(), "components": mesh.components()[0], "closed": True}
-        rows.append({**row, "sample_volume": volume})
+    rows = list[dict[str, Any]]()
+    for (n, (name, _)), path, mesh in zip(called.items(), paths, meshes):
+        files[path][name] = mesh
+        row = {"label": n, "name": name, "output": str(path)}
+        rows.append(row | facts_of(mesh, n) | {"sample_volume": image.volumes[n]})
+    colours = {name: colour for name, colour in called.values() if colour}
     write_meshes(files, force=force, world=World(options.unit, image.grid.space, colours))
     watch.lap("write")
     if options.keep_volume:
         notes += volume_notes({row["name"]: (row["volume"], row["sample_volume"]) for row in rows})
-    if lacking:
-        listed = ", ".join(entry.name for entry in lacking.values())
-        notes.append(f"no sample has a label that was asked for: {listed}")
-    facts = {
-        **describe_place(image.grid),
-        "labels": rows,
-        "missing": [{"label": n, "name": entry.name} for n, entry in lacking.items()],
-        "closed": True,
-        "inferred": [*image.grid.notes, *notes],
-        "warnings": warnings,
-    }
-    return LabelConversion(image.grid, facts, watch.seconds)
+    missing = [{"label": n, "name": name} for n, (name, _) in lacking.items()]
+    listed = ", ".join(name for name, _ in lacking.values())
+    notes += [f"no sample has a label that was asked for: {listed}"] * bool(missing)
+    facts = {"labels": rows, "missing": missing, "closed": True, "warnings": warnings}
+    facts |= {"inferred": [*image.grid.notes, *notes], **describe_place(image.grid)}
+    return LabelConversion(facts, watch.seconds)
+
+
+def facts_of(mesh: Mesh, label: int) -> dict[str, Any]:
+    """Return what is known of a label's mesh, for JSON; MeshError unless it is closed."""
+    if mesh.open_edges():
+        raise MeshError(f"the mesh of label {label} is torn: run it again, and report it")
+    counts = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    return {**counts, "volume": mesh.volume(), "components": mesh.components()[0], "closed": True}
 
 
 def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
     """Return the file of each label: the target, if that holds several meshes, or its own."""
     if has_parts(target):
         return [target] * len(called)
-    ends = {n: called[n].name if n in known else str(n) for n in called}
+    ends = {n: name if n in known else str(n) for n, (name, _) in called.items()}
     ends = {n: re.sub(r"[^\w.-]+", "_", end).strip("._") or "label" for n, end in ends.items()}
     named = told_apart(ends, "-").values()
     return [target.with_name(f"{target.stem}-{end}{target.suffix}") for end in named]
@@ -135,7 +115,7 @@ def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
 
 def check_options(options: Options, more: Sequence[str] = ()) -> None:
     """Raise OptionError for a given option, or one of ``more``, that does not go with labels."""
-    usual = {name: (OPTIONS[name].default, MARCHING) for name in OPTIONS if name not in LABELS}
+    usual = {name: (OPTIONS[name].default, "marching") for name in OPTIONS if name not in LABELS}
     given = [name for name, values in usual.items() if getattr(options, name) not in values]
     for name in (*given, *more):
         raise OptionError(
@@ -146,11 +126,12 @@ def check_options(options: Options, more: Sequence[str] = ()) -> None:
 
 def with_numbers(options: Options, names: Names | None) -> Options:
     """Return options with numbers in place of names of labels; OptionError if some do not go."""
-    if options.labels is not None:
-        check_options(options)
-    if options.labels is None or isinstance(options.labels, str):
+    if options.labels is None:
         return options
-    numbers: dict[Any, int] = {entry.name: number for number, entry in (names or {}).items()}
+    check_options(options)
+    if options.labels == "all":
+        return options
+    numbers: dict[Any, int] = {name: number for number, (name, _) in (names or {}).items()}
     chosen = [numbers.get(label, label) for label in options.labels]
     if unknown := [label for label in chosen if isinstance(label, str)]:
         some = ", ".join(list(numbers)[:10]) or "none without --names"
@@ -159,11 +140,11 @@ def with_numbers(options: Options, names: Names | None) -> Options:
     return replace(options, labels=tuple(in_order(chosen) or ()))
 
 
-def names_of(labels: list[int], known: Names) -> Names:
-    """Return what each label is called, by a name of its own."""
-    entries = {label: known.get(label, LabelName(f"label {label}")) for label in labels}
-    names = told_apart({label: entry.name for label, entry in entries.items()}, " ")
-    return {label: entries[label]._replace(name=name) for label, name in names.items()}
+def names_of(labels: Iterable[int], known: Names) -> Names:
+    """Return what each label is called, by a name of its own, and its colour."""
+    entries = {label: known.get(label, (f"label {label}", None)) for label in labels}
+    names = told_apart({label: name for label, (name, _) in entries.items()}, " ")
+    return {label: (name, entries[label][1]) for label, name in names.items()}
 
 
 def told_apart(names: dict[int, str], mark: str) -> dict[int, str]:
@@ -189,7 +170,7 @@ def read_names(path: str | Path) -> Names:
             plain = "".join(letter if letter.isprintable() else " " for letter in name)
             if plain := plain[:LONGEST].strip():
                 colour: Any = tuple(map(int, rgb)) if any(rgb) else None
-                names[int(label)] = LabelName(plain, colour)
+                names[int(label)] = plain, colour
         if not names:
             raise ValueError("it names none")
     except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:

@@ -15,11 +15,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..arrays import CORNERS, IntArray, Numbers, Vectors, dot, face_normals, length, sums_at
+from ..arrays import CORNERS, Index, Vectors, face_normals, length, sums_at
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..simplify.walls import Walls, faults, labels_apart
-from ..surface.mesh import Mesh
+from ..surface.mesh import Mesh, row_keys
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
@@ -54,11 +54,9 @@ def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Wall
     No wall moves by more than an eighth of the ``spacing``, so the volume of a speck may stay
     another one.
     """
-    middle = walls.vertices.mean(0, dtype=np.float64)
-    movement = _Movement(walls, walls.vertices - middle, spacing)
+    movement = _Movement(walls, spacing)
     for _ in range(TURNS):
-        vertices = (middle + movement.solved(volumes)).astype(walls.vertices.dtype)
-        moved = replace(walls, vertices=vertices)
+        moved = replace(walls, vertices=movement.solved(volumes).astype(walls.vertices.dtype))
         wrong = faults(moved, CELL * spacing)
         if not len(wrong):
             return moved
@@ -69,51 +67,39 @@ def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Wall
 class _Movement:
     """Labels that move along their mean normals at the nodes of a lattice that are near walls."""
 
-    def __init__(self, walls: Walls, points: Vectors, spacing: float) -> None:
-        self.walls, self.points, self.most = walls, points, MOST * spacing
-        places = points / (CELL * spacing)
+    def __init__(self, walls: Walls, spacing: float) -> None:
+        self.walls, self.most = walls, MOST * spacing
+        self.middle = walls.vertices.mean(0, dtype=np.float64)
+        self.points = walls.vertices - self.middle
+        places = self.points / (CELL * spacing)
         corners = np.floor(places)[:, None] + CORNERS
         # the nodes round each point, (n, 8), and their shares in it
-        self.weights = np.prod(1 - np.abs(places[:, None] - corners), axis=2)
-        corners -= corners.min((0, 1))
-        _, ny, nz = (corners.max((0, 1)) + 1).tolist()
-        keys, nodes = np.unique(corners @ [ny * nz, nz, 1], return_inverse=True)
-        self.count, self.nodes = len(keys), nodes.reshape(-1, 8)
-        apart = labels_apart(walls)
-        slopes = np.concatenate([_slopes(points[own], mesh.faces) for mesh, own in apart])
-        point, labels = np.concatenate([own for _, own in apart]), len(apart)
-        label = np.repeat(np.arange(labels), [len(own) for _, own in apart])
-        pairs = self.nodes[point] * labels + label[:, None]
-        pairs, at = np.unique(pairs, return_inverse=True)
-        at, shares = at.ravel(), self.weights[point]
-        sums = sums_at(at, (shares[..., None] * slopes[:, None]).reshape(-1, 3), len(pairs))
-        areas = np.bincount(at, (shares * length(slopes)[:, None]).ravel(), len(pairs))
+        nodes = np.unique(row_keys(corners.reshape(-1, 3)), return_inverse=True)[1].reshape(-1, 8)
+        shares = np.prod(1 - np.abs(places[:, None] - corners), axis=2)
+        self.nodes, self.shares, found = nodes, shares, list[tuple[Index, Index, Vectors]]()
+        for label, (mesh, own) in enumerate(labels_apart(walls)):
+            each = face_normals(self.points[own], mesh.faces).repeat(3, 0) / 6
+            # by how much the volume grows as vertices move, (m, 3), and the lengths of that
+            slopes = sums_at(mesh.faces.ravel().astype(np.int64), each, len(own))
+            slopes = np.insert(slopes, 3, length(slopes), axis=1)
+            near, at = np.unique(nodes[own], return_inverse=True)
+            each = (shares[own, :, None] * slopes[:, None]).reshape(-1, 4)
+            sums = sums_at(at.ravel(), each, len(near))
+            normals = sums[:, :3] / np.maximum(sums[:, 3:], np.finfo(float).tiny)
+            found.append((near, np.full(len(near), label), normals))
         # of pairs of a node and a label that is near it, (p,), and the mean normals, (p, 3)
-        self.node, self.label = np.divmod(pairs, labels)
-        self.normals = sums / np.maximum(areas, np.finfo(float).tiny)[:, None]
-
-    def moved(self, distances: Numbers) -> Vectors:
-        """Return the points, (n, 3), if labels move by distances, but no node beyond the limit."""
-        moves = sums_at(self.node, self.normals * distances[self.label, None], self.count)
-        moves *= np.minimum(1, self.most / np.maximum(length(moves), 1e-300))[:, None]
-        points = self.points.copy()
-        for near, shares in zip(self.nodes.T, self.weights.T):
-            points += shares[:, None] * moves[near]
-        return points
+        self.node, self.label, self.normals = map(np.concatenate, zip(*found))
 
     def solved(self, volumes: Sequence[float]) -> Vectors:
-        """Return the points, (n, 3), moved so that the labels have their volumes."""
-        count, faces, sides = len(volumes), self.walls.faces, self.walls.sides.T
-        areas = length(face_normals(self.points, faces)) / 2
-        effects = np.zeros((count + 1, count + 1))  # of moves of labels on the volumes of others
-        for one, other in ((0, 1), (1, 0)):
-            np.add.at(effects, (sides[one], sides[one]), areas)
-            np.add.at(effects, (sides[one], sides[other]), -areas)
-        distances, points = np.zeros(count), self.points
+        """Return the vertices, moved so that the labels have their volumes; no node farther."""
+        faces, sides, points = self.walls.faces, self.walls.sides.T, self.points
+        distances, between = np.zeros(len(volumes)), np.zeros((len(volumes) + 1,) * 2)
+        np.add.at(between, tuple(sides), length(face_normals(points, faces)) / 2)
+        between += between.T  # areas of the walls of two labels
+        effects = np.diag(between.sum(1)) - between  # of moves on the volumes of others
         for _ in range(ROUNDS):
-            a, b, c = (points[corner] for corner in faces.T)
-            each = dot(a, np.cross(b, c)) / 6
-            inside, outside = (np.bincount(side, each, count + 1) for side in sides)
+            each = np.linalg.det(points[faces]) / 6
+            inside, outside = (np.bincount(side, each, len(between)) for side in sides)
             off = np.asarray(volumes) - (inside - outside)[1:]
             if (np.abs(off) <= GOOD * np.abs(volumes)).all():
                 break
@@ -121,11 +107,8 @@ class _Movement:
             rows = np.ix_(*[np.flatnonzero(free) + 1] * 2)
             step = np.linalg.lstsq(effects[rows], off[free], rcond=None)[0]
             distances[free] = np.clip(distances[free] + step, -self.most, self.most)
-            points = self.moved(distances)
-        return points
-
-
-def _slopes(points: Vectors, faces: IntArray) -> Vectors:
-    """Return by how much the volume of a closed mesh grows as its vertices move, (n, 3)."""
-    each = face_normals(points, faces).repeat(3, 0) / 6
-    return sums_at(faces.ravel().astype(np.int64), each, len(points))
+            each = self.normals * distances[self.label, None]
+            moves = sums_at(self.node, each, self.nodes.max() + 1)
+            moves *= np.minimum(1, self.most / np.maximum(length(moves), 1e-300))[:, None]
+            points = self.points + np.einsum("ij,ijk->ik", self.shares, moves[self.nodes])
+        return np.asarray(self.middle + points)

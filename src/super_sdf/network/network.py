@@ -14,14 +14,14 @@ import numpy as np
 from .. import options
 from ..arrays import NEIGHBOURHOOD, STRIDES, FloatArray, IntArray
 from ..errors import DeviceError, FileError
-from ..options import AUTO, FLOAT32, INT8, OPTIONS, QUALITIES, Device, Precision, Quality
+from ..options import OPTIONS, QUALITIES, Device, Precision, Quality
 from ..threads import cores_of_system, useful_threads
 from .contract import EXACT_DISTANCES, INPUTS, MASKS, TRIAL, Decoder, read_card
 from .onnx import has_driver, open_session, run
 
 MODELS = Path(__file__).parent.parent / "models"
 NO_NETWORKS = "super-sdf was installed without its networks: install it again"
-KIND_MODELS = (options.MASK, options.NOISY)
+KIND_MODELS = ("mask", "noisy")
 """Kinds of fields that have a shipped network of this name, in place of others."""
 HALF_TURNS: IntArray = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)], np.int32)
 """The signs of x, y and z after half turns about no axis and about each; none is favoured."""
@@ -56,12 +56,12 @@ class Network:
     @property
     def precision(self) -> Precision:
         """The arithmetic of the file: "float32" or "int8"."""
-        return INT8 if self.card.get("precision") == INT8 else FLOAT32
+        return "int8" if self.card.get("precision") == "int8" else "float32"
 
     @property
     def memory_bytes(self) -> tuple[float, float]:
         """Peak memory of a run, as measured: bytes per voxel that it sees, and bytes per value."""
-        each = (9.25 if self.precision == INT8 else 7.25) * self.card.get("channels", 64)
+        each = (9.25 if self.precision == "int8" else 7.25) * self.card.get("channels", 64)
         averages = self.symmetries > 1  # takes more for the turned inputs, and for the mean
         return 216 + each + 600 * averages, 8 + 4 * averages
 
@@ -101,7 +101,7 @@ def shipped_models() -> dict[str, Path]:
     return {path.stem: path for path in sorted(MODELS.glob("*.onnx"))}
 
 
-def find_model(model: str | Path, precision: str = AUTO) -> tuple[Path, int]:
+def find_model(model: str | Path, precision: str = "auto") -> tuple[Path, int]:
     """Return the file for the CPU, and the number of symmetries to average over.
 
     ``model`` is a quality, the name of a shipped network, or a file, which "auto" leaves as it is.
@@ -112,10 +112,10 @@ def find_model(model: str | Path, precision: str = AUTO) -> tuple[Path, int]:
     if name not in shipped and (str(model) in QUALITIES or name in KIND_MODELS):
         raise FileError(f"the network {name!r} is missing: {NO_NETWORKS}")
     path = shipped.get(name, Path(model))
-    if precision == AUTO:
-        path = shipped.get(f"{name}-{INT8}", path)
-    elif precision == INT8:
-        path = path.with_name(f"{path.stem}-{INT8}.onnx")  # beside the float32 file
+    if precision == "auto":
+        path = shipped.get(f"{name}-int8", path)
+    elif precision == "int8":
+        path = path.with_name(f"{path.stem}-int8.onnx")  # beside the float32 file
     if not isfile(path):
         names = ", ".join(QUALITIES)
         raise FileError(f"no model {str(path)!r}: give an ONNX file or one of: {names}")
@@ -125,9 +125,9 @@ def find_model(model: str | Path, precision: str = AUTO) -> tuple[Path, int]:
 def load_network(
     model: Quality | str | Path = options.DEFAULT_QUALITY,
     *,
-    device: Device = AUTO,
+    device: Device = "auto",
     threads: int = 0,
-    precision: Precision = AUTO,
+    precision: Precision = "auto",
 ) -> Network:
     """Load a network.
 
@@ -151,15 +151,15 @@ def load_network(
     """
     asked, threads = OPTIONS["device"].check(device), OPTIONS["threads"].check(threads)
     path, symmetries = find_model(options.check_path(model, "model"), precision)
-    if precision == INT8 and asked == "cuda":
+    if precision == "int8" and asked == "cuda":
         raise DeviceError("int8 is for the CPU: use --precision float32 with --device cuda")
     used, notes, failure = useful_threads(threads), list[str](), None
     if not threads and used == cores_of_system():
         used = 0  # onnxruntime's default, one thread per physical core
     session: Any = None
     runs_on: Device = "cpu"
-    if asked != "cpu" and precision != INT8:
-        on_cuda, _ = find_model(model, FLOAT32)
+    if asked != "cpu" and precision != "int8":
+        on_cuda, _ = find_model(model, "float32")
         try:  # a session can open although it cannot run: a GPU may be too old, or its memory full
             session = open_session(on_cuda, "cuda", used)
             run(session, TRIAL, "cuda")
@@ -180,7 +180,7 @@ def load_network(
 
 @lru_cache(maxsize=4)
 def _load_once(
-    model: str | Path, device: Device, threads: int, symmetries: int, precision: Precision = AUTO
+    model: str | Path, device: Device, threads: int, symmetries: int, precision: Precision = "auto"
 ) -> Network:
     loaded = load_network(model, device=device, threads=threads, precision=precision)
     return replace(loaded, symmetries=symmetries)
@@ -195,6 +195,6 @@ def network_for(network: Decoder, kind: str | None) -> Decoder:
     """
     if not isinstance(network, Network) or not network.shipped or kind not in KIND_MODELS:
         return network
-    if kind == options.NOISY and network.card.get("inputs") != EXACT_DISTANCES:
+    if kind == "noisy" and network.card.get("inputs") != EXACT_DISTANCES:
         return network
     return _load_once(kind, network.device, network.threads, network.symmetries, network.precision)

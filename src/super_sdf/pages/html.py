@@ -111,7 +111,7 @@ def viewed_page(sources: Sequence[str], options: Options) -> str:
                 target = Path(folder, "mesh.ply")
                 done = convert(source, target, network, options)
                 item = item_of_files(target, source, options, done)
-            report = {**done.report(), "input": source, "asked": options.digest()}
+            report = {**done.facts, "input": source, "asked": options.digest()}
             report["seconds"] = done.seconds
         else:
             mesh, item = read_mesh(source), Item()

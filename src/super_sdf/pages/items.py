@@ -111,7 +111,7 @@ def packed_mesh(title: str, mesh: Mesh, certificate: Certificate | None = None) 
     places = np.rint((vertices - low) / step).astype("<u2")
     flat = places.T.ravel(), mesh.faces.astype("<u4").ravel()
     parts = [np.diff(each, prepend=each.dtype.type(0)) for each in flat]
-    if shaded := certificate is not None and certificate.has_evidence:
+    if shaded := certificate is not None and len(certificate.values) > 0:
         share = certificate.residuals_at(mesh.vertices) / FULL
         known = np.rint(np.clip(share, -1, 1) * 127)
         parts.append(np.where(np.isnan(share), -128, known).astype(np.int8))

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import product
 from threading import Lock
 from typing import Any
 
@@ -23,11 +24,10 @@ import numpy as np
 from ..arrays import BoolArray, face_normals, length
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid, smallest_angles
-from .measuring import Original
-from .walls import Walls, irregular_places, labels_apart
+from .measuring import Original, mean_side
+from .walls import Walls, irregular, labels_apart
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
-ALONE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])  # a triangle apart from all others
 # Edges are collapsed while the new vertex is within this many errors of the planes around it (root
 # of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
 # the error, those of the second do at some places, and leave a fifth fewer triangles.
@@ -50,18 +50,17 @@ class Unsimplified:
 
     def __init__(self, walls: Walls) -> None:
         self.walls, self.originals = walls, [Original(mesh) for mesh, _ in labels_apart(walls)]
-        self.irregular = irregular_places(walls)
+        alone = len(self.originals) == 1
+        self.solid = self.originals[0].solid if alone else Solid(walls)
+        self.irregular = irregular(walls)[0]
 
 
 def within(of: Unsimplified, error: float) -> Walls | None:
     """Return walls within a distance of the originals; None if no triangle can be spared."""
-    for halving in range(HALVINGS):
-        unit = error / 2**halving
-        passes = [[unit * share for share in steps] for steps in PLANE_DISTANCES]
-        for some in (passes, passes[:1]):
-            result = collapsed(of, some, error)
-            if result and len(result.faces) < len(of.walls.faces):
-                return result
+    for halving, passes in product(range(HALVINGS), (PLANE_DISTANCES, PLANE_DISTANCES[:1])):
+        result = collapsed(of, passes, error / 2**halving, error)
+        if result and len(result.faces) < len(of.walls.faces):
+            return result
     return None
 
 
@@ -88,46 +87,47 @@ def down_to(of: Unsimplified, triangles: int) -> Walls:
         error *= float(np.clip(left / triangles, 1 / STRIDE, STRIDE))
         if not CLOSE * low < error < high / CLOSE:
             error = (low * high) ** 0.5 if low else high / STRIDE
-    few = [walls for walls in found if len(walls.faces) <= triangles]
-    return few[-1] if few else min(found, key=lambda walls: len(walls.faces))
+    return min(reversed(found), key=lambda walls: max(len(walls.faces) - triangles, 0))
 
 
-def collapsed(of: Unsimplified, passes: Sequence[Sequence[float]], error: float) -> Walls | None:
+def collapsed(
+    of: Unsimplified, passes: Sequence[Sequence[float]], unit: float, error: float
+) -> Walls | None:
     """Return what the last pass makes once nothing is wrong with it, None if that fails.
 
-    Of each pass are the distances within which edges are collapsed, step by step; see ``examine``.
+    Of each pass are the distances, in units, within which edges are collapsed, step by step; see
+    ``examine``.
     """
-    alone = len(of.originals) == 1
-    stages, solids = [of.walls], [of.originals[0].solid if alone else Solid(of.walls)]
+    stages: list[tuple[Walls, Solid]] = [(of.walls, of.solid)]
     kept: list[BoolArray] = []  # triangles of each stage but the last
     places, since = np.zeros((0, 3)), np.zeros(0, np.intp)  # to keep, and from which pass on
     first = 0  # pass that is to be made anew
     for _ in range(MOST_REPEATS):
-        del stages[first + 1 :], solids[first + 1 :], kept[first:]
+        del stages[first + 1 :], kept[first:]
         for number, steps in enumerate(passes[first:], first):
-            result, held = stages[number], np.zeros(len(stages[number].vertices), bool)
-            held[result.faces[solids[number].nearest(places[since <= number])[1]]] = True
+            result, solid = stages[number]
+            held = np.zeros(len(result.vertices), bool)
+            held[result.faces[solid.nearest(places[since <= number])[1]]] = True
             held[result.faces[held[result.faces].any(1)]] = True
             kept.append(np.asarray(held[result.faces].all(1)))
             for distance in steps:
-                result, held = collapse_edges(result, held, distance=distance)
+                result, held = collapse_edges(result, held, distance=distance * unit)
             if number == len(passes) - 1:
                 result = turn_edges(result, held, LOW * error)
-            stages.append(result)
-            solids.append(Solid(result))
-        wrong = examine(of, result, solids[-1], error)
+            stages.append((result, Solid(result)))
+        wrong = examine(of, *stages[-1], error)
         if wrong is None or not len(wrong):
             return None if wrong is None else result
         first = len(passes)
         while len(wrong) and first:  # back to the first pass that got it wrong
             first -= 1
-            distances, face, _ = solids[first].nearest(wrong)
+            distances, face, _ = stages[first][1].nearest(wrong)
             earlier = kept[first][face] | ((distances > error) & (first > 0))
             places = np.concatenate([places, wrong[~earlier]])
             since = np.append(since, np.full(np.count_nonzero(~earlier), first))
             wrong = wrong[earlier]
         if len(wrong):  # although it is kept in all
-            return None
+            break
     return None
 
 
@@ -143,34 +143,24 @@ def examine(of: Unsimplified, result: Walls, solid: Solid, error: float) -> Poin
         labels = [Solid(mesh) for mesh, _ in labels_apart(result)]
     if len(labels) < len(of.originals) or not all(len(label.mesh.faces) for label in labels):
         return None
-    wrong = [faults_made(of, result, solid)]
+    found = irregular(result)[0]
+    made = found[~np.isin(row_keys(found), row_keys(of.irregular))]
+    lost = of.irregular[~np.isin(row_keys(of.irregular), row_keys(found))]
+    lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
+    wrong = [made.reshape(-1, 3), lost.reshape(-1, 3)]
+    if len(pairs := solid.intersecting()):
+        corners = solid.mesh.vertices[solid.mesh.faces[pairs]].reshape(-1, 9)
+        old = of.solid.mesh.vertices[of.solid.mesh.faces].reshape(-1, 9)
+        is_new = ~np.isin(row_keys(corners), row_keys(old)).reshape(-1, 2).all(1)
+        corners = corners.reshape(-1, 2, 3, 3)[is_new]
+        wrong += [corners.reshape(-1, 3), corners.mean(2).reshape(-1, 3)]
     wrong += [one.compare(label, error)[0] for one, label in zip(of.originals, labels)]
     if len(far := np.concatenate(wrong)):
         return far
-    pairs = [(one, label.mesh) for one, label in zip(of.originals, labels)]
-    others = [pair for pair in pairs if topology(pair[0].mesh) != topology(pair[1])]
-    lost = np.concatenate([far, *(lost_places(*pair) for pair in others)])
-    return lost if len(lost) or not others else None
-
-
-def faults_made(of: Unsimplified, result: Walls, solid: Solid) -> Points:
-    """Return where walls are less of a manifold than those they were made of, or meet themselves.
-
-    ``solid`` is that of the result.
-    """
-    before, found = of.irregular, irregular_places(result)
-    made = found[~np.isin(row_keys(found), row_keys(before))]
-    lost = before[~np.isin(row_keys(before), row_keys(found))]
-    lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
-    wrong = np.concatenate([made, lost]).reshape(-1, 3)
-    pairs = solid.intersecting()
-    if not len(pairs):
-        return wrong
-    corners = result.vertices[result.faces[pairs]].astype(np.float64)  # (k, 2, 3, 3)
-    old = row_keys(of.walls.vertices[of.walls.faces].reshape(-1, 9).astype(np.float64))
-    is_old = np.isin(row_keys(corners.reshape(-1, 9)), old).reshape(-1, 2).all(1)
-    corners = corners[~is_old].reshape(-1, 3, 3)
-    return np.concatenate([wrong, corners.reshape(-1, 3), corners.mean(1)])
+    both = [(one.solid, label.mesh) for one, label in zip(of.originals, labels)]
+    others = [each for each in both if topology(each[0].mesh) != topology(each[1])]
+    gone = np.concatenate([far, *(lost_places(*each) for each in others)])
+    return gone if len(gone) or not others else None
 
 
 def topology(mesh: Mesh) -> tuple[int, int]:
@@ -178,13 +168,12 @@ def topology(mesh: Mesh) -> tuple[int, int]:
     return mesh.components()[0], 2 * len(np.unique(mesh.faces)) - len(mesh.faces)
 
 
-def lost_places(original: Original, mesh: Mesh) -> Points:
+def lost_places(original: Solid, mesh: Mesh) -> Points:
     """Return the vertices of those components of a mesh of which nothing is left."""
     component = original.mesh.components()[1][original.mesh.faces[:, 0]]
     roots = np.unique(mesh.components()[1][mesh.faces[:, 0]])
-    found = component[original.solid.nearest(mesh.vertices[roots].astype(np.float64))[1]]
-    missing = np.unique(original.mesh.faces[~np.isin(component, found)])
-    return original.mesh.vertices[missing].astype(np.float64)
+    found = component[original.nearest(mesh.vertices[roots])[1]]
+    return original.mesh.vertices[original.mesh.faces[~np.isin(component, found)]].reshape(-1, 3)
 
 
 def collapse_edges(
@@ -197,44 +186,43 @@ def collapse_edges(
     vertices ``held``, (n,), stay where they are, and open edges; also returned is which are held.
 
     pyfqmr keeps open edges and the order of triangles. So a vertex is held by a triangle of its
-    own, and after the triangles of each pair of labels comes one apart from all others.
+    own, and after the triangles of each pair of labels comes one at a vertex apart from all others.
     """
     from pyfqmr import Simplify
 
     if not len(walls.faces):
         return walls, held
-    pair, pins = walls.sides @ np.array([1 << 16, 1]), np.flatnonzero(held)
+    pair = walls.sides @ np.array([1 << 16, 1])
     order = np.argsort(pair, kind="stable")
     last = np.flatnonzero(np.diff(pair[order], append=-1))
-    first_sides = np.diff(walls.vertices.astype(np.float64)[walls.faces[:, :2]], axis=1)
-    unit = distance or float(length(first_sides).mean())  # which pyfqmr's thresholds are in
+    unit = distance or mean_side(walls)  # which pyfqmr's thresholds are in
     middle = walls.vertices.mean(0, dtype=np.float64)
     scaled = (walls.vertices - middle) / unit
-    tips = scaled[np.tile(pins, 2)] + np.repeat(ALONE[1:], len(pins), axis=0)
-    marks = np.tile(ALONE, (len(last), 1)) + 3 * np.repeat(np.arange(len(last)), 3)[:, None]
-    points = np.concatenate([scaled, tips, marks + scaled.max(0) + 2])
-    one, other = len(scaled) + np.arange(len(tips)).reshape(2, -1)
-    mark = np.arange(len(points) - len(marks), len(points)).reshape(-1, 3)
-    faces = np.insert(walls.faces[order], last + 1, mark, axis=0)
-    faces = np.concatenate([faces, np.stack([pins, one, other], 1)]).astype(np.int32)
-    options: dict[str, Any] = {"target_count": int(triangles) + len(last) + len(pins)}
+    scaled = np.append(scaled, [scaled.max(0) + 2], axis=0)
+    pins = np.flatnonzero(held)
+    corner = np.append(np.full(len(last), len(held)), pins)
+    tips = scaled[np.tile(corner, 2)] + np.repeat(np.eye(3)[:2], len(corner), axis=0)
+    lone = np.stack([corner, *(len(scaled) + np.arange(len(tips)).reshape(2, -1))], 1)
+    faces = np.insert(walls.faces[order], last + 1, lone[: len(last)], axis=0)
+    faces = np.concatenate([faces, lone[len(last) :]]).astype(np.int32)
+    options: dict[str, Any] = {"target_count": int(triangles) + len(lone)}
     if distance:
         rounds, rise = FEW_ROUNDS if len(walls.faces) > LARGE else ROUNDS
         options = {"target_count": 0, "max_iterations": rounds}
         options |= {"alpha": rounds**-rise, "K": 1, "aggressiveness": rise}  # to the distance
     with ONE_AT_A_TIME:
         library = Simplify()
-        library.setMesh(points, faces)
+        library.setMesh(np.concatenate([scaled, tips]), faces)
         library.simplify_mesh(preserve_border=True, verbose=False, update_rate=1, **options)
         moved, faces, _ = library.getMesh()
-    count = len(moved) - len(tips) - len(marks)
+    moved = moved[: len(moved) - len(tips) - 1]
     faces, pinned = np.split(faces.astype(np.int32), [len(faces) - len(pins)])
-    is_mark = faces[:, 0] >= count
+    is_mark = faces[:, 0] == len(moved)
     sides = walls.sides[order[last]][np.cumsum(is_mark)[~is_mark]]
-    vertices = (moved[:count] * unit + middle).astype(walls.vertices.dtype)
-    _, same, old = np.intersect1d(row_keys(moved[:count]), row_keys(scaled), return_indices=True)
+    vertices = (moved * unit + middle).astype(walls.vertices.dtype)
+    _, same, old = np.intersect1d(row_keys(moved), row_keys(scaled), return_indices=True)
     vertices[same] = walls.vertices[old]
-    held = np.zeros(count, bool)
+    held = np.zeros(len(moved), bool)
     held[pinned[:, 0]] = True
     return Walls(vertices, faces[~is_mark], sides), held
 
@@ -253,26 +241,25 @@ def turn_edges(walls: Walls, held: BoolArray, distance: float) -> Walls:
         if len(thin) <= FEW_SLIVERS * len(faces):
             break
         sides = length(corners[thin] - np.roll(corners[thin], -1, axis=1))
-        normals, flat = face_normals(points, faces), faces.ravel()
+        normals, start = face_normals(points, faces), faces.ravel().astype(np.int64)
         is_low = length(normals[thin]) < distance * sides.max(1)
         half, opposite = (3 * thin + sides.argmax(1))[is_low], Mesh(points, faces).pair_edges()[0]
         half = half[(opposite[half] >= 0) & ~kept[opposite[half] // 3]]
         one, other = half // 3, opposite[half] // 3
-        a, b, c = (flat[3 * one + (half + turn) % 3] for turn in range(3))
-        d = flat[3 * other + (opposite[half] + 2) % 3]
+        a, b, c = (start[3 * one + (half + turn) % 3] for turn in range(3))
+        d = start[3 * other + (opposite[half] + 2) % 3]
         new = np.stack([c, a, d, d, b, c], axis=1).reshape(-1, 3)
         better = smallest_angles(points[new]).reshape(-1, 2).min(1) > THIN
         after, before = face_normals(points, new), normals[other].repeat(2, 0)
         steady = (after * before).sum(1) > STEADY * length(after) * length(before)
-        edges = np.sort(np.stack([flat, np.roll(faces, -1, axis=1).ravel()]).astype(np.int64), 0)
-        diagonal = np.sort(np.stack([c, d]).astype(np.int64), 0)
-        free = ~np.isin(diagonal[0] * count + diagonal[1], edges[0] * count + edges[1])
-        taken: set[int] = set()
+        edges = start * count + np.roll(faces, -1, axis=1).ravel()
+        free = ~np.isin(c * count + d, edges) & ~np.isin(d * count + c, edges)
+        taken = np.zeros(count, bool)
         for row in np.flatnonzero(better & steady.reshape(-1, 2).all(1) & free):
             quad = new[2 * row : 2 * row + 2]
-            if taken.isdisjoint(quad.ravel().tolist()):
-                taken |= set(quad.ravel().tolist())
+            if not taken[quad].any():
+                taken[quad] = True
                 faces[[one[row], other[row]]] = quad
-        if not taken:
+        if not taken.any():
             break
     return replace(walls, faces=faces)

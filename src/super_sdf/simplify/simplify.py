@@ -7,17 +7,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..errors import MeshError, check_modules
 from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
-from ..threads import check_bound, give_back
-
-if TYPE_CHECKING:
-    from .measuring import Deviation
+from ..threads import check_fits, give_back, memory_bound
+from ..truth.solid import Solid
+from .collapsing import Unsimplified, down_to, within
+from .measuring import Deviation
+from .walls import Walls
 
 # Peak of memory beside the mesh, measured on meshes of 120,000 to 760,000 triangles: 680 to 1,230,
 # with the libraries that it loads.
@@ -84,14 +85,9 @@ def simplify_mesh(
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
-    count, most = len(mesh.faces), OPTIONS["max_memory"].check(max_memory)
-    way_out = "use a smaller factor, do not simplify, or "
-    check_bound(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", most, way_out)
-    from ..truth.solid import Solid
-    from .collapsing import Unsimplified, down_to, within  # need the extra
-    from .measuring import Deviation
-    from .walls import Walls
-
+    count, most = len(mesh.faces), memory_bound(OPTIONS["max_memory"].check(max_memory))
+    way_out = "use a smaller factor, do not simplify, or allow more (--max-memory)"
+    check_fits(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", way_out, most)
     if not count:
         return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
     of, warnings = Unsimplified(Walls.of(mesh)), tuple[str, ...]()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -36,11 +35,10 @@ class Walls(Mesh):
 def labels_apart(walls: Walls) -> list[tuple[Mesh, Rows]]:
     """Return the closed mesh of each label from 1 on, and the numbers of its vertices in walls."""
     both, label = np.concatenate([walls.faces, walls.faces[:, ::-1]]), walls.sides.T.ravel()
-    order, count = np.argsort(label, kind="stable"), int(label.max(initial=1))
-    ends = np.searchsorted(label[order], np.arange(1, count + 2)).tolist()
+    order, labels = np.argsort(label, kind="stable"), np.arange(1, label.max(initial=1) + 2)
     number, found = np.empty(len(walls.vertices), np.int32), []
-    for start, stop in pairwise(ends):
-        faces, used = both[order[start:stop]], np.zeros(len(walls.vertices), bool)
+    for faces in np.split(both[order], np.searchsorted(label[order], labels))[1:-1]:
+        used = np.zeros(len(walls.vertices), bool)
         used[faces] = True
         point = np.flatnonzero(used)
         number[point] = np.arange(len(point))
@@ -48,19 +46,14 @@ def labels_apart(walls: Walls) -> list[tuple[Mesh, Rows]]:
     return found
 
 
-def irregular_places(walls: Walls) -> NDArray[np.float64]:
+def irregular(walls: Walls) -> tuple[NDArray[np.float64], Rows, Rows]:
     """Return where a label has no closed manifold, (n, 6): two ends of an edge, or a point twice.
 
     These are the edges of each label, in the direction of their triangle, without exactly one
     triangle that passes them in the other direction, and the vertices at which several fans of its
     triangles meet, or that are at the position of another one, or at which two triangles have the
-    same three corners.
+    same three corners. Also returned are these points, and the ends of sharp edges.
     """
-    return walls.vertices.astype(np.float64)[_irregular(walls)[0]].reshape(-1, 6)
-
-
-def _irregular(walls: Walls) -> tuple[Rows, Rows]:
-    """Return the ends of ``irregular_places``, (n, 2), by number, and of edges that are sharp."""
     odd, sharp = list[Rows](), [np.zeros(0, np.intp)]
     for mesh, point in labels_apart(walls):
         opposite = mesh.pair_edges()[0]
@@ -71,8 +64,9 @@ def _irregular(walls: Walls) -> tuple[Rows, Rows]:
         sharp.append(point[ends[is_sharp]].ravel())
     doubled = walls.faces[_repeated(np.sort(walls.faces, 1))].ravel()
     same: Rows = np.concatenate([_repeated(walls.vertices), doubled])
-    odd.append(same[:, None].repeat(2, 1))
-    return np.concatenate(odd), np.concatenate(sharp)
+    points: Rows = np.concatenate([*odd, same[:, None].repeat(2, 1)]).ravel()
+    places: NDArray[np.float64] = walls.vertices[points].astype(np.float64).reshape(-1, 6)
+    return places, points, np.concatenate(sharp)
 
 
 def _repeated(rows: NDArray[Any]) -> Rows:
@@ -85,14 +79,12 @@ def _repeated(rows: NDArray[Any]) -> Rows:
 def faults(walls: Walls, spacing: float) -> Rows:
     """Return the points at which something is wrong with walls, found without other libraries.
 
-    These are ``irregular_places``, and the corners of triangles that intersect near an edge with an
+    These are ``irregular`` ones, and the corners of triangles that intersect near an edge with an
     angle near 0. ``spacing`` is that of the lattice.
     """
-    irregular, sharp = _irregular(walls)
-    suspect = np.zeros(len(walls.vertices), bool)
-    suspect[sharp] = True
-    some = walls.faces[suspect[walls.faces].any(1)].astype(np.int64)
+    _, ends, sharp = irregular(walls)
+    some = walls.faces[np.isin(walls.faces, sharp).any(1)].astype(np.int64)
     points = (walls.vertices - walls.vertices.mean(0, dtype=np.float64)) / spacing
     one, other = overlapping_boxes(points, some, np.ones(len(points), bool))
     pairs = intersecting(points, some[one], some[other])
-    return np.unique(np.concatenate([irregular.ravel(), *(corners.ravel() for corners in pairs)]))
+    return np.unique(np.concatenate([ends, *(corners.ravel() for corners in pairs)]))

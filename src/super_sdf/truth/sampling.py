@@ -18,7 +18,7 @@ from ..errors import MeshError, OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..surface.mesh import Mesh
 from ..threads import check_fits, chunks_of
-from .solid import Points, Solid
+from .solid import Solid
 
 EDGE = 8  # samples along a cube
 EXACT_SAMPLES = 1 << 24  # up to 256^3 every sample is exact unless a band is given
@@ -33,11 +33,6 @@ WORK_BYTES = 500_000_000  # for search trees and chunks, besides the values
 Progress = Callable[[int, int], None]
 Layout = tuple[tuple[int, int, int], float, NDArray[np.float64]]
 """Samples along the axes, spacing, and the position of sample (0, 0, 0)."""
-
-
-def unit_layout(n: int, side: float = 1.0) -> Layout:
-    """Return the layout of the test grids: voxel centres (i + 1/2)/n - 1/2, times ``side``."""
-    return (n, n, n), side / n, np.full(3, (0.5 / n - 0.5) * side)
 
 
 def fitted_layout(
@@ -69,64 +64,42 @@ def fitted_layout(
 def sample_solid(
     solid: Solid, layout: Layout, *, band: float | None = None, progress: Progress | None = None
 ) -> SdfGrid:
-    """Sample the signed distance to a solid as an ``SdfGrid``; see ``sample_grid``.
+    """Sample the signed distance to a solid.
 
-    Without a ``band``, distances in grids of over 256^3 samples are clamped ``BIG_GRID_BAND``
-    voxels from the surface, and the grid's notes say so.
+    ``band`` is the distance in voxels up to which values are exact (to float32), at least 1.5; they
+    are clamped there, as the grid's notes say. Default: ``BIG_GRID_BAND`` in grids of over 256^3
+    samples, else none. ``progress`` is called with (cubes done, all cubes). MeshError if floating
+    point cannot hold the distances or the positions; OutOfMemoryError.
     """
     shape, spacing, origin = layout
     if band is None:
         band = BIG_GRID_BAND if prod(shape) > EXACT_SAMPLES else np.inf
     if not band >= LEAST_BAND:
         raise OptionError(f"band is {band:g}: give at least {LEAST_BAND:g} voxels")
-    values = sample_grid(solid, layout, band=band, progress=progress)
-    notes = [f"distances are exact up to {band:g} voxels and clamped there"] * (band < np.inf)
-    return SdfGrid.trusted(values, spacing, origin, tuple(notes))
-
-
-def sample_grid(
-    solid: Solid, layout: Layout, *, band: float = np.inf, progress: Progress | None = None
-) -> NDArray[np.float32]:
-    """Return the signed distance at every sample of a grid, (nx, ny, nz) float32, negative inside.
-
-    ``band`` is the distance in voxels up to which values are exact (to float32), at least 1.5; they
-    are clamped there. ``progress`` is called with (cubes done, all cubes). MeshError if floating
-    point cannot hold the distances or the positions; OutOfMemoryError.
-    """
-    shape, spacing, origin = layout
     reach = float(np.abs(origin).max()) + spacing * max(shape)
     if not (spacing > 1e-30 and reach < 1e30 and np.spacing(reach) <= POSITION_ERROR * spacing):
-        raise MeshError(
-            f"a grid with a spacing of {spacing:g} that reaches to {reach:g} cannot be held in "
-            "floating point: scale the mesh, or move it to the origin"
-        )
+        said = f"a spacing of {spacing:g} in a grid that reaches to {reach:g} is too fine for "
+        raise MeshError(f"{said}floating point: scale the mesh, or move it to the origin")
     size = " x ".join(map(str, shape))
     check_fits(prod(shape) * 8 + WORK_BYTES, f"a grid of {size}", "take fewer samples")
     counts, limit = [-(-n // EDGE) for n in shape], band * spacing
-    cubes = np.argwhere(np.ones(counts, bool)) * EDGE
+    cubes, within_cube = np.argwhere(np.ones(counts, bool)) * EDGE, np.argwhere(np.ones([EDGE] * 3))
     values = np.empty((len(cubes), EDGE**3), np.float32)
-    within_cube = np.indices((EDGE,) * 3).reshape(3, -1).T
     half = 3**0.5 * (EDGE - 1) / 2 * spacing  # from the centre of a cube to its corners
     for some in chunks_of(len(cubes), EDGE**3):
         centres = (cubes[some] + (EDGE - 1) / 2) * spacing + origin
-        away, inside = solid.distance(centres), solid.is_inside(centres)
-        uncrossed = (away > half * (1 + 1e-9)) & solid.is_closed
-        near = ~uncrossed | (away <= limit + half)
-        points = ((cubes[some][near, None] + within_cube) * spacing + origin).reshape(-1, 3)
-        found = np.full((len(away), EDGE**3), limit)
-        found[near] = solid.distance(points).clip(max=limit).reshape(-1, EDGE**3)
-        sides = np.repeat(inside[:, None], EDGE**3, axis=1)
-        crossed = np.repeat(~uncrossed[near], EDGE**3)
-        sides[~uncrossed] = solid.is_inside(points[crossed]).reshape(-1, EDGE**3)
-        values[some] = np.where(sides, -found, found)
+        away, side = solid.distance(centres), np.where(solid.is_inside(centres), -1.0, 1.0)
+        crossed = (away <= half * (1 + 1e-9)) | (solid.unbalanced_edges > 0)
+        found = np.repeat(side[:, None] * limit, EDGE**3, axis=1)
+        near = ~crossed & (away <= limit + half)
+        for chosen, measure in ((near, solid.distance), (crossed, solid.signed_distance)):
+            points = ((cubes[some][chosen, None] + within_cube) * spacing + origin).reshape(-1, 3)
+            found[chosen] = measure(points).reshape(-1, EDGE**3)
+        found[near] *= side[near, None]
+        values[some] = found.clip(-limit, limit)
         if progress:
             progress(min(some.stop, len(cubes)), len(cubes))
-    grid = values.reshape(*counts, EDGE, EDGE, EDGE).transpose(0, 3, 1, 4, 2, 5)
-    nx, ny, nz = shape
-    return grid.reshape([n * EDGE for n in counts])[:nx, :ny, :nz]
-
-
-def grid_points(layout: Layout) -> Points:
-    """Return the position of every sample of a grid, (n, 3) in C order."""
-    shape, spacing, origin = layout
-    return np.indices(shape).reshape(3, -1).T * spacing + origin
+    cut = values.reshape(*counts, EDGE, EDGE, EDGE).transpose(0, 3, 1, 4, 2, 5)
+    whole = cut.reshape([n * EDGE for n in counts])[tuple(map(slice, shape))]
+    notes = [f"distances are exact up to {band:g} voxels and clamped there"] * (band < np.inf)
+    return SdfGrid.trusted(whole, spacing, origin, tuple(notes))

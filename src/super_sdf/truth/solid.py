@@ -11,17 +11,15 @@ import logging
 import warnings
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import cross, length
 from ..errors import FileError, MeshError
 from ..files.formats import check_regular_file
 from ..surface.mesh import Mesh
-
-if TYPE_CHECKING:
-    import igl
 
 Points = NDArray[np.float64]
 Distances = NDArray[np.float64]
@@ -56,10 +54,8 @@ def read_mesh(path: str | Path) -> Mesh:
         raise MeshError(f"{path} has a face of a vertex that it does not hold: repair it")
     used, corners = np.unique(faces, return_inverse=True)
     mesh = Mesh(vertices[used], corners.astype(np.int32).reshape(-1, 3))
-    if not np.isfinite(mesh.vertices).all():
-        raise MeshError(f"{path} holds coordinates that are not finite: repair it first")
-    if (largest := np.abs(mesh.vertices).max()) > LARGEST_COORDINATE:
-        raise MeshError(f"{path} reaches to {largest:.3g}: scale it to coordinates under 1e30")
+    if not (largest := np.abs(mesh.vertices).max()) <= LARGEST_COORDINATE:
+        raise MeshError(f"{path} reaches to {largest:.3g}: repair it, or scale it to under 1e30")
     return merged(mesh)
 
 
@@ -80,13 +76,6 @@ def merged(mesh: Mesh) -> Mesh:
     return Mesh(mesh.vertices[first], place.astype(np.int32)[mesh.faces])
 
 
-def normalise(mesh: Mesh) -> Mesh:
-    """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
-    vertices = mesh.vertices.astype(np.float64)
-    low, high = vertices.min(0), vertices.max(0)
-    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
-
-
 class Solid:
     """The solid that a mesh, facing outward, encloses, with search trees for fast queries.
 
@@ -97,21 +86,16 @@ class Solid:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = Mesh(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32))
 
-    @cached_property
-    def _triangles(self) -> igl.AABB:
+    def _tree(self, kind: str) -> Any:
+        """Return a search tree of igl for the triangles."""
         import igl
 
-        tree = igl.AABB()
+        tree = getattr(igl, kind)()
         tree.init(self.mesh.vertices, self.mesh.faces)
         return tree
 
-    @cached_property
-    def _winding(self) -> igl.FastWindingNumberBVH:
-        import igl
-
-        tree = igl.FastWindingNumberBVH()
-        tree.init(self.mesh.vertices, self.mesh.faces)
-        return tree
+    _triangles = cached_property(lambda self: self._tree("AABB"))
+    _winding = cached_property(lambda self: self._tree("FastWindingNumberBVH"))
 
     @cached_property
     def unbalanced_edges(self) -> int:
@@ -124,11 +108,6 @@ class Solid:
         key = np.minimum(start, end) * (start.max(initial=0) + 1) + np.maximum(start, end)
         _, edge = np.unique(key, return_inverse=True)
         return int(np.count_nonzero(np.bincount(edge, np.sign(end - start))))
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether the mesh is closed, so that the winding number changes at the surface only."""
-        return self.unbalanced_edges == 0
 
     def nearest(self, points: Points) -> tuple[Distances, NDArray[np.int64], Points]:
         """Return the distance to the nearest triangle, that triangle, and its nearest point."""
@@ -166,12 +145,10 @@ class Solid:
 
 def smallest_angles(corners: Points) -> Distances:
     """Return the smallest angle of each triangle, (m,), in degrees; corners are (m, 3, 3)."""
-    found = []
-    for turn in range(3):
-        at, one, other = np.roll(corners, turn, axis=1).transpose(1, 0, 2)
-        sine = np.linalg.norm(np.cross(one - at, other - at), axis=1)
-        found.append(np.arctan2(sine, ((one - at) * (other - at)).sum(1)))
-    return np.degrees(np.min(found, axis=0))
+    a, b, c = np.moveaxis(corners, 1, 0)
+    sides = np.sort(length(corners - np.roll(corners, 1, axis=1)), axis=1)
+    sine = length(cross(b - a, c - a)) / np.maximum(sides[:, 1] * sides[:, 2], 1e-300)
+    return np.degrees(np.arcsin(np.minimum(sine, 1)))
 
 
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:

@@ -1,9 +1,8 @@
-"""The readers of grid files, a module for each library: each turns a Request into a Volume.
+"""The readers of grid files, by libraries that own the formats: each turns a Request into a Volume.
 
 A reader says what the file says, in the world coordinates of the file. Here, and nowhere else, the
-axes of the array are brought into the order and sense in which they lie nearest to the world's.
-What is left is the direction of the grid. A reader may raise anything: ``files.grids`` turns what a
-library raises into one line.
+axes of the array are brought into the order and sense in which they lie nearest to the world's. A
+reader may raise anything: ``files.grids`` turns what a library raises into one line.
 """
 
 from __future__ import annotations
@@ -21,15 +20,14 @@ from numpy.typing import NDArray
 
 from ...arrays import Triple
 from ...errors import FileError, GridError, OptionError
-from ...grid.samples import UNNAMED, as_direction, as_triple, check_direction, even_steps
-from ...threads import check_bound
+from ...grid.samples import AXES, UNNAMED, as_direction, as_triple, check_direction, even_steps
+from ...threads import check_fits, memory_bound
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
 MOST_NAMED = 10  # arrays that an error lists
 COPIES = 2  # of an array that is loaded, while its axes are put in order
 PLACE = ("spacing", "origin", "direction")
 XYZ = np.eye(3)
-SPACE = ("x", "y", "z")
 LABELS, DENSITY, DISTANCE = "labels", "density", "distance"  # what a file says its values are
 
 Index: TypeAlias = tuple[slice | int, ...]
@@ -53,7 +51,8 @@ class Request:
         """Raise OutOfMemoryError if an array that is loaded whole does not fit."""
         what = f"{self.path}, {' x '.join(map(str, shape))} {dtype}, loaded whole,"
         need = COPIES * prod(map(int, shape)) * dtype.itemsize
-        check_bound(need, what, self.max_memory, "save it as .npy in C order, or ")
+        way_out = "save it as .npy in C order, or allow more (--max-memory)"
+        check_fits(need, what, way_out, memory_bound(self.max_memory))
 
     def choose(self, names: Sequence[str], what: str) -> str:
         """Return the name of the array to read: the one asked for, else the only one."""
@@ -68,19 +67,17 @@ class Request:
             return same[0]
         raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
 
-    def choose_array(
-        self, shapes: Mapping[str, Sequence[int]], what: str = "array of three axes"
-    ) -> str:
+    def choose_array(self, shapes: Mapping[str, Sequence[int]]) -> str:
         """Return the name of the array to read, of three axes or more, by the shapes of all."""
-        return self.choose([name for name, shape in shapes.items() if len(shape) >= 3], what)
+        names = [name for name, shape in shapes.items() if len(shape) >= 3]
+        return self.choose(names, "array of three axes")
 
     def pick(
         self, shape: Sequence[int], kept: Sequence[int] | None = None, names: Sequence[str] = ()
     ) -> Index:
         """Return which samples of an array are read; GridError if an axis or a number is missing.
 
-        ``kept`` are the axes in space. Without it, axes of length 1 are left out, and of those left
-        the longest are in space.
+        ``kept`` are the axes in space, by default the longest.
         """
         if len(shape) < 3:
             raise GridError(f"{self.path} has shape {tuple(shape)}: give a file of three axes")
@@ -93,12 +90,10 @@ class Request:
         chosen = dict(zip(others, self.numbers))
         for axis in others:
             if chosen.get(axis, shape[axis]) >= shape[axis]:
-                called = (names[axis] if names else "") or axis
+                said = f"{self.path}: its axis {(names[axis] if names else '') or axis} has"
                 name = f"{self.path}:{self.member}" if self.member else self.path
-                raise GridError(
-                    f"{self.path}: its axis {called} has {shape[axis]} entries, from 0 on: choose "
-                    f"one, {name}{'[0]' * len(others)}, say"
-                )
+                say = f"choose one, {name}{'[0]' * len(others)}, say"
+                raise GridError(f"{said} {shape[axis]} entries, from 0 on: {say}")
         whole = slice(None)
         return tuple(whole if n in kept else chosen.get(n, 0) for n in range(len(shape)))
 
@@ -122,7 +117,7 @@ class Volume:
     axes: str | None = None  # order of x, y and z along the array, if the file or user names it
     space: str | None = None  # "RAS" or "LPS", if the file states one of them
     notes: tuple[str, ...] = ()  # sentences on what the file says, for the user
-    # spacing, origin, direction of x, y, z: see ``stated_place``; they replace those above
+    # spacing, origin, direction of x, y, z, as far as they are stated; they replace those above
     place: dict[str, Any] = field(default_factory=dict)
     is_mapped: bool = False  # the samples stay in the file
     hint: str = ""  # what the file says its values are: LABELS, DENSITY, DISTANCE
@@ -131,8 +126,7 @@ class Volume:
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of samples along each axis in space."""
-        kept = (count for count, at in zip(self.stored, self.index) if isinstance(at, slice))
-        return tuple(map(int, kept))
+        return tuple(int(self.stored[axis]) for axis in kept_of(self.index))
 
     def read(self) -> NDArray[Any]:
         """Return the samples along the axes in space."""
@@ -151,11 +145,6 @@ class Volume:
         origin = None if self.origin is None else triple(turn * self.origin)
         turned = turn[:, None] * (XYZ if self.direction is None else self.direction)
         return replace(self, origin=origin, direction=turned, space=space)
-
-
-def of_array(values: Any) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
-    """Return how a ``Volume`` loads an array that is at hand, its shape and its type."""
-    return lambda index: values[index], tuple(values.shape), np.dtype(values.dtype)
 
 
 def triple(numbers: Any) -> Triple:
@@ -177,12 +166,6 @@ def kept_of(index: Index) -> list[int]:
     return [axis for axis, at in enumerate(index) if isinstance(at, slice)]
 
 
-def stated_place(said: Mapping[str, Any]) -> dict[str, Any]:
-    """Return spacing, origin and direction that a file states by these names, as far as it does."""
-    place: dict[str, Any] = {k: as_triple(said[k], k) for k in PLACE[:2] if k in said}
-    return place | {k: check_direction(np.squeeze(said[k])) for k in PLACE[2:] if k in said}
-
-
 def axes_direction(axes: str) -> NDArray[np.float64]:
     """Return the direction of an array whose axes are the world's in an order, such as "zyx"."""
     return XYZ[:, ["xyz".index(name) for name in axes]]
@@ -190,17 +173,15 @@ def axes_direction(axes: str) -> NDArray[np.float64]:
 
 def find_placement(
     volume: Volume, given: dict[str, Any]
-) -> tuple[tuple[int, ...], tuple[slice, ...], dict[str, Any]]:
-    """Return which axes of an array lie along x, y and z, or nearest to them, and its place.
+) -> tuple[tuple[int, ...], tuple[int, ...], dict[str, Any]]:
+    """Return which axes of an array lie nearest to x, y and z, which run backwards, and its place.
 
-    Between the two are the steps along each axis of the array, forwards or backwards. Spacing,
-    origin and direction are those that are ``given``, else the file's, None if not known. GridError
-    if the axes are not at right angles.
+    The place is spacing, origin and direction: ``given``, else the file's, else None.
     """
     direction = XYZ if volume.direction is None else np.asarray(volume.direction, np.float64)
     check_direction(direction)
-    orders = permutations(range(3))  # of which the axes are taken in the nearest
-    order = max(orders, key=lambda axes: float(np.abs(direction[(0, 1, 2), axes]).sum()))
+    nearness = np.abs(direction)
+    order = max(permutations(range(3)), key=lambda axes: float(nearness[(0, 1, 2), axes].sum()))
     is_back = direction[(0, 1, 2), order] < 0
     turned = direction[:, order] * np.where(is_back, -1, 1)
     place = {k: volume.place.get(k) if given.get(k) is None else given[k] for k in PLACE}
@@ -215,8 +196,7 @@ def find_placement(
         steps = np.broadcast_to(np.asarray(spacing, np.float64), 3)
         frame = XYZ if frame is None else np.reshape(frame, (3, 3))
         origin = np.asarray(origin, np.float64) - frame @ (ends * steps)
-    forwards = tuple(slice(None, None, -1 if is_back[order.index(n)] else 1) for n in range(3))
-    return order, forwards, {**place, "spacing": spacing, "origin": origin}
+    return order, tuple(np.flatnonzero(is_back)), {**place, "spacing": spacing, "origin": origin}
 
 
 # What HDF5, Zarr, NetCDF, MATLAB and TIFF files say of the axes of an array, and of its values
@@ -240,31 +220,31 @@ def one_unit(units: Sequence[str]) -> tuple[bool, tuple[str, ...]]:
     return True, (f"lengths are in the unit that it states, {listed}",) * bool(listed)
 
 
-def measured(name: str, count: int, scale: Any, about: Mapping[str, Any]) -> Axis:
-    """Return an axis by its name and a scale, if there is one of its length, with attributes.
+def measured(name: str, count: int, scale: Any) -> Axis:
+    """Return an axis by its name and its scale, a variable with the coordinates, if there is one.
 
-    The scale has the coordinates, which must be evenly spaced, or all the same, if none are known.
     By the conventions for climate and forecast data an axis may be ``positive: down``, and ``axis``
     may name it.
     """
     places = np.asarray(scale[:] if getattr(scale, "shape", ()) == (count,) else [0])
-    if places[0] == places[-1]:
+    if places[0] == places[-1]:  # none are known
         return Axis(name)
     start, step = even_steps(name, places)
+    about = getattr(scale, "attrs", getattr(scale, "_attributes", {}))  # the second of SciPy
     unit, alias, positive = (
         said.decode() if isinstance(said, bytes) else str(said)
         for said in (about.get(key, "") for key in ("units", "axis", "positive"))
     )
     sign = -1 if positive.lower() == "down" else 1
-    is_named = name.lower() in SPACE or alias.lower() not in SPACE
+    is_named = name.lower() in AXES or alias.lower() not in AXES
     return Axis(name if is_named else alias, unit, sign * step, sign * start)
 
 
 def placed(
     request: Request,
-    axes: Sequence[Axis],
-    attributes: Mapping[str, Any],
     shape: Sequence[int],
+    attributes: Mapping[str, Any],
+    axes: Sequence[Axis] = (),
     order: str = "",
 ) -> dict[str, Any]:
     """Return what a ``Volume`` says of the place of an array: which axes are kept, and where.
@@ -273,9 +253,10 @@ def placed(
     order of the array's axes; ``spacing``, ``origin`` and the columns of ``direction`` are x, y, z.
     ``order`` is that of axes without names.
     """
+    axes = axes or [Axis()] * len(shape)
     names = ["" if axis.name in UNNAMED else axis.name.strip().lower() for axis in axes]
-    in_space = [n for n, name in enumerate(names) if name in SPACE]
-    is_named = sorted(names[n] for n in in_space) == list(SPACE)
+    in_space = [n for n, name in enumerate(names) if name in AXES]
+    is_named = sorted(names[n] for n in in_space) == list(AXES)
     index = request.pick(shape, in_space if is_named else None, names)
     kept, order = kept_of(index), order or request.axes
     notes = tuple[str, ...]()
@@ -284,7 +265,7 @@ def placed(
     elif not is_named and any(names[n] for n in kept):
         called = ", ".join(names[n] or "?" for n in kept)
         notes = (f"its axes are named {called}: taken as {', '.join(order)}",)
-    world = [axes[kept[order.index(name)]] for name in SPACE]
+    world = [axes[kept[order.index(name)]] for name in AXES]
     is_one, told = one_unit([axis.unit for axis in world])
     spacing = origin = None
     if is_one and all(axis.step for axis in world):
@@ -294,25 +275,28 @@ def placed(
     if "element_size_um" in attributes:
         spacing = as_triple(attributes["element_size_um"], "element_size_um")
     signs = [-1 if (axes[n].step or 0) < 0 else 1 for n in kept]
+    stated: dict[str, Any] = {k: as_triple(attributes[k], k) for k in PLACE[:2] if k in attributes}
+    if "direction" in attributes:
+        stated["direction"] = check_direction(np.squeeze(attributes["direction"]))
     place = {"spacing": spacing, "origin": origin, "direction": axes_direction(order) * signs}
-    stated = {"place": stated_place(attributes), "notes": notes + told}
-    return {**place, **stated, "index": index, "axes": order}
+    return {**place, "place": stated, "notes": notes + told, "index": index, "axes": order}
 
 
-def stored(values: Any, attributes: Mapping[str, Any], none: Any = None) -> tuple[Any, Any, Any]:
-    """Return how a ``Volume`` loads an array of a file, as ``of_array``.
+def stored(
+    values: Any, attributes: Mapping[str, Any] | None = None, none: Any = None
+) -> tuple[Callable[[Index], Any], tuple[int, ...], np.dtype[Any]]:
+    """Return how a ``Volume`` loads an array of a file, its shape and its type.
 
     By the conventions for climate and forecast data a value is ``scale_factor`` times the number,
     plus ``add_offset``; ``none``, or ``_FillValue``, is no value.
     """
-    dtype = np.dtype(values.dtype)
-    is_packed = "scale_factor" in attributes or "add_offset" in attributes
-    is_packed |= dtype.kind == "f" and "_FillValue" in attributes
-    if not is_packed:
-        return of_array(values)
-    factor = float(np.ravel(attributes.get("scale_factor", 1))[0])
-    offset = float(np.ravel(attributes.get("add_offset", 0))[0])
-    missing = np.ravel(attributes.get("_FillValue", none))
+    said, shape, dtype = attributes or {}, tuple(values.shape), np.dtype(values.dtype)
+    is_packed = "scale_factor" in said or "add_offset" in said
+    if not (is_packed or (dtype.kind == "f" and "_FillValue" in said)):
+        return lambda index: values[index], shape, dtype
+    factor = float(np.ravel(said.get("scale_factor", 1))[0])
+    offset = float(np.ravel(said.get("add_offset", 0))[0])
+    missing = np.ravel(said.get("_FillValue", none))
     kind = np.result_type(dtype, np.float32)
 
     def load(index: Index) -> Any:
@@ -321,4 +305,4 @@ def stored(values: Any, attributes: Mapping[str, Any], none: Any = None) -> tupl
         unpacked[np.isin(numbers, missing)] = np.nan
         return unpacked
 
-    return load, tuple(values.shape), kind
+    return load, shape, kind

@@ -10,8 +10,7 @@ import re
 from typing import Any
 
 from ...errors import FileError
-from ...options import LPS
-from . import PLACE, Axis, Request, Volume, measured, of_array, placed, stored, triple
+from . import PLACE, Axis, Request, Volume, measured, placed, stored, triple
 
 INTEGERS = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
 NUMBERS = ("double", "single", "logical", *INTEGERS)  # of MATLAB
@@ -23,42 +22,33 @@ ORDER = "its axes are taken as x, y, z, the order of ndgrid; of meshgrid save pe
 def read_hdf5(request: Request) -> Volume:
     """Read ``FILE.h5:/DATASET``; without a name the only dataset of three axes."""
     datasets = _datasets_in(request)
-    if "/ITKImage/0/VoxelData" in datasets:  # in LPS, with a direction a row
-        spacing, origin, directions, values = (
-            datasets[f"/ITKImage/0/{name}"]
-            for name in ("Spacing", "Origin", "Directions", "VoxelData")
+    if (image := "/ITKImage/0/") + "VoxelData" in datasets:  # in LPS, with a direction a row
+        spacing, origin, directions = (
+            datasets[image + name][:] for name in ("Spacing", "Origin", "Directions")
         )
-        place: dict[str, Any] = {
-            "spacing": triple(spacing[:][::-1]),
-            "origin": triple(origin),
-            "space": LPS,
-        }
-        return _volume_of(values, {**place, "direction": directions[:].T[:, ::-1]})
+        world = triple(spacing[::-1]), triple(origin), directions.T[:, ::-1]
+        return Volume(*_stored(datasets[image + "VoxelData"]), *world, space="LPS")
     shapes = {name: values.shape or () for name, values in datasets.items()}
-    values = datasets[request.choose_array(shapes, "3D dataset")]
+    values = datasets[request.choose_array(shapes)]
     axes, beside = _axes(values), values.file.get(IMARIS, values).attrs
-    place = placed(request, axes, values.attrs, values.shape)
+    place = placed(request, values.shape, values.attrs, axes)
     if not any(axis.name for axis in axes):
         order = ", ".join(place["axes"])
         place["notes"] += (f"its axes have no names: taken as {order} (--axes is another order)",)
     listed = ", ".join(sorted(str(name) for name in beside if SIZES.search(name)))
     if place["spacing"] is None and listed:
         place["notes"] += (f"{listed}: not read (give --spacing and --origin)",)
-    return _volume_of(values, place)
+    return Volume(*_stored(values), **place)
 
 
 def _datasets_in(request: Request) -> dict[str, Any]:
     """Return the datasets of a file by their paths, without links to other files."""
     import h5py
 
-    file, found = request.files.enter_context(h5py.File(request.path, "r")), dict[str, Any]()
-
-    def note(name: str, entry: Any) -> None:
-        if isinstance(entry, h5py.Dataset):
-            found[f"/{name}"] = entry
-
-    file.visititems(note)
-    return found
+    file, names = request.files.enter_context(h5py.File(request.path, "r")), list[str]()
+    file.visit(names.append)
+    entries = {f"/{name}": file[name] for name in names}
+    return {name: each for name, each in entries.items() if isinstance(each, h5py.Dataset)}
 
 
 def _axes(values: Any) -> list[Axis]:
@@ -71,20 +61,20 @@ def _axes(values: Any) -> list[Axis]:
     for dim, count in zip(values.dims, values.shape):
         scale = _check_own(dim[0]) if len(dim) else None
         name = dim.label or str(getattr(scale, "name", "")).rsplit("/", 1)[-1]
-        axes.append(measured(name, count, scale, getattr(scale, "attrs", {})))
+        axes.append(measured(name, count, scale))
     return axes
 
 
 def _check_own(values: Any) -> Any:
     """Return a dataset; FileError if its numbers are in other files, which may be any."""
-    if values.is_virtual or values.external:
+    if getattr(values, "is_virtual", False) or getattr(values, "external", None):
         raise FileError(f"the numbers of {values.name} are in other files: save them in this one")
     return values
 
 
-def _volume_of(values: Any, place: dict[str, Any]) -> Volume:
-    """Return a dataset at its place."""
-    return Volume(*stored(_check_own(values), values.attrs), **place)
+def _stored(values: Any) -> tuple[Any, Any, Any]:
+    """Return how a ``Volume`` loads a dataset, or an array."""
+    return stored(_check_own(values), getattr(values, "attrs", {}))
 
 
 def read_netcdf(request: Request) -> Volume:
@@ -97,12 +87,10 @@ def read_netcdf(request: Request) -> Volume:
     file = request.files.enter_context(netcdf_file(request.path, mmap=False))
     variables = file.variables
     shapes = {f"/{name}": values.shape for name, values in variables.items()}
-    values = variables[request.choose_array(shapes, "variable of three axes")[1:]]
-    axes = []
-    for name, count in zip(values.dimensions, values.shape):
-        scale = variables.get(name)
-        axes.append(measured(name, count, scale, getattr(scale, "_attributes", {})))
-    place = placed(request, axes, values._attributes, values.shape)
+    values = variables[request.choose_array(shapes)[1:]]
+    scales = map(variables.get, values.dimensions)
+    axes = list(map(measured, values.dimensions, values.shape, scales))
+    place = placed(request, values.shape, values._attributes, axes)
     return Volume(*stored(values.data, values._attributes), **place)
 
 
@@ -115,21 +103,18 @@ def read_mat(request: Request) -> Volume:
     import h5py
     from scipy.io import loadmat, whosmat
 
-    is_hdf5 = h5py.is_hdf5(request.path)
-    if is_hdf5:
-        datasets = {name[1:]: values for name, values in _datasets_in(request).items()}
-        kinds = {name: each.attrs.get("MATLAB_class", b"") for name, each in datasets.items()}
-        numeric = [name for name, kind in kinds.items() if str(kind, "ascii") in NUMBERS]
-        shapes = {name: datasets[name].shape or () for name in numeric if "/" not in name}
-        values = datasets[request.choose_array(shapes)]
-        stated = {key: _check_own(datasets[key])[()].T for key in PLACE if key in datasets}
+    if is_hdf5 := h5py.is_hdf5(request.path):
+        found = {name[1:]: values for name, values in _datasets_in(request).items()}
+        kinds = {name: each.attrs.get("MATLAB_class", b"").decode() for name, each in found.items()}
+        listed = [(name, found[name].shape or (), kind) for name, kind in kinds.items()]
     else:
-        shapes = {name: shape for name, shape, kind in whosmat(request.path) if kind in NUMBERS}
-        name = request.choose_array(shapes)
-        variables = loadmat(request.path, variable_names=[name, *PLACE])
-        stated = {key: variables[key] for key in PLACE if key in variables}
-        values = variables[name].T  # planes of the last axis are contiguous
-    axes = [Axis()] * len(values.shape)
-    place = placed(request, axes, stated, values.shape, request.axes[::-1])
+        listed = whosmat(request.path)
+    shapes = {name: shape for name, shape, kind in listed if kind in NUMBERS and "/" not in name}
+    name = request.choose_array(shapes)
+    if not is_hdf5:  # planes of the last axis are contiguous
+        loaded = loadmat(request.path, variable_names=[name, *PLACE])
+        found = {key: loaded[key].T for key in (name, *PLACE) if key in loaded}
+    stated = {key: _check_own(found[key])[()].T for key in PLACE if key in found}
+    place = placed(request, found[name].shape, stated, order=request.axes[::-1])
     place["notes"] = (ORDER,) if request.axes == "xyz" else ()
-    return _volume_of(values, place) if is_hdf5 else Volume(*of_array(values), **place)
+    return Volume(*_stored(found[name]), **place)

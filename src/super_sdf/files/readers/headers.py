@@ -1,9 +1,14 @@
-"""NRRD, with pynrrd, and MetaImage, with SimpleITK: headers in text, which may name data files.
+"""Files of one array behind a header: NRRD, MetaImage, NIfTI and its kin, MRC.
 
-Both libraries open whatever file a header names: names are checked before. Coordinates of NRRD are
-those of the file's own space (LPS, RAS, ...). SimpleITK turns them all to LPS, takes spacings by
-axis mins and maxs for 1, and refuses bzip2, an axis of time, and spacings beside a space; and of
-MetaImage, which is LPS, it takes a torn zlib stream for data, so the stream is checked here.
+NRRD is read with pynrrd, MetaImage with SimpleITK. Both open whatever data file a header names:
+names are checked before. Coordinates of NRRD are those of the file's own space (LPS, RAS, ...).
+SimpleITK turns them all to LPS, takes spacings by axis mins and maxs for 1, and refuses bzip2, an
+axis of time, and spacings beside a space; and of MetaImage, which is LPS, it takes a torn zlib
+stream for data, so the stream is checked here.
+
+NIfTI, FreeSurfer and Analyze are read with nibabel: RAS. Analyze states sizes and spacing only, and
+not which side is left; a pair ``.hdr`` and ``.img`` of NIfTI states all. MRC and CCP4 maps are read
+with mrcfile: lengths are in angstrom, values are densities.
 """
 
 from __future__ import annotations
@@ -15,18 +20,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ...options import LPS, RAS
 from ..formats import check_beside, split_header
-from . import LABELS, Index, Names, Request, Volume, from_affine, kept_of, one_unit, triple
+from . import DENSITY, LABELS, Index, Names, Request, Volume, from_affine, kept_of, one_unit, triple
 
-SPACES = {"right-anterior-superior": RAS, "ras": RAS, "left-posterior-superior": LPS, "lps": LPS}
+SPACES = dict.fromkeys(("right-anterior-superior", "ras"), "RAS")
+SPACES |= dict.fromkeys(("left-posterior-superior", "lps"), "LPS")
 # Fields in one spelling of those that the format allows
 SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
-
 # What a MetaImage file may state: that data is a zlib stream, which byte of a number is first
 TRUE = re.compile(rb"^ *(CompressedData|\w+ByteOrderMSB) *[=:] *[Tt1]", re.M)
+PAIRS = (".img", ".IMG", ".img.gz")  # beside a ``.hdr``
+UNITS = {1: "metre", 3: "micrometre"}  # of lengths in NIfTI, but for millimetres
+INTENT_LABEL = 1002
+VOLUME_STACKS = 401  # space groups of MRC from here on are of stacks of volumes
 
 
 def read_nrrd(request: Request) -> Volume:
@@ -34,7 +43,7 @@ def read_nrrd(request: Request) -> Volume:
     import nrrd
 
     path, (text, entry, start) = request.path, split_header(request.path)
-    files = [check_beside(path, name) for name in _names_of(path, entry, start)]
+    files = _named_files(path, entry, start)
     # pynrrd reads no lists: of several files it gets the header without them
     raw = nrrd.read_header(text.splitlines(True) if len(files) > 1 else str(path))
     header = {SPELT.get(name, name): value for name, value in raw.items()}
@@ -63,16 +72,16 @@ def read_nrrd(request: Request) -> Volume:
     )
 
 
-def _names_of(path: Path, entry: str, start: int) -> list[str]:
+def _named_files(path: Path, entry: str, start: int) -> list[Path]:
     """Return the data files that a header names: one, ``NAME%03d.raw 1 20 1``, or a list."""
+    names = [entry] * (entry.upper() not in ("", "LOCAL"))
     if entry.upper().startswith("LIST"):
         lines = path.read_bytes()[start:].decode(errors="surrogateescape").splitlines()
-        return [line.strip() for line in lines if line.strip()]
-    if "%" not in entry:
-        return [entry] * (entry.upper() not in ("", "LOCAL"))
-    pattern, first, last, *step = entry.split()
-    numbers = range(int(first), int(last) + 1, *map(int, step[:1]))
-    return [pattern % number for number in numbers]
+        names = [line.strip() for line in lines if line.strip()]
+    elif "%" in entry:
+        pattern, first, last, *step = entry.split()
+        names = [pattern % n for n in range(int(first), int(last) + 1, *map(int, step[:1]))]
+    return [check_beside(path, name) for name in names]
 
 
 def _segments(raw: dict[str, Any], layer: int) -> Names:
@@ -128,16 +137,13 @@ def read_metaimage(request: Request) -> Volume:
     path, (text, entry, start) = request.path, split_header(request.path)
     if not start:
         raise FileError("its header is damaged: it has no ElementDataFile")
-    files = [check_beside(path, name) for name in _names_of(path, entry, start)]
+    files = _named_files(path, entry, start)
     data, start = (files[0], 0) if files else (path, start)
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
     reader = SimpleITK.ImageFileReader()
     reader.SetFileName(str(path))
     reader.SetImageIO("MetaImageIO")
-    try:
-        reader.ReadImageInformation()
-    except RuntimeError:
-        raise FileError("its header is damaged, or not that of a MetaImage file") from None
+    reader.ReadImageInformation()
     size = reader.GetSize()
     if (components := reader.GetNumberOfComponents()) != 1:
         raise GridError(f"{path} has {components} numbers a sample: give a file of three axes")
@@ -162,4 +168,81 @@ def read_metaimage(request: Request) -> Volume:
     steps, origin = (np.array(said)[kept] for said in (reader.GetSpacing(), reader.GetOrigin()))
     direction = np.array(reader.GetDirection()).reshape(len(size), -1)[np.ix_(kept, kept)]
     place = triple(np.abs(steps)), triple(origin), direction * np.sign(steps)
-    return Volume(load, size, dtype, *place, index, space=LPS)
+    return Volume(load, size, dtype, *place, index, space="LPS")
+
+
+def read_nifti(request: Request) -> Volume:
+    """Read a NIfTI file or pair, a file of FreeSurfer, or the ``.hdr`` of Analyze.
+
+    The affine is nibabel's: of NIfTI the sform if there is one, else the qform. Without both, and
+    of Analyze, the axes of the array are x, y and z, as ITK and method 1 of the standard have it;
+    nibabel mirrors x. Values are scaled by the slope and intercept of the header.
+    """
+    import nibabel
+
+    if request.path.suffix.lower() == ".hdr":
+        beside = [request.path.with_suffix(end) for end in PAIRS]
+        check_beside(request.path, next((o for o in beside if o.exists()), beside[0]).name)
+    image: Any = nibabel.load(request.path, mmap=False)
+    proxy, shape, header = image.dataobj, image.shape, image.header
+    place: dict[str, Any] = {"index": request.pick(shape, kept=(0, 1, 2))}
+    is_placed = isinstance(image, nibabel.MGHImage)
+    if "xyzt_units" in header:
+        is_placed = any(int(header[code]) for code in ("sform_code", "qform_code"))
+        place["notes"] = one_unit([UNITS.get(int(header["xyzt_units"]) & 7, "")])[1]
+        place["hint"] = LABELS if int(header["intent_code"]) == INTENT_LABEL else ""
+    if is_placed:
+        place |= {**from_affine(header.get_best_affine()), "space": "RAS"}
+    else:
+        place["spacing"] = triple(np.abs(header.get_zooms()[:3]))
+    dtype = np.asarray(proxy[(slice(0, 1),) * len(shape)]).dtype
+    return Volume(lambda at: proxy[at], shape, dtype, **place)
+
+
+read_mgh = read_analyze = read_nifti
+
+
+def read_mrc(request: Request) -> Volume:
+    """Read a ``.mrc``, ``.map``, ``.rec`` or ``.ccp4`` file, or one that is packed with gzip.
+
+    Columns, rows and sections run along the world's axes in the order of ``mapc``, ``mapr`` and
+    ``maps``. The origin is the field of this name, in angstrom; if it is 0 the place of the first
+    sample in the unit cell, in samples.
+    """
+    import mrcfile
+    from mrcfile.utils import data_dtype_from_header
+
+    with mrcfile.open(request.path, permissive=True, header_only=True) as opened:
+        header = opened.header
+    sizes = tuple(int(header[f"n{axis}"]) for axis in "zyx")
+    order = [int(header[name]) - 1 for name in ("maps", "mapr", "mapc")]
+    order = [2, 1, 0] if order == [-1] * 3 else order
+    cell, angles, origin = (
+        np.array(header[name].tolist(), np.float64) for name in ("cella", "cellb", "origin")
+    )
+    if header.ispg >= VOLUME_STACKS and header.mz != header.nz:
+        raise GridError(f"it is a stack of volumes of {header.mz} sections: save one of them")
+    directions = _axes_of_cell(angles if angles.all() else np.full(3, 90.0))
+    counts = np.array([int(header[name]) for name in ("mx", "my", "mz")])
+    steps = cell / np.maximum(counts, 1)
+    is_stated = bool((cell > 0).all() and (counts > 0).all())
+    if not origin.any():
+        origin[order] = [int(header[f"n{axis}start"]) for axis in "zyx"]
+        origin = directions @ (origin * steps)
+
+    def load(index: Index) -> Any:
+        with mrcfile.open(request.path, permissive=True) as opened:
+            if opened.data is None:
+                raise FileError("it is truncated")
+            return opened.data
+
+    place = triple(steps[order]) if is_stated else None, triple(origin), directions[:, order]
+    return Volume(load, sizes, data_dtype_from_header(header), *place, hint=DENSITY)
+
+
+def _axes_of_cell(angles: Any) -> NDArray[np.float64]:
+    """Return unit vectors along a, b and c of a cell, in columns: a along x, b with y (PDB)."""
+    alpha, beta, gamma = np.cos(np.radians(angles)).round(12)
+    height = np.sqrt(1 - gamma**2)
+    x, y = beta, (alpha - beta * gamma) / height
+    return np.array([[1, 0, 0], [gamma, height, 0], [x, y, np.sqrt(1 - x**2 - y**2)]]).T

@@ -20,20 +20,18 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ...errors import FileError
-from . import PLACE, Request, Volume, axes_direction, of_array, stated_place, triple
+from . import PLACE, Request, Volume, placed, stored, triple
 
 OPEN3D = ("key", "voxel_size", "block_resolution", "attr_name_tsdf", "attr_name_weight")
 SDF_HEADER = struct.Struct("<3i6f")
 SDF_TAGGED = re.compile(rb"#sdf 1\r?\ndim +(\d{1,9}) +(\d{1,9}) +(\d{1,9})\s*\ndata\r?\n")
 SDF_TEXT = re.compile(rb"[\s\d.+\-a-zA-Z]+")
-FLOAT = np.dtype("<f4")
 
 
 def read_npy(request: Request) -> Volume:
     """Read an ``.npy`` file, which is mapped into memory."""
     values = np.load(request.path, mmap_mode="r", allow_pickle=False)
-    place: dict[str, Any] = {"direction": axes_direction(request.axes), "axes": request.axes}
-    return Volume(*of_array(values), index=request.pick(values.shape), **place, is_mapped=True)
+    return Volume(*stored(values), **placed(request, values.shape, {}), is_mapped=True)
 
 
 def read_npz(request: Request) -> Volume:
@@ -55,10 +53,8 @@ def read_npz(request: Request) -> Volume:
             shapes[key], _, dtypes[key] = read(file)
     is_plain = "values" in keys and request.member is None
     name = "values" if is_plain else request.choose_array(shapes)
-    place: dict[str, Any] = {"direction": axes_direction(request.axes), "axes": request.axes}
-    place["place"] = stated_place({key: archive[key] for key in keys & set(PLACE)})
-    index = request.pick(shapes[name])
-    return Volume(lambda at: archive[name][at], shapes[name], dtypes[name], index=index, **place)
+    place = placed(request, shapes[name], {key: archive[key] for key in keys & set(PLACE)})
+    return Volume(lambda at: archive[name][at], shapes[name], dtypes[name], **place)
 
 
 def _blocks_of_open3d(request: Request, archive: Any) -> Volume:
@@ -73,7 +69,7 @@ def _blocks_of_open3d(request: Request, archive: Any) -> Volume:
     whole = np.full(shape, np.nan, samples.dtype)
     for (x, y, z), block in zip(starts, samples):
         whole[x : x + side, y : y + side, z : z + side] = block
-    return Volume(*of_array(whole), (step,) * 3, triple(step * side * low))
+    return Volume(*stored(whole), (step,) * 3, triple(step * side * low))
 
 
 def read_sdf(request: Request) -> Volume:
@@ -88,12 +84,12 @@ def read_sdf(request: Request) -> Volume:
         shape = tuple(map(int, words[:3]))
         x, y, z, spacing = map(float, words[3:7])
         values = np.array(words[7:], np.float32).reshape(shape[::-1]).T
-        return Volume(*of_array(values), (spacing,) * 3, (x, y, z))
+        return Volume(*stored(values), (spacing,) * 3, (x, y, z))
     else:
         start, fields = SDF_HEADER.size, SDF_HEADER.unpack(beginning[: SDF_HEADER.size])
         shape, low, high = fields[:3], np.array(fields[3:6]), fields[6:]
         if min(shape) < 1 or not (high > low).all():
             raise FileError("it is neither SDFGen's text nor a binary grid")
         place = {"spacing": triple((high - low) / shape), "origin": triple(low)}
-    values = np.memmap(path, FLOAT, "r", start)
-    return Volume(*of_array(values.reshape(shape)), **place, is_mapped=True)
+    values = np.memmap(path, "<f4", "r", start)
+    return Volume(*stored(values.reshape(shape)), **place, is_mapped=True)

@@ -6,7 +6,7 @@ a place, and takes missing slices for evenly spaced ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,14 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ...options import LPS
 from ..formats import check_beside
 from . import LABELS, Index, Names, Request, Volume, triple
 
-EVEN, EVEN_FRAMES = (
-    0.01,
-    0.1,
-)  # share of the step by which slices may be off, and frames of segments
+EVEN, EVEN_FRAMES = 0.01, 0.1  # of the step, by which slices, and frames of segments, may be off
 PARALLEL = 1e-4  # by which components of directions may differ
 PREAMBLE = 128  # bytes before the mark DICM
 BEYOND = 2  # empty slices on both sides of those that a segmentation stores
@@ -33,7 +29,7 @@ STATED = (
     *("ReferencedSegmentNumber", "SpacingBetweenSlices", "SliceThickness"),
 )
 """Of a frame, or of all, in the header or in groups."""
-Image = tuple[Path, Any]  # a file and its header
+Use = Callable[[NDArray[Any], "_Frame", NDArray[Any]], None]
 
 
 class _Frame(NamedTuple):
@@ -49,10 +45,6 @@ class _Frame(NamedTuple):
     segment: float  # its number, 0 if none is stated, as the next two
     between: float  # spacing between slices
     thickness: float
-
-
-Use = Callable[[NDArray[Any], _Frame, NDArray[Any]], None]
-"""Takes a plane of a volume, which is 0 at first, a frame in it, and the values of the frame."""
 
 
 def read_dicom(request: Request) -> Volume:
@@ -79,11 +71,11 @@ def read_dicom(request: Request) -> Volume:
     return _of_segments(frames, images[0][1], labels, chosen)
 
 
-def _images_in(path: Path) -> dict[str, list[Image]]:
-    """Return the images of each series in a folder, or of a file."""
+def _images_in(path: Path) -> dict[str, list[tuple[Path, Any]]]:
+    """Return the files and headers of each series in a folder, or of a file."""
     import pydicom
 
-    series: dict[str, list[Image]] = {}
+    series: dict[str, list[tuple[Path, Any]]] = {}
     names = [each.name for each in path.iterdir() if not each.is_dir()] if path.is_dir() else []
     for file in [check_beside(path, name) for name in sorted(names)] if path.is_dir() else [path]:
         with file.open("rb") as opened:
@@ -98,7 +90,7 @@ def _images_in(path: Path) -> dict[str, list[Image]]:
     return series
 
 
-def _frames(images: list[Image]) -> Iterator[_Frame]:
+def _frames(images: list[tuple[Path, Any]]) -> Iterator[_Frame]:
     """Yield the frames of images; GridError if they are no slices of a volume."""
     for path, header in images:
         if header.get("SamplesPerPixel", 1) != 1 or "ModalityLUTSequence" in header:
@@ -106,9 +98,10 @@ def _frames(images: list[Image]) -> Iterator[_Frame]:
         frames = header.get("PerFrameFunctionalGroupsSequence") or [header]
         if len(frames) != int(header.get("NumberOfFrames") or 1):
             raise GridError(f"{path.name} has frames without a place each: save it as NIfTI")
-        shared = _elements(header.get("SharedFunctionalGroupsSequence") or ())
+        shared = header.get("SharedFunctionalGroupsSequence") or ()
         for number, frame in enumerate(frames):
-            stated = {} if frame is header else {**shared, **_elements([frame])}
+            groups = () if frame is header else (*shared, frame)
+            stated = {each.keyword: each.value for group in groups for each in group.iterall()}
             values = [stated.get(name, header.get(name)) for name in STATED]
             if not all(values[:3]):
                 raise GridError(f"{path.name} states no place: it is no slice of a volume")
@@ -117,11 +110,6 @@ def _frames(images: list[Image]) -> Iterator[_Frame]:
             scale = slope if values[3] is not None else 1.0, intercept
             about: Any = corner, across.reshape(2, 3), steps, scale, *others
             yield _Frame(path, number, (header.Rows, header.Columns), *about)
-
-
-def _elements(groups: Iterable[Any]) -> dict[str, Any]:
-    """Return the elements in functional groups, and in the sequences in them, by keyword."""
-    return {each.keyword: each.value for group in groups for each in group.iterall()}
 
 
 def _pixels(frame: _Frame) -> NDArray[Any]:
@@ -153,9 +141,9 @@ def _heights(frames: list[_Frame]) -> NDArray[np.float64]:
 def _volume(
     frames: list[_Frame], planes: NDArray[Any], step: float, use: Use, dtype: Any, **more: Any
 ) -> Volume:
-    """Return the volume whose planes frames fill, as many empty ones beyond the last as before.
+    """Return the volume of frames, with as many empty planes beyond the last as before the first.
 
-    Frames of segments may be off from even steps by more than slices; planes may lean.
+    ``use`` gets a plane, which is 0 at first, a frame in it, and the values of the frame.
     """
     first, last = frames[int(planes.argmin())], frames[int(planes.argmax())]
     normal, lean = np.cross(*first.across), last.corner - first.corner
@@ -163,11 +151,9 @@ def _volume(
     origin = first.corner - planes.min() * shift
     off = [float(np.linalg.norm(f.corner - origin - n * shift)) for f, n in zip(frames, planes)]
     if not max(off) < (EVEN_FRAMES if more else EVEN) * step:
-        raise GridError(
-            f"{frames[int(np.argmax(off))].path.name} is {max(off):.4g} mm off from even steps of "
-            f"{step:.6g}: put all slices of one volume (one time, one echo) into a folder, or "
-            "resample the series"
-        )
+        said = f"{frames[int(np.argmax(off))].path.name} is {max(off):.4g} mm off from even steps"
+        one = "put all slices of one volume (one time, one echo) into a folder"
+        raise GridError(f"{said} of {step:.6g}: {one}, or resample the series")
     shape = int(planes.max() + planes.min()) + 1, *first.shape
 
     def load(index: Index) -> NDArray[Any]:
@@ -181,7 +167,7 @@ def _volume(
     length = float(np.linalg.norm(shift))
     direction = np.column_stack([*first.across, shift / length])
     place = triple((*first.spacing[::-1], length)), triple(origin), direction
-    return Volume(load, shape[::-1], dtype, *place, space=LPS, **more)
+    return Volume(load, shape[::-1], dtype, *place, space="LPS", **more)
 
 
 def _of_images(frames: list[_Frame]) -> Volume:
@@ -203,10 +189,7 @@ def _of_images(frames: list[_Frame]) -> Volume:
 def _of_segments(
     frames: list[_Frame], header: Any, labels: dict[int, str], chosen: list[int]
 ) -> Volume:
-    """Return the numbers of the segments, or 1 in those ``chosen``; else 0.
-
-    Of fractions, what is over a half is inside.
-    """
+    """Return the numbers of the segments, or 1 in those ``chosen``; else 0."""
     heights = _heights(frames)
     gaps = np.diff(np.unique(heights.round(4)))
     step = frames[0].between or (float(gaps.min()) if len(gaps) else frames[0].thickness)
@@ -219,7 +202,7 @@ def _of_segments(
         if is_map:
             plane[:] = np.isin(values, chosen) if chosen else values
         elif not chosen or frame.segment in chosen:
-            inside = values > most / 2
+            inside = values > most / 2  # of fractions
             if plane[inside].any():
                 said = f"{frame.path}:{labels[int(frame.segment)]}"
                 raise GridError(f"its segments overlap: give one of them, {said}")

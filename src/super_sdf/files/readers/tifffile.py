@@ -29,15 +29,13 @@ def read_tiff(request: Request) -> Volume:
     series = file.series[0]
     shape, names = series.shape, series.axes.lower()
     if len(shape) < 3 or "s" in names:
-        raise GridError(
-            f"{request.path} has axes {series.axes} of shape {shape}: give a stack of three axes "
-            "(z, y, x), without colours"
-        )
+        said = f"{request.path} has axes {series.axes} of shape {shape}"
+        raise GridError(f"{said}: give a stack of three axes (z, y, x), without colours")
     if request.axes != "zyx" or not {*"xyz"} <= {*names}:  # pages are z, whatever they are called
         names = names[:-3] + request.axes
     stated = _imagej_axes(file) if ome is None else _ome_axes(ome)
     axes, order = [stated.get(name, Axis(name)) for name in names], [n for n in names if n in "xyz"]
-    place = placed(request, axes, {}, shape, "".join(order))
+    place = placed(request, shape, {}, axes, "".join(order))
     return Volume(lambda index: series.asarray()[index], shape, series.dtype, **place)
 
 

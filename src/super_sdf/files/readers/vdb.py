@@ -39,8 +39,8 @@ VERSION, LIBRARY = 224, (5, 0)  # that is written, and the first library with it
 ZIP, ACTIVE_MASK, BLOSC = 1, 2, 4  # flags of a grid's compression
 # How the inactive values of a node are stored: 0 to 2 have one; in 3 to 5 a mask chooses between
 # two (in 3 the background, where it is set, and minus that); the last stores every value.
-ONE_VALUE, MASKED, MASKED_ONE, MASKED_TWO, ALL = 2, 3, 4, 5, 6
-STATED = {ONE_VALUE: 1, MASKED_ONE: 1, MASKED_TWO: 2}  # inactive values in a node
+MASKED, ALL = 3, 6
+STATED = (0, 0, 1, 0, 1, 2, 0)  # how many inactive values a node has itself
 EDGES = (4096, 128, 8)  # voxels along a node below the root, along one below that, and a leaf
 LEAF = EDGES[2]
 CUBE = (LEAF,) * 3
@@ -48,7 +48,7 @@ WIDTHS = EDGES[0] // EDGES[1], EDGES[1] // LEAF  # children along an edge of the
 F4, F8 = np.dtype("<f4"), np.dtype("<f8")
 TYPES: dict[str, np.dtype[Any]] = {"Tree_float_5_4_3": F4, "Tree_double_5_4_3": F8}
 HALF = "_HalfFloat"  # ends the type of a grid whose values are stored in 16 bits
-NUMBERS = {"float": "f", "double": "d", "int64": "q"}  # of metadata
+NUMBERS = {"float": "f", "double": "d"}  # of metadata
 # How many vectors a map has: the translation, and five of the scale
 MAPS = {"TranslationMap": 1, "ScaleMap": 5, "ScaleTranslateMap": 6}
 PICOGK_MM = 1000  # PicoGK states the size of a voxel in metres, and works in millimetres
@@ -70,21 +70,16 @@ def read_vdb(request: Request) -> Volume:
     kind, file.place = grids[request.choose(list(grids), "grid of floating-point values")]
     (flags,), metadata, matrix = file.numbers("I"), file.metadata(), _transform(file)
     tree = _Tree(file, kind, flags)
-    if metadata.get("file_voxel_count", tree.active_count) != tree.active_count:
-        raise FileError(f"it is damaged: it has {tree.active_count:,} active voxels, not as stated")
     if not tree.ends:
         raise GridError("it has no active voxel: it holds no surface")
     margin = 0 if np.isnan(tree.empty) else MARGIN
     low, high = np.min(tree.ends, 0) - margin, np.max(tree.ends, 0) + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
 
-    def load(index: Any) -> NDArray[Any]:
-        voxels = tree.voxels(low, high)
-        return voxels if size == 1 else voxels * voxels.dtype.type(size)
-
     matrix = size * np.column_stack([matrix[:, :3], matrix[:, :3] @ low + matrix[:, 3]])
     return Volume(
-        *(load, tuple((high - low).tolist()), tree.dtype),
+        lambda _: tree.voxels(low, high) * tree.dtype.type(size),
+        *(tuple((high - low).tolist()), tree.dtype),
         **from_affine(matrix),
         hint=DISTANCE if metadata.get("class") == "level set" else "",
         notes=("lengths are in millimetres, as PicoGK states",) * (size != 1),
@@ -157,11 +152,10 @@ def _transform(file: _Bytes) -> NDArray[np.float64]:
 
 
 class _Tree:
-    """What a tree holds besides inactive background.
+    """What a tree holds besides inactive background, whose value is ``empty``, NaN if unknown.
 
-    ``cubes`` are tiles and leaves: corner, edge, values (a tile has one), and which of them are no
-    inactive background. ``ends`` are the first voxel, and the one after the last, of each.
-    ``empty`` is the value of inactive background: NaN if it is unknown.
+    ``cubes`` are tiles and leaves: corner, edge, values (a tile has one), and which of them count.
+    ``ends`` are the first voxel, and the one after the last, of each.
     """
 
     def __init__(self, file: _Bytes, kind: str, flags: int) -> None:
@@ -172,20 +166,21 @@ class _Tree:
         self.background = float(file.array(self.dtype, 1)[0])
         self.cubes: list[tuple[Ints, int, Any, Any]] = []
         self.ends: list[Ints] = []
-        self.active_count = 0
-        leaves: list[Ints] = []
         tiles, children = file.numbers("II")
         row = np.dtype([("corner", "<i4", 3), ("value", self.dtype), ("active", "u1")])
         rows = file.array(row, tiles)
         corners = rows["corner"].astype(np.int64)
         self._add_tiles(corners, EDGES[0], rows["value"], rows["active"] & 1 > 0)
+        leaves = list[Ints]()
         for _ in range(children):
-            self._add_node(file.array("<i4", 3).astype(np.int64), 0, leaves)
+            for node in self._children(file.array("<i4", 3).astype(np.int64), 0):
+                for corner in self._children(node, 1):
+                    file.mask(LEAF**3)  # there again before the leaf's values
+                    leaves.append(corner)
         for corner in leaves:  # after the topology, each after its mask
             active = file.mask(LEAF**3)
             values = self._values(active)
             shown = (active | (values != self.background)).reshape(CUBE)
-            self.active_count += int(active.sum())
             if len(places := np.argwhere(shown)):
                 self.cubes.append((corner, LEAF, values.reshape(CUBE), shown))
                 self.ends += [corner + places.min(0), corner + places.max(0) + 1]
@@ -194,34 +189,27 @@ class _Tree:
 
     def _add_tiles(self, corners: Ints, edge: int, values: Any, active: BoolArray) -> None:
         """Take those tiles that are no inactive background."""
-        self.active_count += int(active.sum()) * edge**3
         for n in np.flatnonzero(active | (values != self.background)):
             self.cubes.append((corners[n], edge, values[n], True))
             self.ends += [corners[n], corners[n] + edge]
 
-    def _add_node(self, corner: Ints, depth: int, leaves: list[Ints]) -> None:
-        """Take the tiles of a node, and its children, which are nodes or leaves."""
+    def _children(self, corner: Ints, depth: int) -> Iterator[Ints]:
+        """Take the tiles of a node, and yield the corners of its children, which are next."""
         edge, count = EDGES[depth + 1], WIDTHS[depth]
         child, active = self.file.mask(count**3), self.file.mask(count**3)
         values = self._values(active)
         corners = corner + edge * np.argwhere(np.ones((count,) * 3, bool))
         self._add_tiles(corners[~child], edge, values[~child], active[~child])
-        for place in corners[child]:
-            if edge > LEAF:
-                self._add_node(place, depth + 1, leaves)
-            else:
-                self.file.mask(LEAF**3)  # there again before the leaf's values
-                leaves.append(place)
+        yield from corners[child]
 
     def _values(self, active: BoolArray) -> NDArray[Any]:
         """Return the next values of a node."""
         file, count = self.file, len(active)
         (state,) = file.numbers("B")
         values = [-self.background if state else self.background, self.background]
-        stated = STATED.get(state, 0)
+        stated = STATED[min(state, ALL)]
         values[:stated] = file.array(self.dtype, stated).tolist()
-        masked = state in (MASKED, MASKED_ONE, MASKED_TWO)
-        selection = file.mask(count) if masked else np.zeros(count, bool)
+        selection = file.mask(count) if MASKED <= state < ALL else np.zeros(count, bool)
         if state >= ALL or not self.flags & ACTIVE_MASK:
             return self._numbers(count)
         filled = np.where(selection, *np.array(values[::-1], self.dtype))
@@ -259,10 +247,7 @@ class _Tree:
 
 
 def write_level_set(field: FineField, path: Path) -> None:
-    """Write a refined field as a file with one level set, ``surface``.
-
-    NoSurfaceError if there is none.
-    """
+    """Write a refined field as a file with one level set, ``surface``."""
     grid = fine_grid(field)
     background = np.float32(HALF_WIDTH * grid.voxel_size)
     sides: list[NDArray[np.uint8]] = []  # of the cubes of 8^3 voxels, from that before voxel 0 on
@@ -300,23 +285,19 @@ def _slabs(field: FineField, background: np.float32) -> Iterator[FloatArray]:
 
     Beyond the lattice are distances from a surface that its border is nearest to.
     """
-    lattice = FineLattice(field)
-    inner, least, beyond = [], [], []  # along each axis
-    for n in lattice.shape:
-        at = np.arange(-LEAF, LEAF * -(-(n + HALF_WIDTH - 1) // LEAF))
-        inner.append(at.clip(0, n - 1))
-        depth = np.minimum(inner[-1], n - 1 - inner[-1])  # no node is deeper inside than that
-        least.append((depth * -background / HALF_WIDTH).astype(np.float32) + np.float32(0))
-        beyond.append(np.abs(at - inner[-1]) * background / HALF_WIDTH)
-    least_across = np.maximum(least[1][:, None], least[2])
-    beyond_across = np.hypot(beyond[1][:, None], beyond[2])
-    for first in range(0, len(inner[0]), LEAF):
+    lattice, voxel = FineLattice(field), float(background) / HALF_WIDTH
+    places = [np.arange(-LEAF, LEAF * -(-(n + HALF_WIDTH - 1) // LEAF)) for n in lattice.shape]
+    inner = [at.clip(0, n - 1) for at, n in zip(places, lattice.shape)]
+    depths = np.ix_(*(np.minimum(at, n - 1 - at) for at, n in zip(inner, lattice.shape)))
+    beyond = np.ix_(*(np.abs(at - within) for at, within in zip(places, inner)))
+    for first in range(0, len(places[0]), LEAF):
         part = slice(first, first + LEAF)
         x = inner[0][part]
         planes = lattice[int(x[0]) : int(x[-1]) + 1][np.ix_(x - x[0], *inner[1:])]
-        values = np.maximum(planes, np.maximum(least[0][part, None, None], least_across))
-        away = np.hypot(beyond[0][part, None, None], beyond_across).astype(np.float32)
-        yield np.hypot(values, away, out=values, where=away > 0)
+        depth = np.minimum(np.minimum(depths[0][part], depths[1]), depths[2])
+        values = np.maximum(planes, np.float32(0) - (voxel * depth).astype(np.float32))
+        away = voxel * np.hypot(np.hypot(beyond[0][part], beyond[1]), beyond[2])
+        yield np.hypot(values, away.astype(np.float32), out=values, where=away > 0)
 
 
 def _about(grid: SdfGrid, count: int) -> bytes:
@@ -341,10 +322,7 @@ def _about(grid: SdfGrid, count: int) -> bytes:
 def _topology(
     sides: NDArray[np.uint8], leaves: dict[tuple[int, ...], bytes], background: np.float32
 ) -> tuple[bytes, list[tuple[int, ...]]]:
-    """Return the tree without the leaves' values, and the places of the leaves in its order.
-
-    A cube that is not all outside has a node of 128^3; what is inside is tiles of 8^3.
-    """
+    """Return the tree without the leaves' values, and the places of the leaves in its order."""
     width, before = WIDTHS[1], WIDTHS[1] - 1  # whole nodes, from that before voxel 0 on
     padded = np.pad(sides, [(before, -(before + n) % width) for n in sides.shape])
     x, y, z = (n // width for n in padded.shape)

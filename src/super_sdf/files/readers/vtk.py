@@ -11,7 +11,7 @@ import numpy as np
 
 from ...errors import FileError, GridError, OptionTypeError, seen
 from ...grid.samples import even_steps
-from . import XYZ, Request, Volume, of_array, triple
+from . import XYZ, Request, Volume, stored, triple
 
 NAME = "the image"  # in memory, in error messages
 MARKS = ("vtkGhostType", "vtkValidPointMask")
@@ -35,6 +35,7 @@ def read_vtk(request: Request) -> Volume:
         reader.ReadAllFieldsOn()
     vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
     said, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    request.files.callback(vtkOutputWindow.SetInstance, before)
     vtkOutputWindow.SetInstance(said)
     reader.SetFileName(str(request.path))
     reader.UpdateInformation()
@@ -43,7 +44,6 @@ def read_vtk(request: Request) -> Volume:
         extent = np.array(about.Get(key), object)
         request.check_fits(extent[1::2] - extent[::2] + 1, np.dtype("u1"))
     reader.Update()
-    vtkOutputWindow.SetInstance(before)
     image = reader.GetOutputDataObject(0)
     if image is None or "error" in said.GetOutput().lower():
         raise FileError("VTK finds it damaged, or truncated")
@@ -54,13 +54,10 @@ def read_vtk(request: Request) -> Volume:
         if len(text[start:].split()) < sum(each.GetNumberOfValues() for each, _ in arrays.values()):
             raise FileError("it is truncated")
     # what has several numbers a sample, and VTK's own marks, is read only if it is named
-    plain = [
-        name
-        for name, (array, _) in arrays.items()
-        if name == request.member
-        or (array.GetNumberOfComponents() == 1 and name.removeprefix("CellData/") not in MARKS)
-    ]
-    name = request.choose(plain or list(arrays), "array of points or cells")
+    single = [name for name, (array, _) in arrays.items() if array.GetNumberOfComponents() == 1]
+    plain = [name for name in single if name.removeprefix("CellData/") not in MARKS]
+    names = plain if plain and request.member not in arrays else list(arrays)
+    name = request.choose(names, "array of points or cells")
     return _volume_of(image, name, *arrays[name], *request.numbers)
 
 
@@ -93,8 +90,7 @@ def _volume_of(image: Any, name: str, array: Any, of_points: bool, *numbers: int
     extent = np.array(image.GetExtent()) if hasattr(image, "GetExtent") else np.zeros(6, int)
     direction, first = XYZ, extent[::2]  # which need not be 0
     if image.IsA("vtkImageData"):
-        matrix = image.GetDirectionMatrix()
-        direction = np.array([[matrix.GetElement(i, j) for j in range(3)] for i in range(3)])
+        direction = np.reshape(image.GetDirectionMatrix().GetData(), (3, 3))
         spacing, origin = image.GetSpacing(), image.GetOrigin()
     elif image.IsA("vtkRectilinearGrid"):
         places = [vtk_to_numpy(getattr(image, f"Get{axis}Coordinates")()) for axis in "XYZ"]
@@ -104,12 +100,12 @@ def _volume_of(image: Any, name: str, array: Any, of_points: bool, *numbers: int
         said = f"it holds {image.GetClassName()}, no image data"
         raise GridError(f"{said}: sample its distances on a lattice, and write that as .vti")
     shape = tuple(int(n) for n in extent[1::2] - extent[::2] + of_points)
-    components, length = array.GetNumberOfComponents(), array.GetNumberOfTuples()
+    if (count := array.GetNumberOfTuples()) != prod(shape):
+        raise GridError(f"its array {name!r} has {count:,} samples, its shape is {shape}")
+    components = array.GetNumberOfComponents()
     if components != 1 and not (len(numbers) == 1 and numbers[0] < components):
         said = f"its array {name!r} has {components} numbers per sample"
         raise GridError(f"{said}: give an array of one, or NAME[0]")
-    if length != prod(shape):
-        raise GridError(f"its array {name!r} has {length:,} values for {prod(shape):,} samples")
     start = direction @ (np.array(spacing) * (first + (0 if of_points else 0.5)))
     values = vtk_to_numpy(array).reshape(*shape[::-1], -1)[..., numbers[0] if numbers else 0].T
-    return Volume(*of_array(values), triple(spacing), triple(np.array(origin) + start), direction)
+    return Volume(*stored(values), triple(spacing), triple(np.array(origin) + start), direction)

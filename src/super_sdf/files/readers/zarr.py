@@ -40,47 +40,46 @@ def read_zarr(request: Request) -> Volume:
 
     path = request.path
     store: Any = str(path)
-    for _, metadata in _metadata_of(request):
+    for metadata in _metadata_in(path):
         for codec in _codecs_in(json.loads(metadata)):
             if codec not in CODECS:
-                raise FileError(
-                    f"{path} names the codec {seen(codec)}, which is not among those that are "
-                    f"read ({', '.join(sorted(CODECS))}): store it with one of these"
-                )
+                known = f"those that are read ({', '.join(sorted(CODECS))})"
+                said = f"{path} names the codec {seen(codec)}, which is not among {known}"
+                raise FileError(f"{said}: store it with one of these")
     if not path.is_dir():
         store = request.files.enter_context(zarr.storage.ZipStore(store, mode="r"))
     root = zarr.open(store, mode="r")
     nodes = {"": root, **dict(root.members(None) if isinstance(root, zarr.Group) else ())}
-    name = _choose(nodes, request)
-    array, axes = nodes.get(name), _image_axes(nodes, name)
+    levels = _levels(nodes)
+    name = _choose(nodes, levels, request)
+    array = nodes.get(name)
     if not isinstance(array, zarr.Array):
         raise FileError(f"{path} is damaged: its metadata names no array at {name!r}")
     attributes = array.attrs.asdict()
-    if axes is None:
+    if name not in levels:
         axes = _named_axes(nodes, name)
-    elif {*"xyz"} <= {axis.name for axis in axes} and len(axes) == array.ndim:
-        attributes = {}
     else:
-        raise GridError(f"its {array.ndim} axes are not named z, y, x by its metadata")
+        axes, attributes = _image_axes(*levels[name][1:]), {}
+        if not {*"xyz"} <= {axis.name for axis in axes} or len(axes) != array.ndim:
+            raise GridError(f"its {array.ndim} axes are not named z, y, x by its metadata")
     none = array.fill_value if array.metadata.zarr_format == 2 else None  # as xarray takes it
-    place = placed(request, axes, attributes, array.shape)
+    place = placed(request, array.shape, attributes, axes)
     return Volume(*stored(array, attributes, none), **place)
 
 
-def _metadata_of(request: Request) -> Iterator[tuple[str, bytes]]:
+def _metadata_in(path: Path) -> Iterator[bytes]:
     """Yield the files with metadata in a store, out of which no link may lead."""
-    path = request.path
     if not path.is_dir():
         with zipfile.ZipFile(path) as archive:
             keys = [key for key in archive.namelist() if Path(key).name in METADATA]
-            yield from ((key, archive.read(key)) for key in keys)
+            yield from map(archive.read, keys)
         return
     for at, inner, names in os.walk(path):
         for each in (Path(at, name) for name in (*inner, *names)):
             if each.is_symlink() or not (each.is_dir() or each.is_file()):
                 check_beside(path, each.relative_to(path).as_posix())
             if each.name in METADATA:
-                yield each.relative_to(path).as_posix(), each.read_bytes()
+                yield each.read_bytes()
 
 
 def _codecs_in(metadata: Any) -> Iterator[str]:
@@ -95,49 +94,45 @@ def _codecs_in(metadata: Any) -> Iterator[str]:
             yield from _codecs_in(each)
 
 
-def _levels(nodes: dict[str, Any]) -> Iterator[tuple[str, str, Any, Any]]:
-    """Yield group and array of each level of OME-NGFF's images, and metadata of image and level."""
+def _levels(nodes: dict[str, Any]) -> dict[str, tuple[str, Any, Any]]:
+    """Return group, and metadata of image and level, of the arrays of OME-NGFF's images."""
+    levels: dict[str, tuple[str, Any, Any]] = {}
     for group, node in nodes.items():
         attributes = node.attrs.asdict()
         for image in attributes.get("ome", attributes).get("multiscales") or ():
             for level in image["datasets"]:
-                yield group, f"{group}/{str(level['path']).strip('/')}".strip("/"), image, level
+                name = f"{group}/{str(level['path']).strip('/')}".strip("/")
+                levels.setdefault(name, (group, image, level))
+    return levels
 
 
-def _choose(nodes: dict[str, Any], request: Request) -> str:
+def _choose(nodes: dict[str, Any], levels: dict[str, Any], request: Request) -> str:
     """Return the array to read: of an image the finest level, unless another is named."""
-    shapes = {
-        f"/{name}": node.shape for name, node in sorted(nodes.items()) if hasattr(node, "shape")
-    }
-    named = (request.member or "").strip("/")
-    is_group = bool(named) and any(name.startswith(f"/{named}/") for name in shapes)
-    before = f"/{named}/" if is_group else "/"
-    if is_group or request.member is None:
-        for group, name, *_ in _levels(nodes):
-            if group == before.strip("/"):
+    group = (request.member or "").strip("/")
+    if group in nodes and not hasattr(nodes[group], "shape"):
+        for name, (of_image, *_) in levels.items():
+            if of_image == group:
                 return name
+        before, request = f"/{group}/".replace("//", "/"), replace(request, member=None)
+    else:
+        before = "/"
+    shapes = {f"/{name}": getattr(node, "shape", ()) for name, node in sorted(nodes.items())}
     inner = {name: shape for name, shape in shapes.items() if name.startswith(before)}
-    asked = replace(request, member=None) if is_group else request
-    return asked.choose_array(inner, "3D array").strip("/")
+    return request.choose_array(inner).strip("/")
 
 
 def _named_axes(nodes: dict[str, Any], name: str) -> list[Axis]:
     """Return the axes of an array by the names of its dimensions, and by arrays of these names."""
-    array, axes = nodes[name], []
+    array, folder = nodes[name], name.rpartition("/")[0]
     said = getattr(array.metadata, "dimension_names", None)
-    names = [str(each or "") for each in said or array.attrs.get("_ARRAY_DIMENSIONS") or ()]
-    for axis, count in zip(names if len(names) == array.ndim else [""] * array.ndim, array.shape):
-        scale: Any = nodes.get(f"{name.rpartition('/')[0]}/{axis}".lstrip("/")) if axis else None
-        axes.append(measured(axis, count, scale, getattr(scale, "attrs", {})))
-    return axes
+    said = said or array.attrs.get("_ARRAY_DIMENSIONS") or ()
+    names = [str(each or "") for each in said] if len(said) == array.ndim else [""] * array.ndim
+    scales = (nodes.get(f"{folder}/{axis}".lstrip("/")) if axis else None for axis in names)
+    return list(map(measured, names, array.shape, scales))
 
 
-def _image_axes(nodes: dict[str, Any], name: str) -> list[Axis] | None:
-    """Return the axes of an array that is a level of an image of OME, None if it is of none."""
-    found = [(image, level) for _, path, image, level in _levels(nodes) if path == name]
-    if not found:
-        return None
-    image, level = found[0]
+def _image_axes(image: Any, level: Any) -> list[Axis]:
+    """Return the axes of an array that is a level of an image of OME-NGFF."""
     axes = [axis if isinstance(axis, dict) else {"name": axis} for axis in image.get("axes", "zyx")]
     steps = [*level.get(TRANSFORMS, ()), *image.get(TRANSFORMS, ())]  # in this order
     scale, shift = np.ones(len(axes)), np.zeros(len(axes))
