@@ -52,7 +52,7 @@ def refine_band(
     """Return the fine field of a band: the steps from the network to the final values."""
     steps = steps or Steps()
     grid, patches = band.grid, band.patches
-    table = neighbour_table(band.voxel_ijk, grid.shape)
+    table = neighbour_table(band.voxel_ijk, grid.shape, threads)
     voxels = np.flatnonzero(band.decoded).astype(np.int32)
     own_ijk = band.voxel_ijk[voxels]
     if grid.field.network is not None:

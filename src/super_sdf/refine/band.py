@@ -21,7 +21,7 @@ from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError, NoSurfaceError
 from ..grid.samples import let_go, over_three, planes_at_once
 from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
-from ..threads import over_threads
+from ..threads import over_threads, worthwhile_threads
 from .bounds import FARTHEST, SampleSpheres
 
 HALF_BAND = 3.0  # Eq. 2 after Eq. 4: 1.5 h
@@ -273,7 +273,7 @@ def gather_patches(rescaled: FloatArray, voxel_ijk: IntArray) -> FloatArray:
     return np.asarray(padded.ravel().take(around))
 
 
-def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArray:
+def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, int, int], threads: int = 1) -> IntArray:
     """Return the neighbour table (V, 27) of voxels (V, 3), all different and in C order.
 
     It has their rows at the 27 places of ``NEIGHBOURHOOD`` round each, -1 where there is no voxel.
@@ -281,17 +281,19 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, int, int]) -> IntArra
     """
     strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1])
     keys = voxel_ijk.astype(np.int64) @ strides  # ascending; a step beyond the grid has no key
-    rows = np.arange(len(keys), dtype=np.int32)
-    table = np.full((len(keys), 27), -1, np.int32)
-    table[:, CENTRE] = rows
-    at = np.empty(0, np.int64)
-    for place, step in enumerate((NEIGHBOURHOOD[:CENTRE] @ strides).tolist()):
-        if place % 3 == 0:  # the next two are beside it along z
-            at = np.searchsorted(keys, keys + step)
-        found = keys[at] == keys + step
-        table[found, place] = at[found]
-        table[at[found], 26 - place] = rows[found]  # a neighbour's neighbour
-        at += found
+    table, steps = np.full((len(keys), 27), -1, np.int32), (NEIGHBOURHOOD @ strides).tolist()
+    table[:, CENTRE] = np.arange(len(keys))
+
+    def find(first: int) -> None:  # at a place and the next two, which are beside it along z
+        at = np.searchsorted(keys, keys + steps[first])
+        for place in range(first, min(first + 3, CENTRE)):
+            is_there = keys.take(at) == keys + steps[place]
+            row = np.flatnonzero(is_there)
+            there = at.take(row)
+            table[row, place], table[there, 26 - place] = there, row  # a neighbour's neighbour
+            at += is_there
+
+    list(over_threads(find, range(0, CENTRE, 3), worthwhile_threads(27 * len(keys), threads)))
     return table
 
 
