@@ -3,13 +3,10 @@
 import hashlib
 import json
 import os
-import random
 import shutil
 import signal
 import subprocess
 import sys
-import time
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -335,33 +332,6 @@ def test_a_batch_that_is_ended_or_killed_leaves_no_process_and_goes_on(number, b
     facts = batch("in", "--spacing", 1, "--origin", "0")[1]
     assert facts["failed"] == 1 and facts["closed"] == 11
     assert len(rows()) >= 12 and finished >= 2 and not Path("out/.super-sdf-parts").exists()
-
-
-def test_after_kills_at_random_moments_nothing_is_lost_and_nothing_made_twice():
-    """Workers and batches are killed; afterwards each mesh is as its only row says."""
-
-    def recorded():
-        return report.read_bytes().count(b"\n") if report.exists() else 0
-
-    larger_grids(30)
-    chance, report = random.Random(0), Path("out/report.jsonl")
-    words = ("batch", "in", "--out", "out", "--jobs", 2, *SMALL)
-    for _ in range(4):
-        before, process = recorded(), start_command(*words)
-        while process.poll() is None and recorded() == before:  # a fast machine may be through
-            time.sleep(0.01)
-        time.sleep(chance.uniform(0, 0.3))
-        with suppress(psutil.NoSuchProcess, IndexError):
-            psutil.Process(process.pid).children()[-1].kill()
-        time.sleep(chance.uniform(0, 0.2))
-        process.kill()
-        process.communicate()
-    done = start_command(*words)
-    done.communicate(timeout=PATIENCE)
-    made = [row for row in rows() if row["status"] == "ok"]
-    assert len(made) - len({row["out"] for row in made}) <= 4  # rows before they were moved
-    assert len({row["out"] for row in made}) == 33 == len(contents())
-    assert all(is_made(row) for row in {row["out"]: row for row in made}.values())
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="PYTHONSAFEPATH is of Python 3.11")

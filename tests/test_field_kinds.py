@@ -90,6 +90,7 @@ KINDS = {
     "rounded to tenths": (np.rint(10 * box()) / 10, "distance"),
     "rounded to whole numbers": (np.rint(torus()), "noisy"),
     "the whole part": (np.trunc(torus()), "noisy"),
+    "the whole part of halves": (np.trunc(2 * torus()) / 2, "noisy"),
     "noise": (noisy(box()), "noisy"),
     "little noise": (noisy(box(), 0.05), "noisy"),
     "an ellipsoid's polynomial": (ellipsoid() * 32 / 14, "smooth"),
@@ -198,7 +199,22 @@ LABELS = {
 def test_labels_without_a_choice_are_refused(name, spacing):
     said = refusal(GridError, make_grid, LABELS[name], spacing=spacing, origin=0)
     assert said.startswith("no solid is chosen: they look like labels (0, ")
-    assert re.search(r"choose one with label=\d+, or mesh all with labels='all'$", said)
+    assert re.search(
+        r"choose one with label=\d+, or mesh all with reconstruct_labels\(values\)$", said
+    )
+
+
+@pytest.mark.parametrize(("times", "values"), [(10, cube(0.01)), (2, torus())])
+def test_whole_numbers_in_another_unit_are_scaled(times, values):
+    """They are neither labels, of which 4 of 6 neighbours are equal, too, nor densities."""
+    stored = np.rint(times * values).astype(np.int16)
+    said = refusal(GridError, make_grid, stored, **PLACE)
+    assert said.startswith("they are distances in another unit than the spacing: ")
+    scale = float(re.search(r"scale=([.\d]+)", said)[1])
+    assert scale == pytest.approx(1 / times, rel=0.1)
+    found, exact = make_grid(stored, **PLACE, scale=scale), make_grid(values, **PLACE)
+    volume = reconstruct(exact, trilinear).volume()
+    assert reconstruct(found, trilinear).volume() == pytest.approx(volume, rel=0.02)
 
 
 def pieces(mesh) -> list:

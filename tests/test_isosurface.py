@@ -8,15 +8,7 @@ from hypothesis.extra import numpy as hnp
 from scipy.spatial import cKDTree
 from skimage.measure import marching_cubes
 
-from super_sdf import (
-    Mesh,
-    SdfGrid,
-    extract_mesh,
-    load_network,
-    reconstruct,
-    threads as limits,
-    upsample,
-)
+from super_sdf import Mesh, SdfGrid, extract_mesh, load_network, reconstruct, threads, upsample
 from super_sdf.refine.band import neighbour_table
 from super_sdf.refine.bounds import SampleSpheres
 from super_sdf.refine.field import FineField
@@ -45,8 +37,8 @@ def dense_field(lattice: np.ndarray, factor: int = 2) -> tuple[FineField, SdfGri
 def test_threads_change_nothing(monkeypatch):
     field, grid = dense_field(np.random.default_rng(0).normal(size=(13, 11, 15)))
     one, keys = extract(field, grid, mesher="sharp", cap=False)
-    monkeypatch.setattr(limits, "CHUNK", 5000)
-    monkeypatch.setattr(limits, "MIN_PER_THREAD", 1000)
+    monkeypatch.setattr(threads, "CHUNK", 5000)
+    monkeypatch.setattr(threads, "MIN_PER_THREAD", 1000)
     other, same = extract(field, grid, mesher="sharp", cap=False, threads=3)
     for a, b in ((one.vertices, other.vertices), (one.faces, other.faces), (keys, same)):
         np.testing.assert_array_equal(a, b)

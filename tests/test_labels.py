@@ -155,7 +155,7 @@ UNFIT = {
 def test_labels_may_be_nearly_whole_and_unknown_in_places(factor, fast):
     """As nibabel stores them, and resampled atlases; the advice to choose one can be followed."""
     whole = nested() + 0.0
-    stored = factor * whole
+    stored = factor * whole + NOISE.normal(0, 1e-7, whole.shape)
     stored[0] = np.nan
     said = refusal(GridError, make_grid, stored, spacing=1)
     assert said.startswith("no solid is chosen: they look like labels (-3, 0, 7, 9, 40): ")
@@ -313,6 +313,11 @@ def test_labels_are_chosen_by_name(command, boxes):
         rows, _ = convert(command, boxes, "t.stl", "all", "--names", "t.json", "--force")
         assert [row["name"] for row in rows] == names
         assert [row["output"] for row in rows] == [f"t-{end}.stl" for end in ends]
+    Path("two.csv").write_text("1,organ\n5,organ\n")
+    rows, _ = convert(command, boxes, "two.ply", "organ", "--names", "two.csv")
+    assert [row["label"] for row in rows] == [1, 5]
+    said = command("upsample", boxes, "no.ply", "--label", "organ", "--names", "two.csv")[2]
+    assert said == "Error: --label organ names 2 labels: give a number\n"
     run = "upsample", boxes, "one.ply", "--force", *PLAIN
     assert command(*run, "--label", 5)[0] == 0
     made = Path("one.ply").read_bytes()

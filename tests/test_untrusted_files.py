@@ -48,6 +48,13 @@ def nrrd_file(*lines: str, data: bytes = RAW) -> str:
     return write("a.nrrd", NRRD, *(f"{line}\n" for line in lines), "\n", data)
 
 
+@pytest.mark.parametrize("line", ["NDims = 3", "DimSize = 24 20 17", "ElementType = MET_FLOAT"])
+def test_metaimage_without_a_field_is_one_line(line, capfd):
+    write("a.mha", MHA.replace(line, "Comment = none"), "ElementDataFile = LOCAL\n", RAW)
+    said = "its header is damaged: NDims, DimSize, ElementType or ElementDataFile is missing"
+    assert said in refusal(FileError, read_grid, "a.mha") and capfd.readouterr().err == ""
+
+
 # Data that is not as its header promises
 
 

@@ -49,6 +49,8 @@ def in_a_line(error: BaseException) -> str:
 def _keyword(found: re.Match[str]) -> str:
     """Return the keyword of Python for a flag and the word behind it, which may be its value."""
     name, value, more = found[1].replace("-", "_"), found[2], ", " if found[3] else ""
+    if (name, value) == ("labels", "all"):
+        return f"reconstruct_labels(values){more}"
     if value in VERBS:
         return f"{name} {value}"
     if value is None or value in WORDS:

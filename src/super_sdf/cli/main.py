@@ -130,8 +130,10 @@ def chosen_options(given: dict[str, Any]) -> Options:
         from ..labels.files import read_names
 
         given["names"] = read_names(given["names"])
-        numbers = {name: number for number, (name, _) in given["names"].items()}
-        given["label"] = numbers.get(given["label"], given["label"])
+        alike = [n for n, (name, _) in given["names"].items() if name == given["label"]]
+        if len(alike) > 1:
+            raise OptionError(f"--label {given['label']} names {len(alike)} labels: give a number")
+        given["label"] = alike[0] if alike else given["label"]
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
         check_modules(flag(name), "simplify")

@@ -267,25 +267,28 @@ def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int
     return kept, np.array([counts[value] for value in values], np.int64)
 
 
-def whole_factor(values: Floats) -> float:
-    """Return the factor near 1 by which values are whole numbers, 0 if they are not."""
-    some = values[np.abs(values) > NEARLY]
-    if not len(some) or np.abs(some).max() < 1 - FACTOR:
+def whole_factor(parts: Iterable[NDArray[Any]]) -> float:
+    """Return the factor near 1 by which all values but NaN are whole numbers, 0 if they are not."""
+    least, off = np.inf, 0.0
+    for values in parts:
+        sizes = np.abs(np.asarray(values, np.float64))
+        least = min(least, float(sizes[sizes > NEARLY].min(initial=np.inf)))
+    factor = least / max(round(least), 1) if least < np.inf else 0.0
+    if abs(factor - 1) > FACTOR:
         return 0.0
-    least = float(np.abs(some).min())
-    factor = least / max(round(least), 1)
-    off = np.abs(some / factor - np.rint(some / factor))
-    is_whole = (off <= np.maximum(NEARLY, 1e-9 * np.abs(some))).all()
-    return factor if abs(factor - 1) <= FACTOR and is_whole else 0.0
+    for values in parts:
+        sizes = np.abs(np.asarray(values, np.float64) / factor)
+        most = np.maximum(NEARLY, 1e-9 * sizes)
+        off = max(off, float(np.nanmax(np.abs(sizes - np.rint(sizes)) / most, initial=0)))
+    return factor if off <= 1 else 0.0
 
 
-def as_labels(samples: SampleArray) -> SampleArray:
-    """Return labels that were stored as floats as whole numbers, NaN as 0; others as they are."""
-    found = different_values(samples) if samples.dtype.kind == "f" else None
-    factor = 0.0 if found is None else whole_factor(found[0].astype(np.float64))
+def as_labels(samples: SampleArray, unknown: float = np.nan) -> SampleArray:
+    """Return labels that were stored as floats as whole numbers; ``unknown`` is put for NaN."""
+    factor = whole_factor(samples) if samples.dtype.kind == "f" else 0.0
     if not factor:
         return samples
-    return changed(samples, lambda planes: np.where(np.isnan(planes), 0, np.rint(planes / factor)))
+    return changed(samples, lambda x: np.where(np.isnan(x), unknown, np.rint(x / factor)))
 
 
 def count_valleys(look: Look, slope: float, sign: int) -> tuple[int, int]:
@@ -312,12 +315,24 @@ def side_of_zeros(look: Look) -> int:
     return int(np.sign(lone[1] - lone[0]))
 
 
-def counted_steps(boxes: Floats) -> float:
-    """Return of how many samples of size 2 the least of 26, or 6, neighbours has size 1; a share.
+def are_no_squares(values: Floats) -> bool:
+    """Return whether values are not all sums of three squares, as 7, 15, 23 and 28 are not."""
+    return bool(np.isin((7, 15, 23, 28), np.unique(values).round(3)).any())
 
-    It is 1 where values count steps to the surface, as chessboard and city-block distances do.
+
+def counted_steps(look: Look) -> float:
+    """Return of how many samples of two steps the least of 26, or 6, neighbours has one; a share.
+
+    It is 1 where values count steps to the surface, as chessboard and city-block distances do. NaN
+    if they are no multiples of one step, or may be squares of distances.
     """
-    size = np.nan_to_num(np.abs(boxes), nan=np.inf)
+    size = np.abs(look.boxes)
+    step = size[size > 0].min(initial=np.inf)
+    size, values = np.nan_to_num(size / step, nan=np.inf), np.abs(look.pairs / step)
+    one_apart = np.quantile(np.abs(np.diff(look.pairs / step, axis=0)), 0.99) < 1 + NEARLY
+    is_even = (np.abs(values - np.rint(values)) <= NEARLY).all()
+    if not (is_even and (one_apart or are_no_squares(values))):
+        return float("nan")
     windows = np.lib.stride_tricks.sliding_window_view(size, (3, 3, 3), axis=(1, 2, 3))
     around = windows[size[:, 1:4, 1:4, 1:4] == 2].reshape(-1, 27)
     of_six = around[:, np.ravel_multi_index(FACES_OF_3.T, (3, 3, 3))]
@@ -410,19 +425,18 @@ def which_level(look: Look, *, signed: bool = False) -> str:
 
 
 def which_label(samples: SampleArray) -> str:
-    """Return the advice to choose a label: the most frequent that is not the border's."""
+    """Return the advice to choose a label: the most frequent but 0 that is not the border's."""
+    samples = as_labels(samples)
     found = different_values(samples)
     if found is None:
         return "they are labels: choose one with --label, or some with --labels"
     distinct, counts = found
     values, frequent = np.unique(np.stack([samples[0], samples[-1]]), return_counts=True)
-    at = np.flatnonzero(distinct != values[frequent.argmax()])
-    nth = at[counts[at].argmax()] if len(at) else 0
-    if distinct.dtype.kind == "f":
-        distinct = np.rint(distinct / (whole_factor(distinct.astype(np.float64)) or 1))
+    at = np.flatnonzero((distinct != values[frequent.argmax()]) & (distinct != 0))
+    best = distinct[at[counts[at].argmax()] if len(at) else 0]
     return (
         f"they look like labels ({named(distinct.tolist())}): choose one with "
-        f"--label {round(distinct[nth].item())}, or mesh all with --labels all"
+        f"--label {round(best.item())}, or mesh all with --labels all"
     )
 
 

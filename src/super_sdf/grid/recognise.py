@@ -27,6 +27,8 @@ from .look import (
     FACES_OF_3,
     Floats,
     Look,
+    are_no_squares,
+    as_labels,
     border_share,
     count_valleys,
     counted_steps,
@@ -59,7 +61,7 @@ ZEROS = 0.25  # share of samples at 0 beside the surface: sides that start at 0 
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
 NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
 ROUGH = 1.0  # fourth differences over slopes: lattices of short periods to .5, transforms from 4.7
-COUNTED = 0.99  # whole numbers one step apart: transforms 1, rounded distances to .976
+COUNTED = 0.99  # multiples of one step: transforms 1, rounded distances to .976
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
 # 4. Unknown samples: steps to a frequent value over the steepest ones; how many of them jump.
 JUMP = 1.5  # cut off 1.0, sentinels from 2
@@ -159,24 +161,26 @@ def recognise(
 
 
 def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool:
-    if look.infinite or not whole_factor(look.pairs.ravel()):
+    if look.infinite or not (factor := whole_factor([look.pairs])):
         return False
-    found = different_values(samples)
-    if found is None or not whole_factor(found[0].astype(np.float64)):
+    found = different_values(as_labels(samples))
+    if found is None or not whole_factor([found[0]]):
         return False
     distinct, counts = found
-    ranks = np.abs(np.diff(np.searchsorted(distinct, look.pairs), axis=0))
+    pairs, part = (np.rint(x / factor) for x in (look.pairs, look.part))
+    ranks = np.abs(np.diff(np.searchsorted(distinct, pairs), axis=0))
     facts["by_rank"] = float((ranks == 1).mean())
-    inner = ~np.isnan(look.part) & (look.part != distinct[counts.argmax()])
+    inner = ~np.isnan(part) & (part != distinct[counts.argmax()])
     if len(distinct) > 3:  # images are cut off at their ends
-        inner &= (look.part != look.low) & (look.part != look.high)
-    equal = equal_neighbours(look.part)[inner]
+        inner &= (part != distinct[0]) & (part != distinct[-1])
+    equal = equal_neighbours(part)[inner]
+    facts["amid"] = float((equal == 6).mean()) if len(equal) else 1.0
     if len(distinct) > 3 and facts["by_rank"] >= BY_RANK:
-        facts["amid"] = float((equal == 6).mean()) if len(equal) else 1.0
         return bool(facts["amid"] >= AMID)
     facts["plateaus"] = float((equal >= 4).mean()) if len(equal) else 1.0
     few = len(distinct) <= FEW_LABELS and look.low >= 0
-    return bool(few or facts["plateaus"] >= PLATEAUS)
+    inside = facts["amid"] >= AMID or look.is_one_sided  # of distances to boxes four are equal
+    return bool(few or (facts["plateaus"] >= PLATEAUS and inside))
 
 
 def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
@@ -214,8 +218,9 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
             facts.update(follow=share, shape=shape, stairs=stairs, step=typical)
             is_many = patterns > min(PATTERNS, OF_ALL * most)
             facts["stepped"] = stairs > STAIRS and is_many and len(cut) < 2
-    if facts["zeros"] and facts.get("by_rank", 0) >= BY_RANK:  # rounded distances may be so, too
-        return counted_steps(look.boxes) >= COUNTED
+    counted = counted_steps(look) if facts["zeros"] and not look.is_one_sided else np.nan
+    if not np.isnan(counted):  # rounded distances may be so, too
+        return counted >= COUNTED
     if facts["follow"] < FOLLOW or (look.is_one_sided and _fades_out(look, given, facts)):
         return False
     rough = np.abs(np.diff(look.box_lines, 4)[..., 0]).sum(1)
@@ -228,15 +233,14 @@ def _fades_out(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
     """Return whether values of one side grow as no transform does, as an image that fades to 0.
 
     Distances grow by a step from sample to sample, unless they are squared: then they are sums of
-    three squares of steps, which 7, 15, 23 and 28 are not. And they have no flat top.
+    squares of steps. And they have no flat top.
     """
     step, values = facts["step"], np.abs(look.pairs)
     longest = step * (1.0 if given is None else float(given.max() / given.min()))
     if np.quantile(np.abs(values[0] - values[1]), 0.99) <= 2 * longest:
         return False
     is_cut = (look.high if look.low >= 0 else look.low) in facts["cut"]
-    squares = np.unique(values / step)
-    return bool(is_cut or np.isin((7, 15, 23, 28), squares.round(3)).any())
+    return is_cut or are_no_squares(values / step)
 
 
 def _jump_over_0(look: Look) -> bool:
@@ -419,6 +423,8 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
     digit = float(np.diff(values).min())
     if np.ptp(values) < IMAGE * digit:
         steps = _before_rounding(look, digit, given, facts)
+        if steps is not None and given is not None and steps is not given:
+            return _distances(look, float(steps[0] / given[0]), given, facts)
         if steps is not None:
             facts["noise"] = digit / float(steps.max()) / 12**0.5  # standard deviation
             why = f"distances rounded to {digit:.3g}"
@@ -446,11 +452,10 @@ def _before_rounding(
     if facts.get("by_rank", 0) >= BY_RANK and abs(steps.max() - 1) < SLOPE_OFF:
         return steps  # whole numbers, of neighbours one apart
     slope = typical_slope(look, steps)
-    if given is None:
-        steps = steps * slope
-    elif not abs(slope - 1) < SLOPE_OFF:
-        return None
-    if not digit <= ROUNDED * steps.max():
+    is_off = not abs(slope - 1) < SLOPE_OFF  # in another unit, if they are
+    steps = steps * slope if given is None or is_off else steps
+    least = MOST_DIGIT if given is not None and is_off else 0.0  # images have finer digits
+    if not least < digit / steps.max() <= ROUNDED:
         return None
     # both of two values may be half a digit off
     off = _contradictions(look, steps, 0.0, noise=1.01 * digit / steps.max() / NOISES)

@@ -131,8 +131,10 @@ def with_numbers(options: Options, names: Names | None) -> Options:
     check_options(options)
     if options.labels == "all":
         return options
-    numbers: dict[Any, int] = {name: number for number, (name, _) in (names or {}).items()}
-    chosen = [numbers.get(label, label) for label in options.labels]
+    numbers: dict[Any, list[int]] = {}  # a name may be that of several labels
+    for number, (name, _) in (names or {}).items():
+        numbers.setdefault(name, []).append(number)
+    chosen = [number for label in options.labels for number in numbers.get(label, [label])]
     if unknown := [label for label in chosen if isinstance(label, str)]:
         some = ", ".join(list(numbers)[:10]) or "none without --names"
         said = f"--labels has {unknown[0]!r}: give numbers, or names of the table ({some})"

@@ -145,7 +145,7 @@ def find_labels(
     samples: Any, wanted: list[int] | None, *, partly: bool
 ) -> tuple[dict[int, int], NDArray[np.int16], list[int]]:
     """Return how many samples each label has, numbers of a ``LabelImage``, and missing labels."""
-    counts, samples = Counter[Any](), as_labels(samples)
+    counts, samples = Counter[Any](), as_labels(samples, unknown=0)
     for plane in samples:  # to save memory
         values, times = np.unique(plane, return_counts=True)
         odd = values[~np.isfinite(values) | (np.rint(values) != values)]

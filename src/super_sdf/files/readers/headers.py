@@ -31,6 +31,7 @@ SPACES |= dict.fromkeys(("left-posterior-superior", "lps"), "LPS")
 # Fields in one spelling of those that the format allows
 SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis maxs"}
 # What a MetaImage file may state: that data is a zlib stream, which byte of a number is first
+NEEDED = re.compile(rb"^ *(NDims|DimSize|ElementType) *[=:] *(?:\d|MET_)", re.M)
 TRUE = re.compile(rb"^ *(CompressedData|\w+ByteOrderMSB) *[=:] *[Tt1]", re.M)
 PAIRS = (".img", ".IMG", ".img.gz")  # beside a ``.hdr``
 UNITS = {1: "metre", 3: "micrometre"}  # of lengths in NIfTI, but for millimetres
@@ -135,8 +136,9 @@ def read_metaimage(request: Request) -> Volume:
     import SimpleITK
 
     path, (text, entry, start) = request.path, split_header(request.path)
-    if not start:
-        raise FileError("its header is damaged: it has no ElementDataFile")
+    if not start or len(set(NEEDED.findall(text))) < 3:
+        said = "NDims, DimSize, ElementType or ElementDataFile is missing"
+        raise FileError(f"its header is damaged: {said}")
     files = _named_files(path, entry, start)
     data, start = (files[0], 0) if files else (path, start)
     SimpleITK.ProcessObject.GlobalWarningDisplayOff()
