@@ -411,17 +411,18 @@ def which_level(look: Look, *, signed: bool = False) -> str:
 
 def which_label(samples: SampleArray) -> str:
     """Return the advice to choose a label: the most frequent that is not the border's."""
-    found = different_values(as_labels(samples))
+    found = different_values(samples)
     if found is None:
         return "they are labels: choose one with --label, or some with --labels"
     distinct, counts = found
-    ends = np.concatenate([np.asarray(samples[i]).ravel() for i in (0, -1)])
-    values, frequent = np.unique(ends, return_counts=True)
+    values, frequent = np.unique(np.stack([samples[0], samples[-1]]), return_counts=True)
     at = np.flatnonzero(distinct != values[frequent.argmax()])
-    best = distinct[at[counts[at].argmax()]] if len(at) else distinct[0]
+    nth = at[counts[at].argmax()] if len(at) else 0
+    if distinct.dtype.kind == "f":
+        distinct = np.rint(distinct / (whole_factor(distinct.astype(np.float64)) or 1))
     return (
         f"they look like labels ({named(distinct.tolist())}): choose one with "
-        f"--label {round(best.item())}, or mesh all with --labels all"
+        f"--label {round(distinct[nth].item())}, or mesh all with --labels all"
     )
 
 
