@@ -26,7 +26,6 @@ from super_sdf import (
 from super_sdf.errors import FileError, OptionError, OptionTypeError, OutOfMemoryError, WriteError
 from super_sdf.files import fields as writing, meshes
 
-NORMAL = np.array([2.0, -1.0, 2.0]) / 3
 SPACING, ORIGIN = 0.3, (7.0, -8.0, 9.0)
 
 
@@ -41,7 +40,7 @@ def plane() -> SdfGrid:
 
 def to_plane(points: np.ndarray) -> np.ndarray:
     """Return the distances of points (..., 3) from the plane."""
-    return (points - ORIGIN - 1.6) @ NORMAL
+    return (points - ORIGIN - 1.6) @ np.array([2.0, -1.0, 2.0]) / 3
 
 
 def tip() -> SdfGrid:

@@ -20,8 +20,6 @@ from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
 from super_sdf.options import Options
 from super_sdf.truth.solid import load_solid, merged, read_mesh
 
-OPTIONS = Options(4, inside="negative")
-
 pytestmark = pytest.mark.usefixtures("folder")
 
 
@@ -99,16 +97,16 @@ REFUSED = {".stl": set(PLACES) - {"near", "microns"}, ".glb": {"beyond single", 
 @pytest.mark.parametrize("name", PLACES)
 def test_a_format_holds_the_mesh_or_refuses_it(name, suffix):
     place(*PLACES[name])
-    run, target = ("in.npz", f"out{suffix}", trilinear, OPTIONS), Path(f"out{suffix}")
+    run, target = ("in.npz", f"out{suffix}", trilinear), Path(f"out{suffix}")
     if name in REFUSED.get(suffix, ()):
-        said = refusal(FileError, convert, *run)
+        said = refusal(FileError, convert, *run, Options(4, inside="negative"))
         assert said == (
             "the format has single precision, in which vertices of the mesh coincide: write .ply "
             "or .obj"
         )
         assert os.listdir() == ["in.npz"]
     else:
-        done, back = convert(*run), read(target)
+        done, back = convert(*run, Options(4, inside="negative")), read(target)
         assert np.isfinite(back.vertices).all() and back.is_closed() and back.volume() > 0
         assert len(back.vertices) == done.facts["vertices"]
         assert len(back.faces) == done.facts["triangles"]

@@ -11,7 +11,6 @@ from solids import box_distance
 from super_sdf.errors import GridError
 from super_sdf.grid.sdf_grid import make_grid
 
-BEYOND = "no surface lies in it"
 FAR = "every wall is nearer to some sample than that, so there is no surface"
 N = 32
 X, Y, Z = np.indices((N, N, N)) - 15.5
@@ -78,7 +77,7 @@ def test_what_only_looks_thin_is_refused_in_one_line(name, spacing):
     elif name in ("a ball that grew away", "never near"):
         want = FAR
     elif name in ("off the border", "a ball beyond the border"):
-        want = BEYOND
+        want = "no surface lies in it"
     elif name == "slow":
         want = "multiply the values, scale=10" if spacing else FAR
     else:
