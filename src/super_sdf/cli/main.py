@@ -131,7 +131,7 @@ def chosen_options(given: dict[str, Any]) -> Options:
 
         given["names"] = read_names(given["names"])
         alike = [n for n, (name, _) in given["names"].items() if name == given["label"]]
-        if len(alike) > 1:
+        if alike[1:]:
             raise OptionError(f"--label {given['label']} names {len(alike)} labels: give a number")
         given["label"] = alike[0] if alike else given["label"]
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
@@ -190,11 +190,12 @@ def main() -> None:
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         pass  # a standard stream was closed, and the next file would get its text
     os.close(number)
-    heard: list[int] = []
+    # not KeyboardInterrupt itself: after one within exec() Python ends itself by SIGINT
+    heard, ended = list[int](), type("Ended", (KeyboardInterrupt,), {})
 
     def hear(number: int, frame: FrameType | None) -> None:
         heard.append(number)
-        raise KeyboardInterrupt
+        raise ended
 
     for number in SIGNALS:
         if signal.getsignal(number) not in (signal.SIG_IGN, None):

@@ -39,7 +39,6 @@ def command(sources: tuple[str, ...], out: Path | None, **given: Any) -> None:
     text = viewed_page(sources, main.chosen_options(given))
     page = out or Path(mkdtemp(prefix="super-sdf-"), "view.html")  # only this user can read it
     write_page(text, page, force=given["force"])
-    address = page.absolute().as_uri()
-    main.print_stderr(address)
+    main.print_stderr(address := page.absolute().as_uri())
     if not given["no_browser"]:
         webbrowser.open(address)
