@@ -82,7 +82,7 @@ class Results:
             row = self.rows.get(task.key(method)) if is_meant else None
             if row and row["error"] is None and row["shape"] not in failed:
                 floor = self.floors.get(row["shape"], {}).get("cd", 0.0)
-                found.append({**row, "excess_cd": row["cd"] - floor})
+                found.append({**row, "excess_cd": row["cd"] - floor} if "cd" in row else row)
         return found
 
 

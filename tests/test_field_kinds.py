@@ -87,6 +87,8 @@ KINDS = {
     "cut off at 1": (np.clip(box(), -1, 1), "distance"),
     "cut off unevenly": (np.clip(box(), -1, 2.5), "distance"),
     "cut off at 0.5": (np.clip(box(), -0.5, 0.5), "distance"),
+    "unknown beyond 2": (np.where(np.abs(torus()) > 2, np.nan, torus()), "distance"),
+    "unknown beyond 3": (np.where(np.abs(box()) > 3, np.nan, box()), "distance"),
     "rounded to tenths": (np.rint(10 * box()) / 10, "distance"),
     "rounded to whole numbers": (np.rint(torus()), "noisy"),
     "the whole part": (np.trunc(torus()), "noisy"),

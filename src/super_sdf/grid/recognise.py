@@ -55,7 +55,7 @@ FEW_LABELS = 8  # different values: rounded distances and images from 11, lesion
 # 3. Transforms: share of the samples beside the surface that equal others with the same 27 signs.
 # Values that do not jump over 0 need the steps of a mask: a share of these samples with other sides
 # along two axes, and many patterns of signs, or many of all. Else faces are along the axes.
-FOLLOW = 0.95  # distances to .94 (but where faces are along the axes), transforms from .957
+FOLLOW = 0.953  # distances to .9502 (but where faces are along the axes), transforms from .957
 STAIRS = 0.2  # solids along the axes to .18, masks of others from .26
 ZEROS = 0.25  # share of samples at 0 beside the surface: sides that start at 0 have .3
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
@@ -356,7 +356,7 @@ def _distances(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any
         facts["slope"] = float(unit)
     if look.is_one_sided:
         return _to_thin_walls(look, steps, facts)
-    outside = 1 if border_share(look, lambda x: x > 0) >= 0.5 else -1
+    outside = -1 if border_share(look, lambda x: x < 0) > 0.5 else 1  # also if none is known
     found, changes = count_valleys(look, float(steps.min()), -outside)
     facts["seams"] = found / max(changes, 1)
     if facts["seams"] > SEAMS:
@@ -403,8 +403,9 @@ def _unsigned(sign: int, h: float, facts: dict[str, Any]) -> Answer:
 
 
 def _is_cut_near(look: Look, given: Floats, facts: dict[str, Any]) -> bool:
-    """Return whether values are distances cut off so near the surface that few slopes are left."""
-    nearest = min(map(abs, facts["cut"]), default=np.inf)
+    """Return whether values are distances cut off, or unknown, so near that few slopes are left."""
+    known = max(-look.low, look.high) if look.unknown or "unknown_values" in facts else np.inf
+    nearest = min(map(abs, facts["cut"]), default=known)
     if nearest >= NARROW * given.max():
         return False
     size = np.abs(look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]) / nearest
