@@ -14,6 +14,7 @@ FLAG = re.compile(r"(?<!install )--([a-z-]+)(?: ('[^']*'|[\w.,+-]*\w))?( (?=--))
 VERBS = ("is", "are", "has", "does", "needs")
 WORDS = ("and", "or", "if", "out", "to", "with", "for")
 SWITCHES = {"open": "cap=False", "cap": "cap=True", "force": "force=True"}
+SWITCHES |= {"labels all": "reconstruct_labels(values)"}
 
 
 class SuperSdfError(Exception):
@@ -49,8 +50,8 @@ def in_a_line(error: BaseException) -> str:
 def _keyword(found: re.Match[str]) -> str:
     """Return the keyword of Python for a flag and the word behind it, which may be its value."""
     name, value, more = found[1].replace("-", "_"), found[2], ", " if found[3] else ""
-    if (name, value) == ("labels", "all"):
-        return f"reconstruct_labels(values){more}"
+    if call := SWITCHES.get(f"{name} {value}"):
+        return call + more
     if value in VERBS:
         return f"{name} {value}"
     if value is None or value in WORDS:

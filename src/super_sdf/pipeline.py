@@ -294,12 +294,11 @@ def mesh_grid(
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
-    # so many voxels are refined in one piece; -1: the grid is cut in any case
-    most = room.voxels() if map_tiles is None and least_tiles == 1 else -1
-    bands = [survey(lattice, chosen.offset, threads=threads, most=most)]
+    in_one_piece = room.voxels() if map_tiles is None and least_tiles == 1 else -1  # at most
+    bands = [survey(lattice, chosen.offset, threads=threads, most=in_one_piece)]
     steps.finish("band")
     whole = bands[0].whole
-    if whole.count <= most:
+    if whole.count <= in_one_piece:
         # popped, so that nothing here keeps the band in memory
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:

@@ -269,7 +269,7 @@ def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int
 
 def whole_factor(parts: Iterable[NDArray[Any]]) -> float:
     """Return the factor near 1 by which all values but NaN are whole numbers, 0 if they are not."""
-    least, off = np.inf, 0.0
+    least = np.inf
     for values in parts:
         sizes = np.abs(np.asarray(values, np.float64))
         least = min(least, float(sizes[sizes > NEARLY].min(initial=np.inf)))
@@ -278,9 +278,9 @@ def whole_factor(parts: Iterable[NDArray[Any]]) -> float:
         return 0.0
     for values in parts:
         sizes = np.abs(np.asarray(values, np.float64) / factor)
-        most = np.maximum(NEARLY, 1e-9 * sizes)
-        off = max(off, float(np.nanmax(np.abs(sizes - np.rint(sizes)) / most, initial=0)))
-    return factor if off <= 1 else 0.0
+        if (np.abs(sizes - np.rint(sizes)) > np.maximum(NEARLY, 1e-9 * sizes)).any():
+            return 0.0
+    return factor
 
 
 def as_labels(samples: SampleArray, unknown: float = np.nan) -> SampleArray:

@@ -179,8 +179,8 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
         return bool(facts["amid"] >= AMID)
     facts["plateaus"] = float((equal >= 4).mean()) if len(equal) else 1.0
     few = len(distinct) <= FEW_LABELS and look.low >= 0
-    inside = facts["amid"] >= AMID or look.is_one_sided  # of distances to boxes four are equal
-    return bool(few or (facts["plateaus"] >= PLATEAUS and inside))
+    has_cores = facts["amid"] >= AMID or look.is_one_sided  # distances to boxes have none
+    return bool(few or (facts["plateaus"] >= PLATEAUS and has_cores))
 
 
 def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:

@@ -69,7 +69,7 @@ class Mesh:
         To find them without sorting all edges, every vertex gets a mark of 46 random bits. At a
         vertex inside the surface, each neighbour follows the vertex in one triangle and precedes it
         in another, so the marks of those that follow, less those that precede, sum to 0. Only edges
-        between vertices where they do not are sorted. By chance a sum is 0 hardly ever.
+        between vertices where they do not are sorted. Sums are hardly ever 0 by chance.
         """
         count = len(self.vertices)
         bits = np.arange(1, count + 1, dtype=np.uint64) * MIXER
