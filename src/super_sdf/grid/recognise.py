@@ -95,6 +95,7 @@ IMAGE = 1 << 17  # 16 bits have 65,535, floats 1e6 and more
 ALIKE = 0.05  # by which ends differ between which distances were cut off: .004, images .2 to 1
 CENTRED = 0.13  # maps of density and statistics to .11, fields from .15
 AREA = 1.0  # fields to 1.11 and d^3 1.02 with centres from .15, maps from 1.14
+RISING = 0.1  # of steps between neighbours, median over steepest: images to .03, distances from .3
 VALLEY = 0.2, 1.5  # unsigned distances .3 to .6; densities .05, noise 3
 ENOUGH = 20  # samples from which a share is evidence
 
@@ -468,10 +469,13 @@ def _is_noise(look: Look, steps: Floats, facts: dict[str, Any]) -> bool:
 def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
     """Return densities, or unsigned distances of one slope or another."""
     sign = 1 if look.low >= 0 else -1
-    steep = float(np.quantile(np.abs(look.pairs[0] - look.pairs[1]), 0.98))
+    change = np.abs(look.pairs[0] - look.pairs[1])
+    steep = float(np.quantile(change, 0.98))
     share = np.count_nonzero(~np.isnan(look.part)) / np.prod(look.shape)
     found = count_valleys(look, steep, sign)[0] / share / float(np.prod(look.shape)) ** (2 / 3)
-    is_unsigned = (look.low if sign > 0 else look.high) not in look.cut
-    if is_unsigned and VALLEY[0] < found < VALLEY[1]:
+    # steps between plateaus, with noise on them, make valleys, too
+    is_rising = np.median(change) > RISING * steep
+    is_cut = (look.low if sign > 0 else look.high) in look.cut
+    if is_rising and not is_cut and VALLEY[0] < found < VALLEY[1]:
         return _unsigned(sign, steep, facts)
     return Answer("density", "", facts, which_level(look))
