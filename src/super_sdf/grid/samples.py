@@ -346,9 +346,8 @@ def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
     if step == 0 or not off <= EVEN * abs(step) + np.spacing(np.abs(coordinates).max()):
         usual = float(np.nanmedian(steps))
         worst = int(np.nan_to_num(np.abs(steps - usual), nan=np.inf).argmax())
-        raise GridError(
-            f"{said} are not evenly spaced: {places[worst]:.6g} is followed by "
-            f"{places[worst + 1]:.6g}, a step of {steps[worst]:.6g} among steps of {usual:.6g}; "
-            f"resample the array (array.interp({name}=...))"
-        )
+        pair = f"{places[worst]:.6g} is followed by {places[worst + 1]:.6g}"
+        pair = f"{pair}, a step of {steps[worst]:.6g} among steps of {usual:.6g}"
+        how = f"resample the array (array.interp({name}=...))"
+        raise GridError(f"{said} are not evenly spaced: {pair}; {how}")
     return first, step

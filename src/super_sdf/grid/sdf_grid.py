@@ -90,8 +90,10 @@ class SdfGrid:
     low: float
     high: float
     field: Field
-    space: str | None
-    on_sample: tuple[BoolArray, ...] | None  # of each axis, if resampled: which planes are samples
+    space: str | None = None
+    on_sample: tuple[BoolArray, ...] | None = (
+        None  # of each axis, if resampled: which planes are samples
+    )
 
     def __init__(
         self,
@@ -172,8 +174,6 @@ class SdfGrid:
             low=low,
             high=high,
             field=field,
-            space=None,
-            on_sample=None,
         )
         return grid
 
@@ -352,13 +352,8 @@ def crop(grid: SdfGrid, low: Index, high: Index) -> SdfGrid:
 
 def describe_place(grid: SdfGrid) -> dict[str, Any]:
     """Return where the samples of a grid lie, for JSON."""
-    return {
-        "shape": list(grid.shape),
-        "spacing": list(grid.spacing),
-        "origin": list(grid.origin),
-        "direction": [list(row) for row in grid.direction],
-        "space": grid.space,
-    }
+    names = ("shape", "spacing", "origin", "direction", "space")
+    return {name: getattr(grid, name) for name in names}
 
 
 def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
