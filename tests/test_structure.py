@@ -200,6 +200,7 @@ def test_one_conversion_loads_little(tmp_path):
     loaded = loaded_by(tmp_path, *words)
     assert not loaded & {"ssl", "email", "xml.sax", "scipy", "trimesh", "dask", "torch"}
     assert len({name for name in loaded if name.startswith("super_sdf")}) <= MOST_LOADED
+    assert "numpy" not in loaded_by(tmp_path, "view", "--help")  # its threads are set before
 
 
 def test_a_batch_without_a_cluster_loads_nothing_of_dask(tmp_path):

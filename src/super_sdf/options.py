@@ -17,8 +17,6 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypedDict, get_args
 
-import numpy as np
-
 from .errors import OptionError, OptionTypeError, flag, seen
 
 FieldKind = Literal["auto", "distance", "noisy", "mask", "smooth"]
@@ -140,8 +138,8 @@ def _bytes(value: Any) -> int:
 ANY, ABOVE_0 = number("a finite number"), number("a number greater than 0", above=0)
 COUNT, POINT = number("", above=0, step=1), numbers((1, 3), "one number, or three")
 LABEL = Kind("a whole number, -2^63 to 2^64 - 1", _label)
-FLAG = having(
-    "True or False, in JSON true or false", lambda value: isinstance(value, (bool, np.bool_)), bool
+FLAG = having(  # also NumPy's, without it: before it is loaded, the command line sets its threads
+    "True or False, in JSON true or false", lambda value: type(value).__name__[:4] == "bool", bool
 )
 PATH = having("the path of a file", lambda value: isinstance(value, (str, PathLike)), Path)
 NETWORK = having("one from load_network()", callable, lambda network: network)
