@@ -32,7 +32,6 @@ from ...arrays import (
     IntArray,
     Numbers,
     Vectors,
-    cross,
     dot,
     unit,
 )
@@ -192,7 +191,7 @@ class Placed:
     def facing(self, corners: tuple[Index, Index, Index], *crossings: Index) -> Numbers:
         """Return the least cosine between triangles, corners (t,) each, and planes of crossings."""
         a, b, c = (self.points.take(corner, 0) for corner in corners)
-        normal = unit(cross(b - a, c - a))
+        normal = unit(np.cross(b - a, c - a))
         least = [dot(normal, self.normal.take(at, 0)) for at in crossings]
         return least[0] if len(least) == 1 else np.minimum(*least)
 
