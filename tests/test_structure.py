@@ -36,8 +36,8 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
-    TOP: 1372,  # 1,250; and ``arrays``, which the design does not count
-    "grid": 2663,  # 1,800
+    TOP: 1309,  # 1,250; and ``arrays``, which the design does not count
+    "grid": 2547,  # 1,800
     "network": 500,
     "refine": 1300,
     "surface": 2200,
@@ -200,7 +200,6 @@ def test_one_conversion_loads_little(tmp_path):
     loaded = loaded_by(tmp_path, *words)
     assert not loaded & {"ssl", "email", "xml.sax", "scipy", "trimesh", "dask", "torch"}
     assert len({name for name in loaded if name.startswith("super_sdf")}) <= MOST_LOADED
-    assert "numpy" not in loaded_by(tmp_path, "view", "--help")  # its threads are set before
 
 
 def test_a_batch_without_a_cluster_loads_nothing_of_dask(tmp_path):

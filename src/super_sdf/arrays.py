@@ -38,18 +38,10 @@ def inner(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def cross(a: Vectors, b: Vectors) -> Vectors:
-    """Return the cross products of vectors, (n, 3)."""
-    product: Vectors = np.empty_like(a)
-    for k in range(3):
-        product[..., k] = a[..., k - 2] * b[..., k - 1] - a[..., k - 1] * b[..., k - 2]
-    return product
-
-
 def face_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
     """Return normals of triangles (m, 3), as long as twice their areas."""
     a, b, c = (points.take(corner, 0) for corner in faces.T)
-    return cross(b - a, c - a)
+    return np.asarray(np.cross(b - a, c - a))
 
 
 def length(vectors: Vectors) -> Numbers:

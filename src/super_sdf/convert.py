@@ -89,24 +89,21 @@ def _reworked(
     mesh: Mesh, grid: SdfGrid, options: Options
 ) -> tuple[Mesh, Simplified | None, list[str]]:
     """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
-    simplified, volume = None, volume_of_samples(grid) if options.keep_volume else None
-    if volume is not None:
+    simplified, notes, volume = None, list[str](), 0.0
+    if options.keep_volume:
         from .labels.volumes import keep_volume, volume_notes
 
+        volume = volume_of_samples(grid)
         mesh = keep_volume(mesh, volume, mean_spacing(grid))
     if options.goals():
         from .simplify.simplify import simplify_mesh
 
-        simplified = simplify_mesh(
-            mesh,
-            error=options.error(grid.voxel_size),
-            triangles=options.triangles,
-            max_memory=options.max_memory,
-        )
+        goal: Any = {"error": options.error(grid.voxel_size), "triangles": options.triangles}
+        simplified = simplify_mesh(mesh, **goal, max_memory=options.max_memory)
         mesh = simplified.mesh
-    if volume is None:
-        return mesh, simplified, []
-    return mesh, simplified, volume_notes({"the mesh": (mesh.volume(), volume)})  # may be off now
+    if options.keep_volume:  # simplification may change it
+        notes = volume_notes({"the mesh": (mesh.volume(), volume)})
+    return mesh, simplified, notes
 
 
 def _facts(

@@ -43,11 +43,7 @@ if TYPE_CHECKING:
 
 
 def refine_band(
-    band: Band,
-    network: Adapter,
-    factor: int,
-    threads: int = 1,
-    steps: Steps | None = None,
+    band: Band, network: Adapter, factor: int, threads: int = 1, steps: Steps | None = None
 ) -> FineField:
     """Return the fine field of a band: the steps from the network to the final values."""
     steps = steps or Steps()
@@ -74,20 +70,12 @@ def refine_band(
         nodes.hold_sides(decoded, factor, patches[voxels, CENTRE])
     nodes.pin_to_skipped(decoded, parts, factor, own_ijk, patches[voxels], grid.shape)
     steps.finish("nodes")
-    unseen, exact = grid.field.unseen, band.exact
+    unseen, leaves, exact = grid.field.unseen, band.whole.leaves, band.exact
     number = np.ravel_multi_index(tuple(band.voxel_ijk[exact].T), grid.shape)
-    return FineField(
-        grid.shape,
-        factor,
-        own_ijk,
-        decoded,
-        parts,
-        grid,
-        band.offset,
-        SampleSpheres(grid.shape, number, patches[exact, CENTRE]),
-        band.whole.leaves,
-        octants=None if unseen is None else seen_octants(unseen, own_ijk),
-    )
+    spheres = SampleSpheres(grid.shape, number, patches[exact, CENTRE])
+    octants = None if unseen is None else seen_octants(unseen, own_ijk)
+    made: Any = {"spheres": spheres, "leaves": leaves, "octants": octants}
+    return FineField(grid.shape, factor, own_ijk, decoded, parts, grid, band.offset, **made)
 
 
 def upsample(

@@ -48,7 +48,7 @@ def cores_of_system() -> int:
 
 def count_cores() -> int:
     """Return the number of cores this process may use; in a container its quota, rounded up."""
-    quotas = _of_groups(lambda quota, period: int(quota) / int(period), "cpu.max")
+    quotas = [float(quota) / int(period) for quota, period in _of_groups("cpu.max")]
     return max(ceil(min([cores_of_system(), *quotas])), 1)
 
 
@@ -63,14 +63,9 @@ def worthwhile_threads(size: int, threads: int) -> int:
     return max(min(threads, size // MIN_PER_THREAD), 1)
 
 
-def rows_in_chunk(width: int) -> int:
-    """Return the rows per chunk when each row needs ``width`` temporaries."""
-    return max(CHUNK // width, 1)
-
-
 def chunks_of(count: int, width: int) -> list[slice]:
     """Cut ``count`` rows into chunks, when each row needs ``width`` temporaries."""
-    step = rows_in_chunk(width)
+    step = max(CHUNK // width, 1)
     return [slice(first, min(first + step, count)) for first in range(0, count, step)]
 
 
@@ -108,13 +103,11 @@ def free_memory() -> int:
 
     Inactive cached files of a container can be dropped.
     """
-
-    def left(most: str, taken: str, *stat: str) -> int:
+    left = [float(psutil.virtual_memory().available)]
+    for most, taken, *stat in _of_groups("memory.max", "memory.current", "memory.stat"):
         cached = int(stat[stat.index("inactive_file") + 1])
-        return max(int(most) - max(int(taken) - cached, 0), 0)
-
-    files = "memory.max", "memory.current", "memory.stat"
-    return min([int(psutil.virtual_memory().available), *_of_groups(left, *files)])
+        left.append(max(float(most) - max(int(taken) - cached, 0), 0))
+    return int(min(left))
 
 
 def held_memory() -> int:
@@ -154,8 +147,8 @@ def give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _of_groups(take: Callable[..., Result], *names: str) -> Iterator[Result]:
-    """Yield what is taken of the words in files of the control groups that this process is in.
+def _of_groups(*names: str) -> Iterator[list[str]]:
+    """Yield the words in files of each control group that this process is in; "inf" for "max".
 
     Groups (version 2), such as those of containers, are nested; the tightest limit counts. In a
     container the path of the group may not exist: what is mounted there is the group itself.
@@ -163,8 +156,9 @@ def _of_groups(take: Callable[..., Result], *names: str) -> Iterator[Result]:
     with suppress(OSError, IndexError):  # not Linux, or version 1
         inner = GROUPS / OWN.read_text().split("0::/")[1].split("\n")[0]
         for group in (inner, *inner.parents):
-            with suppress(OSError, ValueError):  # no such file, or the limit is "max"
-                yield take(*" ".join((group / name).read_text() for name in names).split())
+            with suppress(OSError):  # no such file
+                words = " ".join((group / name).read_text() for name in names).split()
+                yield ["inf" if word == "max" else word for word in words]
 
 
 Progress = Callable[[int, int], None]

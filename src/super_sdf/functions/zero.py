@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, Numbers, Vectors, cross, dot, face_normals, length, sums_at, unit
+from ..arrays import BoolArray, Numbers, Vectors, dot, face_normals, length, sums_at, unit
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..surface.mesh import Mesh
@@ -239,7 +239,7 @@ def overlapping_in_plane(points: Vectors, first: NDArray[Any], second: NDArray[A
     one, other, normals = one[rows], other[rows], normals[rows]
     for triangle in (one, other):
         for k in range(3):
-            across = cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
+            across = np.cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
             mine, theirs = dot(one, across), dot(other, across)
             beyond = np.minimum(mine.max(1), theirs.max(1)) - np.maximum(mine.min(1), theirs.min(1))
             overlap[rows] &= beyond > TOUCHING
