@@ -202,6 +202,13 @@ def test_one_conversion_loads_little(tmp_path):
     assert len({name for name in loaded if name.startswith("super_sdf")}) <= MOST_LOADED
 
 
+def test_a_command_chooses_the_threads_of_blas_before_numpy_starts_them(tmp_path):
+    (tmp_path / "numpy.py").write_text("import os; exit(os.environ['OPENBLAS_NUM_THREADS'])")
+    script = [sys.executable, "-c", "import super_sdf.cli.main"]
+    run = subprocess.run(script, env={"PYTHONPATH": str(tmp_path)}, capture_output=True)
+    assert run.stderr.split() == [b"1"]
+
+
 def test_a_batch_without_a_cluster_loads_nothing_of_dask(tmp_path):
     words = "batch", "examples", "--out", str(tmp_path), "--quality", "fast", "--jobs", "1", "-q"
     assert not loaded_by(tmp_path, *words) & {"dask", "distributed", "tornado"}

@@ -151,9 +151,7 @@ def spoilt(task, network):
     part = make_tile(task, network)
     if task.tile.inner_low != (0, 0, 0):
         return replace(part, worker="worker 7")
-    keys = part.keys.copy()
-    keys[~part.mine] += 1
-    return replace(part, keys=keys, worker="worker 3")
+    return replace(part, keys=part.keys + ~part.mine, worker="worker 3")
 
 
 @pytest.mark.parametrize("cap", [True, False])

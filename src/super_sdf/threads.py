@@ -24,7 +24,7 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 CHUNK = 1 << 19  # temporaries (array elements) per chunk, so that they stay in cache
-MIN_PER_THREAD = 1 << 20  # array elements; with fewer, a thread costs more than it saves
+MIN_PER_THREAD = 1 << 21  # array elements; with fewer, a thread costs more than it saves
 MAX_INDEX = 2**31 - 1  # of vertices and nodes, as in mesh files; beyond, one would mean another
 
 GROUPS, OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
