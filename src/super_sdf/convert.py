@@ -111,7 +111,7 @@ def _facts(
 ) -> dict[str, Any]:
     """Return what is known of a mesh, for JSON."""
     notes, warnings = list(made.lattice.notes), _warnings(grid, made, options.offset)
-    capped, columns = options.cap and made.leaves, mesh.vertices.T  # in world units
+    capped, columns = options.cap and made.whole.leaves, mesh.vertices.T  # in world units
     if capped:
         closed = "its surface is closed along the border (leave it open with --open)"
         notes.append(f"the solid runs out of the grid: {closed}")
@@ -119,7 +119,8 @@ def _facts(
         notes.append(f"{grid.field.kind} values show no edges: the mesh is that of marching cubes")
     facts = {
         **describe_place(grid),
-        **made.counts,
+        "band_voxels": made.whole.count,
+        "noisy_voxels": made.whole.noisy,
         "vertices": len(mesh.vertices),
         "triangles": len(mesh.faces),
         "tiles": made.tiles,
@@ -139,7 +140,7 @@ def _facts(
 
 def _warnings(grid: SdfGrid, made: Result, offset: float) -> list[str]:
     """Return a sentence on each thing that may be wrong with the mesh of a grid."""
-    counts, warnings = made.counts, list[str]()
+    warnings = list[str]()
     if made.open_edges and grid.field.unseen is not None:
         warnings.append("the surface ends where samples are unknown, and is open there")
     elif made.open_edges:
@@ -147,8 +148,8 @@ def _warnings(grid: SdfGrid, made: Result, offset: float) -> list[str]:
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if counts["noisy_voxels"] and grid.field.network and not grid.field.sides_only:
-        share = 100 * counts["noisy_voxels"] / counts["band_voxels"]
+    if made.whole.noisy and grid.field.network and not grid.field.sides_only:
+        share = 100 * made.whole.noisy / made.whole.count
         differ = f"in {share:.3g} % of the band the values differ by more than distances can"
         warnings.append(f"{differ}: they are taken as noisy there, and corrected")
     return warnings

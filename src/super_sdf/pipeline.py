@@ -105,13 +105,13 @@ def upsample(
     """
     asked = Options(factor, offset=offset)  # checks them
     steps = Steps(progress, MESHING[:-1])
-    lattice, decoder = _prepared(grid, network, asked)
+    lattice, decoder, factor = _prepared(grid, network, asked)
     threads = useful_threads(decoder.threads)
     band = survey(lattice, asked.offset, threads=threads)  # Eqs. 2 and 4
     if not band.decoded.any():
         raise no_surface(grid, asked.offset)
     steps.finish("band")
-    field = refine_band(band, decoder, asked.factor_for(mask=grid.field.sides_only), threads, steps)
+    field = refine_band(band, decoder, factor, threads, steps)
     if not field.blocks.min(initial=1) <= 0 < field.blocks.max(initial=0):
         raise no_surface(grid, asked.offset)
     return field
@@ -207,12 +207,12 @@ def reconstruct(
         exact = None if function is None else as_function(function)
         grid = sampled(grid, exact, bounds, spacing, chosen.offset)
     grid = check_grid(grid)
-    where = {"model": quality, "device": device, "precision": precision, "threads": threads}
+    where = {"quality": quality, "device": device, "precision": precision, "threads": threads}
     asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
-    if network is not None and asked:
-        name = next(iter(asked)).replace("model", "quality")
-        raise OptionError(f"a network and {name} are given: give only one of them")
-    network = load_network(**asked) if network is None else network
+    if network is None:
+        network = load_network(asked.pop("quality", options.DEFAULT_QUALITY), **asked)
+    elif asked:
+        raise OptionError(f"a network and {next(iter(asked))} are given: give only one of them")
     mesh = mesh_grid(grid, network, chosen, steps=Steps(progress)).mesh
     if exact is None:
         return mesh
@@ -221,12 +221,13 @@ def reconstruct(
     return put_on_zero(mesh, exact, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
 
 
-def _prepared(grid: SdfGrid, network: Decoder, chosen: Options) -> tuple[SdfGrid, Adapter]:
-    """Check what is given; return the cubic lattice of a grid, and the network for its field."""
+def _prepared(grid: SdfGrid, network: Decoder, chosen: Options) -> tuple[SdfGrid, Adapter, int]:
+    """Check what is given; return the cubic lattice of a grid, its field's network and factor."""
     options.NETWORK.check(network, "network")
     lattice = cubic_grid(check_grid(grid), chosen.offset)
-    vertex_type(lattice, chosen.factor_for(mask=grid.field.sides_only))  # raises beyond float64
-    return lattice, adapt(network_for(network, grid.field.network))
+    factor = chosen.factor_for(mask=grid.field.sides_only)
+    vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
+    return lattice, adapt(network_for(network, grid.field.network)), factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,10 +236,8 @@ class Result:
 
     mesh: Mesh
     lattice: SdfGrid  # the grid, made cubic
+    whole: BandSummary
     open_edges: int
-    # ``band_voxels``, and ``noisy_voxels``, whose samples differ by more than distances can
-    counts: dict[str, int]
-    leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
     tiles: int
 
 
@@ -275,10 +274,10 @@ def mesh_grid(
     ``save_field`` is called with the fine field, which needs one piece. ``map_tiles`` has tiles
     made elsewhere, ``least_tiles`` or more, each within the memory bound.
     """
-    lattice, decoder = _prepared(grid, network, chosen)
+    lattice, decoder, factor = _prepared(grid, network, chosen)
     check_can_close(grid, cap=chosen.cap)
-    steps, factor = steps or Steps(), chosen.factor_for(mask=grid.field.sides_only)
-    mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
+    steps, shape = steps or Steps(), lattice.shape
+    mesher = chosen.mesher_for(exact=lattice.field.has_exact)
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
@@ -306,15 +305,13 @@ def mesh_grid(
             steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
     count = len(parts)
-    leaves = any(part.leaves for part in parts)
-    counts = {"band_voxels": whole.count, "noisy_voxels": whole.noisy}
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, chosen.offset)
     ends = lattice.field.unseen is not None
     edges = check_closed(mesh, lattice, names, cap=chosen.cap, ends=ends)
     steps.finish("isosurface")
-    return Result(mesh, lattice, edges, counts, leaves, count)
+    return Result(mesh, lattice, whole, edges, count)
 
 
 def make_tile(
@@ -335,6 +332,5 @@ def make_tile(
         save_field(field)
     how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
-    leaves = field.leaves
     del field
-    return own_part(mesh, keys, tile, task.shape, factor, leaves)
+    return own_part(mesh, keys, tile, task.shape, factor)

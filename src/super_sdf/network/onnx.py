@@ -13,8 +13,8 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, redirect_stdout
-from functools import partial
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import DeviceError, ModelError
-from ..threads import call_beside, count_cores
+from ..threads import count_cores
 
 
 def first_line(error: Exception) -> str:
@@ -123,10 +123,12 @@ def run(session: ort.InferenceSession, feeds: Mapping[str, Any], device: str = "
         chunk = ort.OrtValue.ortvalue_from_numpy(np.array([rows]), "cpu", 0)
         if any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers()):
             binding.bind_ortvalue_input(CHUNK_INPUT, chunk)
-        call_beside(
-            partial(session.run_with_iobinding, binding, options),
-            stop=lambda: setattr(options, "terminate", True),
-        )
+        with ThreadPoolExecutor(1) as pool:
+            try:
+                pool.submit(session.run_with_iobinding, binding, options).result()
+            except BaseException:
+                options.terminate = True
+                raise
         return values if on_cpu else binding.copy_outputs_to_cpu()[0]
 
 
