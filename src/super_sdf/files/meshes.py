@@ -10,7 +10,6 @@ A new format is a name in ``options.MESH_FORMATS`` and a function ``write_NAME``
 
 from __future__ import annotations
 
-import html
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -257,6 +256,8 @@ COMPRESSION = 1  # the fastest level: higher ones save a tenth and take three ti
 
 def write_3mf(target: IO[bytes], parts: Parts, world: World) -> None:
     """Write 3MF, an object for each part; members have no date: a mesh gives the same bytes."""
+    import html  # imported here, as few meshes need it
+
     with ZipFile(target, "w", ZIP_DEFLATED, compresslevel=COMPRESSION) as archive:
         for member, text in MEMBERS.items():
             with archive.open(member, "w") as file:

@@ -200,9 +200,9 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
         ring = whole & along.any(1)
         free = ring & ~np.isin(boxes[:, 1, 1, 1], cut)
         x = boxes[free, 1, 1, 1]
-        if len(x) < max(ENOUGH, ring.sum() / 2) or np.median(np.abs(x)) < NOTHING * largest:
+        typical = float(np.quantile(np.abs(x), 0.5)) if len(x) else 0.0
+        if len(x) < max(ENOUGH, ring.sum() / 2) or typical < NOTHING * largest:
             continue
-        typical = float(np.median(np.abs(x)))
         alike = np.abs(np.abs(x) - typical) <= 0.01 * typical
         shape = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
         bits = np.packbits(signs[free].reshape(-1, 27), axis=1)
@@ -308,7 +308,7 @@ def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> An
     slope = np.sort(np.sqrt((gradients**2).sum(1)))
     third = max(len(slope) // 3, 1)  # the narrowest range that holds a third of them
     at = int(np.argmin(slope[third:] / slope[:-third]))
-    facts["unit"] = unit = float(np.median(slope[at : at + third + 1]))
+    facts["unit"] = unit = float(np.quantile(slope[at : at + third + 1], 0.5))
     facts["error"] = SAME_UNIT if fourth >= ENOUGH else 3 * SAME_UNIT
     error = EXACT + min(facts["digit"] / unit / h, MOST_DIGIT) / 2
     facts["slopes"] = float((np.abs(slope / unit - 1) < error).mean())
@@ -432,8 +432,6 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
             return Answer("noisy", why, facts | {"spacing": steps})
         if not facts["cut"] or abs(look.low + look.high) >= ALIKE * look.high:
             return Answer("density", "", facts, which_level(look, signed=True))
-    if given is not None and _is_noise(look, given, facts):
-        return Answer("noisy", "distances with noise", facts | {"spacing": given})
     middle = look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]
     if len(middle) >= ENOUGH:
         size, (one, other) = np.abs(middle), look.pairs
@@ -442,6 +440,8 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
         facts["area"] = float(at_0 / max(best, 1))
         if facts["centred"] < CENTRED and facts["area"] > AREA:
             return Answer("density", "", facts, which_level(look, signed=True))
+    if given is not None and _is_noise(look, given, facts):
+        return Answer("noisy", "distances with noise", facts | {"spacing": given})
     return Answer("smooth", "the slope is not that of a distance everywhere", facts)
 
 

@@ -86,7 +86,10 @@ def open_session(path: Path, device: str, threads: int) -> ort.InferenceSession:
             raise DeviceError(f"{VERSION} could not start its CUDA provider")
         return session
     try:
-        if OPTIMISED.encode() in path.read_bytes()[-8192:]:  # opens in half the time
+        with path.open("rb") as file:
+            file.seek(-min(path.stat().st_size, 8192), os.SEEK_END)
+            optimised = OPTIMISED.encode() in file.read()
+        if optimised:  # opens in half the time
             options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
         return ort.InferenceSession(str(path), options, providers=[CPU])
     except Exception as error:  # onnxruntime's errors have no other common base class
