@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
-from .options import MesherName, Options
+from .options import Options
 from .refine import nodes
 from .refine.band import Band, BandSummary, neighbour_table, no_surface, survey
 from .refine.bounds import SampleSpheres, keep_within_bounds
@@ -37,9 +37,6 @@ from .surface.extract import extract
 from .surface.mesh import Mesh, vertex_type
 from .threads import MESHING, Progress, Steps, in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
-
-if TYPE_CHECKING:
-    from .functions.function import Function
 
 
 def refine_band(
@@ -149,7 +146,7 @@ def reconstruct(
     network: Decoder | None = None,
     factor: int | None = None,
     *,
-    function: Function | None = None,
+    function: Callable[[Any], Any] | None = None,
     bounds: ArrayLike | None = None,
     spacing: ArrayLike | None = None,
     quality: options.Quality | str | Path | None = None,
@@ -248,9 +245,8 @@ class Task:
     tile: Tile
     grid: SdfGrid  # the samples of the tile
     shape: tuple[int, int, int]  # samples of the whole grid
-    options: Options
+    options: Options  # with the mesher that is used
     factor: int
-    mesher: MesherName
     threads: int
     whole: BandSummary | None = None  # of a tile that is not the whole grid
 
@@ -276,10 +272,10 @@ def mesh_grid(
     """
     lattice, decoder, factor = _prepared(grid, network, chosen)
     check_can_close(grid, cap=chosen.cap)
+    chosen = replace(chosen, mesher=chosen.mesher_for(exact=lattice.field.has_exact))
     steps, shape = steps or Steps(), lattice.shape
-    mesher = chosen.mesher_for(exact=lattice.field.has_exact)
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
-    task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
+    task = Task(everything, lattice, shape, chosen, factor, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
     in_one_piece = room.voxels() if map_tiles is None and least_tiles == 1 else -1  # at most
     bands = [survey(lattice, chosen.offset, threads=threads, most=in_one_piece)]
@@ -294,7 +290,7 @@ def mesh_grid(
             "smaller factor, allow more (--max-memory), or leave --save-field out"
         )
     else:
-        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
+        margin = margin_of(lattice, decoder.receptive_field, chosen.mesher, factor)
         tiles, parts = plan(shape, whole, margin, room, least_tiles), list[Part]()
         tasks = (
             replace(task, tile=tile, grid=crop(lattice, tile.low, tile.high), whole=whole)
@@ -330,7 +326,7 @@ def make_tile(
     del band
     if save_field:
         save_field(field)
-    how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": threads}
+    how: Any = {"mesher": chosen.mesher, "cap": chosen.cap, "threads": threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
     del field
     return own_part(mesh, keys, tile, task.shape, factor)

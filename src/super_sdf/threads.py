@@ -86,7 +86,7 @@ def map_chunks(
 
 
 def free_memory() -> int:
-    """Return the bytes of memory that are free; in a container at most what is left of its limit."""
+    """Return the bytes of memory that are free; in a container what is left of its limit."""
     left = [float(psutil.virtual_memory().available)]
     for most, taken, *stat in _of_groups("memory.max", "memory.current", "memory.stat"):
         cached = int(stat[stat.index("inactive_file") + 1])  # can be dropped
@@ -153,24 +153,17 @@ MESHING = ("band", "network", "nodes", "isosurface")
 
 
 class Steps:
-    """Measures the time of steps, by name, and reports what is done of the work.
+    """Measures the time of steps, by name, and reports the share of the work that is ``done``.
 
-    ``names`` are the steps that ``finish`` ends, in order: they take the work from ``begin`` on to
-    ``end``, which are shares of the whole.
+    ``names`` are the steps that ``finish`` ends, each as often as it does.
     """
 
-    def __init__(
-        self,
-        progress: Progress | None = None,
-        names: Iterable[str] = MESHING,
-        begin: float = 0.0,
-        end: float = 1.0,
-    ) -> None:
+    def __init__(self, progress: Progress | None = None, names: Iterable[str] = MESHING) -> None:
         if not (progress is None or callable(progress)):
             said = "give a function of (done, total), in thousandths"
             raise OptionTypeError(f"progress is {seen(progress)}: {said}")
-        self.progress, self.done, self.clock = progress, begin, time.perf_counter()
-        self.scale = (end - begin) / sum(STEPS[name] for name in names)
+        self.progress, self.done, self.clock = progress, 0.0, time.perf_counter()
+        self.scale = 1 / sum(STEPS[name] for name in names)
         self.seconds: dict[str, float] = {}
 
     def lap(self, name: str) -> None:

@@ -141,11 +141,7 @@ class DistanceFunction:
             raise
 
 
-Function: TypeAlias = DistanceFunction | Callable[[Vectors], Any]
-"""A function of points; one that counts what it is asked, or any other."""
-
-
-def as_function(function: Function) -> DistanceFunction:
+def as_function(function: Callable[[Vectors], Any]) -> DistanceFunction:
     """Return a function that counts at how many points it is evaluated."""
     return function if isinstance(function, DistanceFunction) else DistanceFunction(function)
 
