@@ -197,12 +197,10 @@ def reconstruct(
         values that are not finite; if not even small tiles of the grid fit in the memory.
     """
     chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
-    exact = None
     if function is not None or bounds is not None or spacing is not None:
-        from .functions.function import as_function, sampled  # imported here, as few need it
+        from .functions.function import sampled  # imported here, as few need it
 
-        exact = None if function is None else as_function(function)
-        grid = sampled(grid, exact, bounds, spacing, chosen.offset)
+        grid = sampled(grid, function, bounds, spacing, chosen.offset)
     grid = check_grid(grid)
     where = {"quality": quality, "device": device, "precision": precision, "threads": threads}
     asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
@@ -211,11 +209,11 @@ def reconstruct(
     elif asked:
         raise OptionError(f"a network and {next(iter(asked))} are given: give only one of them")
     mesh = mesh_grid(grid, network, chosen, steps=Steps(progress)).mesh
-    if exact is None:
+    if function is None:
         return mesh
     from .functions.zero import put_on_zero
 
-    return put_on_zero(mesh, exact, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
+    return put_on_zero(mesh, function, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
 
 
 def _prepared(grid: SdfGrid, network: Decoder, chosen: Options) -> tuple[SdfGrid, Adapter, int]:
@@ -300,14 +298,12 @@ def mesh_grid(
             parts.append(part)
             steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
-    count = len(parts)
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, chosen.offset)
-    ends = lattice.field.unseen is not None
-    edges = check_closed(mesh, lattice, names, cap=chosen.cap, ends=ends)
+    edges = check_closed(mesh, lattice, names, cap=chosen.cap)
     steps.finish("isosurface")
-    return Result(mesh, lattice, whole, edges, count)
+    return Result(mesh, lattice, whole, edges, len(names))
 
 
 def make_tile(

@@ -249,15 +249,15 @@ def join(parts: list[Part]) -> tuple[Mesh, list[tuple[str, int]]]:
 
 
 def check_closed(
-    mesh: Mesh, lattice: SdfGrid, names: Sequence[tuple[str, int]], *, cap: bool, ends: bool
+    mesh: Mesh, lattice: SdfGrid, names: Sequence[tuple[str, int]], *, cap: bool
 ) -> int:
     """Return how many edges of a mesh are open; MeshError if some are that should not be.
 
     Open are those on the border of the grid, if there is no ``cap``, and any others if the surface
-    ``ends`` at unknown samples. ``names`` are those of ``join``.
+    may end at unknown samples. ``names`` are those of ``join``.
     """
     edges = mesh.boundary()
-    if ends or not len(edges):
+    if lattice.field.unseen is not None or not len(edges):
         return len(edges)
     bad = edges
     if not cap:
