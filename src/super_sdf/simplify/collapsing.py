@@ -25,7 +25,7 @@ import numpy as np
 from ..arrays import BoolArray, face_normals, length
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid, smallest_angles
-from .measuring import Original, find, mean_side
+from .measuring import Original, find
 from .walls import Walls, irregular, labels_apart
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
@@ -112,7 +112,7 @@ def collapsed(
             held[result.faces[held[result.faces].any(1)]] = True
             kept.append(np.asarray(held[result.faces].all(1)))
             for distance in steps:
-                result, held = collapse_edges(result, held, distance=distance * unit)
+                result, held = collapse_edges(result, held, distance * unit)
             if number == len(passes) - 1:
                 result = turn_edges(result, held, LOW * error)
             stages.append((result, Solid(result)))
@@ -160,12 +160,9 @@ def examine(of: Unsimplified, result: Walls, solid: Solid, error: float) -> Poin
     return gone if len(gone) or all(places is None for places in lost) else None
 
 
-def lost_places(original: Solid, mesh: Mesh) -> Points | None:
-    """Return the vertices of components of which nothing is left; None if the topology is equal.
-
-    Equal are the numbers of components and Euler's.
-    """
-    before, after = original.mesh, mesh
+def lost_places(original: Solid, after: Mesh) -> Points | None:
+    """Return the vertices of components of which nothing is left; None if the topology is equal."""
+    before = original.mesh
     (count, root), (left, roots) = before.components(), after.components()
     euler = [2 * len(np.unique(each.faces)) - len(each.faces) for each in (before, after)]
     if count == left and euler[0] == euler[1]:
@@ -177,13 +174,13 @@ def lost_places(original: Solid, mesh: Mesh) -> Points | None:
 
 
 def collapse_edges(
-    walls: Walls, held: BoolArray, *, distance: float = 0.0, triangles: float = 0
+    walls: Walls, held: BoolArray, distance: float, triangles: int = 0
 ) -> tuple[Walls, BoolArray]:
     """Collapse the edges whose new vertex is within a distance of the planes around it.
 
-    That is the root of the sum of squared distances, in world units. Or, without a distance, those
-    until no more than a number of triangles is left, unless the shape does not allow it. The
-    vertices ``held``, (n,), stay where they are, and open edges; also returned is which are held.
+    That is the root of the sum of squared distances. With a number of triangles, edges are
+    collapsed until no more are left; the distance is then about a side of them. The vertices
+    ``held``, (n,), stay where they are, and open edges; also returned is which are held.
 
     pyfqmr keeps open edges and the order of triangles. So a vertex is held by a triangle of its
     own, and after the triangles of each pair of labels comes one at a vertex apart from all others.
@@ -195,9 +192,8 @@ def collapse_edges(
     pair = walls.sides @ np.array([1 << 16, 1])
     order = np.argsort(pair, kind="stable")
     last = np.flatnonzero(np.diff(pair[order], append=-1))
-    unit = distance or mean_side(walls)  # which pyfqmr's thresholds are in
     middle = walls.vertices.mean(0, dtype=np.float64)
-    scaled = (walls.vertices - middle) / unit
+    scaled = (walls.vertices - middle) / distance  # which pyfqmr's thresholds are in
     scaled = np.append(scaled, [scaled.max(0) + 2], axis=0)
     pins = np.flatnonzero(held)
     corner = np.append(np.full(len(last), len(held)), pins)
@@ -205,10 +201,10 @@ def collapse_edges(
     lone = np.stack([corner, *(len(scaled) + np.arange(len(tips)).reshape(2, -1))], 1)
     faces = np.insert(walls.faces[order], last + 1, lone[: len(last)], axis=0)
     faces = np.concatenate([faces, lone[len(last) :]]).astype(np.int32)
-    options: dict[str, Any] = {"target_count": int(triangles) + len(lone)}
-    if distance:
+    options: dict[str, Any] = {"target_count": triangles + len(lone)}
+    if not triangles:  # but a threshold that rises to the distance
         options = {"target_count": 0, "max_iterations": ROUNDS}
-        options |= {"alpha": ROUNDS**-RISE, "K": 1, "aggressiveness": RISE}  # to the distance
+        options |= {"alpha": ROUNDS**-RISE, "K": 1, "aggressiveness": RISE}
     with ONE_AT_A_TIME:
         library = Simplify()
         library.setMesh(np.concatenate([scaled, tips]), faces)
@@ -218,7 +214,7 @@ def collapse_edges(
     faces, pinned = np.split(faces.astype(np.int32), [len(faces) - len(pins)])
     is_mark = faces[:, 0] == len(moved)
     sides = walls.sides[order[last]][np.cumsum(is_mark)[~is_mark]]
-    vertices = (moved * unit + middle).astype(walls.vertices.dtype)
+    vertices = (moved * distance + middle).astype(walls.vertices.dtype)
     old = find(row_keys(moved), row_keys(scaled[:-1]))
     vertices[old >= 0] = walls.vertices[old[old >= 0]]
     held = np.zeros(len(moved), bool)

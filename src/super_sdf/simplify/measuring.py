@@ -40,21 +40,19 @@ class Original:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        self.solid, self.side = Solid(mesh), mean_side(mesh)
+        self.solid = Solid(mesh)
         self.distance = np.full(len(mesh.vertices), np.inf)
         self.near = np.zeros(len(mesh.vertices), np.uint64)  # key of the nearest triangle
         start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
         self.edges = np.stack([start, end])[:, start < end]
+        self.side = float(length(np.subtract(*self.solid.mesh.vertices[[start, end]])).mean())
         # of the edges: keys of what their ends and middles are near, if within the limit; distances
         self.seen = np.zeros((3, self.edges.shape[1]), np.uint64)
         self.off = np.zeros(self.edges.shape[1])
         self.keys, self.back = np.zeros(1, np.uint64), np.full((2, 1), np.inf)  # largest, mean
 
     def compare(self, other: Solid, error: float) -> tuple[Points, Deviation]:
-        """Return points near this mesh, (n, 3), where the two are farther apart than an error.
-
-        Without bounds of the error, the points mean nothing.
-        """
+        """Return points near this mesh, (n, 3), where the two are farther apart than an error."""
         limit, vertices, faces = BETWEEN * error, self.solid.mesh.vertices, self.solid.mesh.faces
         keys = row_keys(other.mesh.vertices[other.mesh.faces].reshape(-1, 9))
         face = find(self.near, keys)
@@ -142,9 +140,3 @@ def find(keys: NDArray[Any], among: NDArray[Any]) -> NDArray[np.intp]:
     order = np.argsort(among)
     at = order[np.searchsorted(among[order], keys).clip(max=len(among) - 1)]
     return np.where(among[at] == keys, at, -1)
-
-
-def mean_side(mesh: Mesh) -> float:
-    """Return the mean length of the first sides of all triangles."""
-    start, end = mesh.vertices.astype(np.float64)[mesh.faces[:, :2].T]
-    return float(length(end - start).mean())
