@@ -10,22 +10,18 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float32]
 IntArray: TypeAlias = NDArray[np.int32]
 BoolArray: TypeAlias = NDArray[np.bool_]
-Triple: TypeAlias = tuple[float, float, float]
-"""One number per axis: x, y, z."""
+Triple: TypeAlias = tuple[float, float, float]  # one number per axis: x, y, z
 
 NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
 """Steps from the centre voxel to the 27 of a patch or of a row of a neighbour table, (27, 3)."""
 CORNERS: IntArray = np.indices((2, 2, 2)).reshape(3, 8).T.astype(np.int32)
 """Steps from the lowest corner of a cell to all of them, (8, 3)."""
-CENTRE = 13
-"""Index of the centre voxel itself."""
-STRIDES = np.array([9, 3, 1])
-"""Difference of the indices of two places next to each other along each axis."""
+CENTRE = 13  # index of the centre voxel itself
+STRIDES = np.array([9, 3, 1])  # from a place to that beside it along each axis, in indices
 
 Index: TypeAlias = NDArray[np.int64]
 Numbers: TypeAlias = NDArray[np.float64]
-Vectors: TypeAlias = NDArray[np.float64]
-"""A vector in each row, (n, 3)."""
+Vectors: TypeAlias = NDArray[np.float64]  # a vector in each row, (n, 3)
 
 
 def dot(a: Vectors, b: Vectors) -> Numbers:

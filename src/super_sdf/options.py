@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass, field, fields
+from functools import partial
 from math import inf, isfinite
 from numbers import Real
 from os import PathLike
@@ -88,21 +89,17 @@ def number(give: str, above: float = -inf, most: float = inf, step: int = 0) -> 
     return Kind(give, make)
 
 
-def numbers(counts: tuple[int, ...], give: str) -> Kind:
-    """Return the kind of several numbers, of which there may be one; in text with commas."""
-
-    def make(value: Any) -> tuple[float, ...]:
-        parts = value.split(",") if isinstance(value, str) else value
-        found = tuple(map(ANY.make, parts if isinstance(parts, Iterable) else [parts]))
-        if len(found) not in counts:
-            raise ValueError
-        return found
-
-    return Kind(give, make)
+def numbers(counts: tuple[int, ...], value: Any) -> tuple[float, ...]:
+    """Return numbers, as many as one of the counts; there may be one, or text with commas."""
+    parts = value.split(",") if isinstance(value, str) else value
+    found = tuple(map(ANY.make, parts if isinstance(parts, Iterable) else [parts]))
+    if len(found) not in counts:
+        raise ValueError
+    return found
 
 
 ANY, ABOVE_0 = number("a finite number"), number("a number greater than 0", above=0)
-COUNT, POINT = number("", above=0, step=1), numbers((1, 3), "one number, or three")
+COUNT, POINT = number("", above=0, step=1), Kind("one number, or three", partial(numbers, (1, 3)))
 LABEL = number("a whole number, -2^63 to 2^64 - 1", -(2**63) - 1, 2**64 - 1, step=1)
 
 
@@ -172,18 +169,17 @@ class Options:
     factor: int | None = _option(None, MESH, "list labels", number(
         "an even number from 2 to 16 (an odd one has no node on the samples)", 0, 16, step=2),
         "How many times finer than the grid per axis: an even number from 2 to 16. Default: 2 for "
-        "masks and labels, else 4.", metavar="K")
+        "masks and labels, else 4.", "K")
     _: KW_ONLY
     spacing: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
         "World distance between neighbouring samples: one number, or X,Y,Z. Default: from the "
-        "file, else estimated from the values.", metavar="H")
+        "file, else estimated from the values.", "H")
     origin: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
-        "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.", metavar="X,Y,Z")
+        "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.", "X,Y,Z")
     direction: tuple[float, ...] | None = _option(None, GRID, "read list labels",
-        numbers((9,), "nine numbers, row by row"),
+        Kind("nine numbers, row by row", partial(numbers, (9,))),
         "World directions of the array's axes, a matrix with a unit vector in each column, as nine "
-        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other files state it.",
-        metavar="MATRIX")
+        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other files state it.", "MATRIX")
     axes: AxisOrder | None = _option(None, GRID, "read list labels", one_of(AxisOrder),
         "Axis order of an array in NumPy, TIFF, HDF5 or Zarr. Default: by the names of the axes, "
         "else xyz for NumPy, zyx for the others.")
@@ -195,24 +191,20 @@ class Options:
         "What the values are: distances, distances with noise, a mask or its transform, or a "
         "smooth field, which has the surface of its own cubic spline; auto goes by the samples.")
     label: int | None = _option(None, VALUES, "read list", LABEL,
-        "Mesh the samples with the value N of a label image, or its name by --names.",
-        metavar="N")
+        "Mesh the samples with the value N of a label image, or its name by --names.", "N")
     labels: str | tuple[int | str, ...] | None = _option(None, VALUES, "list labels",
         Kind("all, or some labels such as 1,2,3", _labels),
         "Mesh all labels of a label image but 0, or those listed, with shared walls: as parts of "
-        "a .glb or .3mf, else each in its own file, NAME-N.ply.", metavar="all|N,N")
+        "a .glb or .3mf, else each in its own file, NAME-N.ply.", "all|N,N")
     level: float | None = _option(None, VALUES, "read list", ANY,
         "Mesh the surface at the value L of densities; above L is inside, unless --inside is "
-        "negative.", metavar="L")
+        "negative.", "L")
     scale: float | None = _option(None, VALUES, "read list", ABOVE_0,
-        "World units per unit of the values, if they have another unit than the spacing.",
-        metavar="S")
+        "World units per unit of the values, if they have another unit than the spacing.", "S")
     unknown: float | None = _option(None, VALUES, "read list", ANY,
-        "Samples with the value V are unknown, as those that are NaN.", metavar="V")
-    offset: float = _option(0.0, MESH, "list",
-        number("a finite number, in world units"),
-        "Mesh the offset surface at distance D, in world units; a positive D grows the solid.",
-        metavar="D")
+        "Samples with the value V are unknown, as those that are NaN.", "V")
+    offset: float = _option(0.0, MESH, "list", number("a finite number, in world units"),
+        "Mesh the offset surface at distance D, in world units; a positive D grows the solid.", "D")
     cap: bool = _option(True, MESH, "list", FLAG,
         "Close the surface along the border of the grid (default), or leave it open there, as one "
         "that ends at unknown samples must be.", off="open")
@@ -222,13 +214,13 @@ class Options:
     simplify: float | None = _option(None, MESH, "list labels",
         number("a number greater than 0, in voxels (--tolerance takes world units)", above=0),
         "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
-        "Needs the extra simplify.", metavar="ERROR")
+        "Needs the extra simplify.", "ERROR")
     tolerance: float | None = _option(None, MESH, "list labels",
         number("a number greater than 0, in world units", above=0),
-        "Simplify as with --simplify, but within D in world units.", metavar="D")
+        "Simplify as with --simplify, but within D in world units.", "D")
     triangles: int | None = _option(None, MESH, "list",
         number("a whole number, 4 or more, as a closed mesh has", above=3, step=1),
-        "Simplify the mesh to at most N triangles, instead of --simplify.", metavar="N")
+        "Simplify the mesh to at most N triangles, instead of --simplify.", "N")
     keep_volume: bool = _option(False, MESH, "list labels", FLAG,
         "Of masks and labels: move each surface by a small part of a voxel until its volume is "
         "that of its samples, as boxes.")
@@ -240,7 +232,7 @@ class Options:
         "grid, and takes 4 times as long.")
     model: str | None = _option(None, WORK, "labels",
         PATH._replace(make=lambda value: str(Path(value))),
-        "Use the network in this ONNX file instead of --quality.", metavar="FILE")
+        "Use the network in this ONNX file instead of --quality.", "FILE")
     precision: Precision = _option("auto", WORK, "labels", one_of(Precision),
         "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "
         "it, else float32.")
@@ -248,11 +240,11 @@ class Options:
         "Where the network runs; auto uses CUDA if it works here, else the CPU.")
     threads: int = _option(0, WORK, "labels",
         number("1 or more, or 0 for one per core", above=-1, step=1),
-        "CPU threads; 0 means one per core.", metavar="N")
+        "CPU threads; 0 means one per core.", "N")
     max_memory: int | None = _option(None, WORK, "labels",
         Kind("a number of bytes greater than 0, such as 1500M or 4G", _bytes),
         "Memory limit of the process, such as 4G. Default: 60 % of the free memory. Larger grids "
-        "are refined in boxes, whose meshes are joined.", metavar="SIZE")
+        "are refined in boxes, whose meshes are joined.", "SIZE")
     # fmt: on
 
     def __post_init__(self) -> None:
@@ -260,8 +252,8 @@ class Options:
         for name, row in OPTIONS.items():
             object.__setattr__(self, name, row.check(getattr(self, name)))
         for names in EXCLUSIVE:
-            values = {name: getattr(self, name) for name in names}
-            some = [f"{flag(n)} {seen(value)}" for n, value in values.items() if value is not None]
+            given = [name for name in names if getattr(self, name) is not None]
+            some = [f"{flag(name)} {seen(getattr(self, name))}" for name in given]
             if len(some) > 1:
                 raise OptionError(f"{some[0]} and {some[1]}: give only one of them")
         if self.label is not None and self.field not in ("auto", "mask"):

@@ -24,7 +24,7 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 CHUNK = 1 << 19  # temporaries (array elements) per chunk, so that they stay in cache
-MIN_PER_THREAD = 1 << 20  # array elements; with fewer, a thread costs more than it saves
+MIN_PER_THREAD = 1 << 21  # array elements; with fewer, a thread costs more than it saves
 MAX_INDEX = 2**31 - 1  # of vertices and nodes, as in mesh files; beyond, one would mean another
 
 GROUPS, OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
@@ -73,11 +73,8 @@ def over_threads(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
 ) -> Iterator[Result]:
     """Yield ``work(piece)`` for each piece, in order, with up to ``threads`` threads."""
-    if min(threads, len(pieces)) < 2:
-        yield from map(work, pieces)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(work, pieces)
+    with ThreadPoolExecutor(threads) as pool:  # starts its threads when it gets work
+        yield from (pool.map if min(threads, len(pieces)) > 1 else map)(work, pieces)
 
 
 def map_chunks(
@@ -88,24 +85,11 @@ def map_chunks(
     return list(over_threads(work, chunks_of(count, width), threads))
 
 
-def call_beside(work: Callable[[], object], stop: Callable[[], object]) -> None:
-    """Do some work in another thread, and ``stop`` it at an interrupt; errors are passed on."""
-    with ThreadPoolExecutor(1) as pool:  # waits at the end
-        try:
-            pool.submit(work).result()
-        except BaseException:
-            stop()
-            raise
-
-
 def free_memory() -> int:
-    """Return the bytes of memory that are free; in a container at most what is left of its limit.
-
-    Inactive cached files of a container can be dropped.
-    """
+    """Return the bytes of memory that are free; in a container what is left of its limit."""
     left = [float(psutil.virtual_memory().available)]
     for most, taken, *stat in _of_groups("memory.max", "memory.current", "memory.stat"):
-        cached = int(stat[stat.index("inactive_file") + 1])
+        cached = int(stat[stat.index("inactive_file") + 1])  # can be dropped
         left.append(max(float(most) - max(int(taken) - cached, 0), 0))
     return int(min(left))
 
@@ -116,10 +100,7 @@ def held_memory() -> int:
 
 
 def memory_bound(max_memory: int | None = None) -> int:
-    """Return how many bytes this process may hold in all.
-
-    ``max_memory`` if given; else what the process holds, and ``SHARE`` of what is free.
-    """
+    """Return how many bytes this process may hold: by default, ``SHARE`` of what is free more."""
     return max_memory or held_memory() + int(SHARE * free_memory())
 
 
@@ -166,32 +147,24 @@ Progress = Callable[[int, int], None]
 
 If it raises an exception, the work stops with that exception.
 """
-TOTAL = 1000
 # Share of the time that each step takes with a network on a CPU.
 STEPS = {"read": 0.1, "band": 0.03, "network": 0.4, "nodes": 0.14, "isosurface": 0.33}
 MESHING = ("band", "network", "nodes", "isosurface")
 
 
 class Steps:
-    """Measures the time of steps, by name, and reports what is done of the work from ``begin``.
+    """Measures the time of steps, by name, and reports the share of the work that is ``done``.
 
-    ``names`` are the steps that ``finish`` ends, in order; together they reach the share ``end``.
+    ``names`` are the steps that ``finish`` ends, each as often as it does.
     """
 
-    def __init__(
-        self,
-        progress: Progress | None = None,
-        names: Iterable[str] = MESHING,
-        begin: float = 0.0,
-        end: float = 1.0,
-    ) -> None:
+    def __init__(self, progress: Progress | None = None, names: Iterable[str] = MESHING) -> None:
         if not (progress is None or callable(progress)):
             said = "give a function of (done, total), in thousandths"
             raise OptionTypeError(f"progress is {seen(progress)}: {said}")
-        self.progress, self.done, self.clock = progress, begin, time.perf_counter()
+        self.progress, self.done, self.clock = progress, 0.0, time.perf_counter()
+        self.scale = 1 / sum(STEPS[name] for name in names)
         self.seconds: dict[str, float] = {}
-        lengths = {name: STEPS[name] for name in names}
-        self.lengths = {n: (end - begin) * x / sum(lengths.values()) for n, x in lengths.items()}
 
     def lap(self, name: str) -> None:
         """Add the time since the last lap to a step."""
@@ -201,15 +174,15 @@ class Steps:
     def show(self, share: float) -> None:
         """Report the share of all work that is done."""
         if self.progress:
-            self.progress(round(TOTAL * share), TOTAL)
+            self.progress(round(1000 * share), 1000)
 
     def finish(self, name: str) -> None:
         """Report that a step is done, and record its time."""
         self.lap(name)
-        self.done += self.lengths[name]
+        self.done += self.scale * STEPS[name]
         self.show(self.done)
 
     def within(self, name: str) -> Callable[[float], None] | None:
         """Return a callback for the share of a step that starts now; None without ``progress``."""
-        begin, length = self.done, self.lengths[name]
+        begin, length = self.done, self.scale * STEPS[name]
         return (lambda share: self.show(begin + share * length)) if self.progress else None

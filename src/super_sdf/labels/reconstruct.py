@@ -215,7 +215,7 @@ def spared(walls: Walls, distance: float, spacing: float) -> Walls:
 
     held, vertices = np.zeros(len(walls.vertices), bool), walls.vertices
     for turn in range(MOST_REPEATS):
-        made = collapse_edges(walls, held, distance=distance)[0]
+        made = collapse_edges(walls, held, distance)[0]
         places = made.vertices[faults(made, spacing)]
         if not len(places):
             return made
