@@ -26,9 +26,7 @@ from ..arrays import BoolArray, FloatArray, Triple
 from .look import Extremes, Floats
 from .samples import MadePlanes, SampleArray, SamplePlanes, in_spacings, over_three
 
-REACH = (
-    4  # voxels; patches are clipped to 3 (``refine.band.PATCH_LIMIT``), and half of one goes off
-)
+REACH = 4  # voxels; patches are clipped to 3 (``refine.band.PATCH_LIMIT``), half of one goes off
 
 FEET_REACH = 3  # samples from one up to which others are filled in with the help of its foot
 NO_FOOT = 2.6  # voxels: the distance of a sample without a foot point near it
@@ -91,12 +89,11 @@ def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> Mad
     h = min(spacing)
     low, high = (limit / h for limit in limits)
     steps = np.array(spacing) / h
-    beside = 2 * (int(FEET_REACH * steps.max() / steps.min()) + 1)
-
-    def make(planes: NDArray[Any]) -> Floats:
-        return fill_in(in_spacings(planes, h), low, high, steps).astype(float) * h
-
-    return MadePlanes(values, make, beside)
+    return MadePlanes(
+        values,
+        lambda planes: fill_in(in_spacings(planes, h), low, high, steps).astype(float) * h,
+        beside=2 * (int(FEET_REACH * steps.max() / steps.min()) + 1),  # once for each round
+    )
 
 
 def fill_in(values: FloatArray, low: float, high: float, steps: Floats) -> FloatArray:

@@ -35,7 +35,6 @@ from .samples import (
     MadePlanes,
     SampleArray,
     changed,
-    check_kind,
     check_spacing,
     steps_of,
 )
@@ -165,7 +164,6 @@ def interpret(
     ``hint`` is a kind that the file states.
     """
     steps, notes = None if spacing is None else check_spacing(spacing), list[str]()
-    check_kind(samples.dtype, samples.shape)
     if wanted.inside == "auto" and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
     if wanted.label is not None:

@@ -23,10 +23,8 @@ from .samples import (
     Index,
     SampleArray,
     SamplePlanes,
-    as_samples,
     as_triple,
     check_direction,
-    check_kind,
     check_spacing,
     cropped,
     in_rows,
@@ -102,10 +100,8 @@ class SdfGrid:
         origin: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
-        values, _, origin = placed(values, spacing, origin)
-        samples, h = as_samples(values), max(check_spacing(spacing))
-        check_kind(samples.dtype, samples.shape)
-        look = look_at(samples)
+        samples, _, origin = placed(values, spacing, origin)
+        h, look = max(check_spacing(spacing)), look_at(samples)
         if not look.is_finite:
             bad = (np.argwhere(~np.isfinite(plane)) for plane in samples)
             i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
@@ -189,8 +185,8 @@ class SdfGrid:
     @property
     def values(self) -> NDArray[Any]:
         """All samples, negative inside."""
-        samples = self.samples
-        return samples.loaded if isinstance(samples, SamplePlanes) else samples
+        whole: NDArray[Any] = np.asanyarray(self.samples)
+        return whole
 
     def planes(self, first: int, last: int) -> NDArray[Any]:
         """Return the samples with first <= i < last, negative inside, (last - first, ny, nz)."""
@@ -308,8 +304,8 @@ def make_grid(
     """
     told: dict[str, Any] = {"label": label, "level": level, "scale": scale, "unknown": unknown}
     wanted = Options(inside=inside, field=field, **told)
-    values, spacing, origin = placed(values, spacing, origin)
-    taken = interpret(as_samples(values), wanted, spacing, hint)
+    samples, spacing, origin = placed(values, spacing, origin)
+    taken = interpret(samples, wanted, spacing, hint)
     if origin is None:
         taken["notes"] += ("origin not given: sample (0, 0, 0) is at 0, 0, 0",)
         origin = 0.0
