@@ -59,8 +59,7 @@ def kind_table(rows: Sequence[Row]) -> str:
     for name, kind in dict.fromkeys((row["set"], row["kind"]) for row in rows):
         found = {row["method"]: row for row in pick(rows, set=name, kind=kind)}
         mine, mc = found["ours"], found["mc"]
-        taken = mine["taken_as"] + (f", told {mine['told']}" if mine["told"] else "")
-        taken += f", refused {mine['refused']}" if mine["refused"] else ""
+        taken = mine["taken_as"] + (f", refused {mine['refused']}" if mine["refused"] else "")
         voxels = Column("voxels", digits=4)
         body.append([
             *(kind if name == "shapes" else f"{kind}, CAD parts", taken),

@@ -174,7 +174,7 @@ def kind_rows(results: Results, setting: Setting, name: str, title: str) -> list
             kinds_of = Counter(one["taken_as"] for one in used).most_common()
             several = len(kinds_of) > 1
             row["taken_as"] = ", ".join(f"{k} {n}" if several else k for k, n in kinds_of)
-            row |= {"refused": taken.count(False), "told": sum(bool(r.get("told")) for r in used)}
+            row["refused"] = taken.count(False)
         rows.append(row)
     return rows
 

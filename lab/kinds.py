@@ -121,11 +121,6 @@ def truncated_kind(title: str, inside: float, outside: float) -> Kind:
         case.coarse, -inside * case.spacing, outside * case.spacing))  # fmt: skip
 
 
-def unequal_kind(ratio: float, axis: str) -> Kind:
-    make = partial(unequal, ratio=ratio, axis=axis)
-    return Kind("unequal", f"spacing 1:1:{ratio:g}", make, ("mc", "ours"), ratio=ratio, axis=axis)
-
-
 HALF: dict[str, Any] = {"level": 0.5, "options": {"level": 0.5}}
 PERCENT = np.float32(0.01)
 ALL_KINDS = (
@@ -136,7 +131,8 @@ ALL_KINDS = (
     Kind("truncated", "unknown beyond 2", lambda case: np.where(
         np.abs(case.coarse) <= 2 * case.spacing, case.coarse, np.float32(np.nan))),
     Kind("scaled", "d/100, no spacing given", lambda case: case.coarse * PERCENT, unit=0.01),
-    Kind("scaled", "d/100, spacing given", lambda case: case.coarse * PERCENT),
+    Kind("scaled", "d/100, spacing and scale given", lambda case: case.coarse * PERCENT,
+         options={"scale": 100}),
     Kind("exact", "int16, no spacing given", lambda case: np.rint(
         case.coarse * INTEGERS).astype(np.int16), unit=INTEGERS),
     Kind("scaled", "2h tanh(d/2h)", saturating),
@@ -148,7 +144,8 @@ ALL_KINDS = (
     Kind("density", "share of the voxel", lambda case: np.clip(
         0.5 - case.coarse / case.spacing, 0, 1).astype(np.float32), **HALF),
     *(Kind("noisy", f"noise of {n:g}", partial(noisy, amplitude=n)) for n in (0.1, 0.25)),
-    *(unequal_kind(ratio, axis) for ratio in RATIOS for axis in AXES),
+    *(Kind("unequal", f"spacing 1:1:{ratio:g}", partial(unequal, ratio=ratio, axis=axis),
+           ("mc", "ours"), ratio=ratio, axis=axis) for ratio in RATIOS for axis in AXES),
 )  # fmt: skip
 KINDS = {kind.name: kind for kind in ALL_KINDS}
 
@@ -179,23 +176,17 @@ def spline_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
 def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
     """Mesh the values with super-sdf, as a user of the command would.
 
-    If the default call is refused, and the kind is scaled, ``--field smooth`` is tried. ``facts``
-    has what the values were taken as and whether the user had to say so, or why they were refused.
-    Without a spacing the mesh is in units of the values.
+    ``facts``: what they were taken as, or the refusal. Without a spacing, in units of the values.
     """
     values, spacing, origin = samples_of(kind, case)
     placed = {"spacing": spacing, "origin": origin} if kind.unit is None else {}
-    refusals = []
-    for told in ("auto", "smooth") if kind.group == "scaled" else ("auto",):
-        try:
-            grid = make_grid(values, field=told, **kind.options, **placed)
-            mesh = reconstruct(grid, network, factor=case.factor)
-        except GridError as problem:
-            refusals.append(str(problem))
-        else:
-            facts = {"taken_as": grid.field.kind, "told": told != "auto"}
-            return Surface(mesh if placed else stretched(mesh, 1 / kind.unit, origin), facts=facts)
-    return Surface(EMPTY, facts={"refused": refusals[0]})
+    try:
+        grid = make_grid(values, **kind.options, **placed)
+        mesh = reconstruct(grid, network, factor=case.factor)
+    except GridError as problem:
+        return Surface(EMPTY, facts={"refused": str(problem)})
+    facts = {"taken_as": grid.field.kind}
+    return Surface(mesh if placed else stretched(mesh, 1 / kind.unit, origin), facts=facts)
 
 
 BY_METHOD: dict[str, Callable[[Kind, Case, Decoder], Surface]] = {

@@ -121,6 +121,14 @@ def gyroid(p: Array, n: int) -> Array:
     return np.maximum(wave, sphere(x, y, z, 0, 0.4 * 9))
 
 
+def sheet(p: Array, n: int) -> Array:
+    """Return a gyroid's wall over its gradient, the usual distance to first order."""
+    (a, b, c), (u, v, w) = np.sin(xyz := 13 * at(p, n)), np.cos(xyz)
+    slope = np.sqrt((u * v - c * a) ** 2 + (v * w - a * b) ** 2 + (w * u - b * c) ** 2)
+    wall = np.abs(a * v + b * w + c * u) / np.maximum(slope, 0.3) - 0.8
+    return n / 13 * np.maximum(wall, np.abs(xyz).max(0) - 5.2)
+
+
 def metaballs(p: Array, n: int) -> Array:
     x, y, z = at(p, n)
     middles = ((-0.15, 0.0, 0.0), (0.15, 0.05, 0.0), (0.0, -0.15, 0.1))
@@ -255,6 +263,7 @@ kind("exact, along the border", lambda p, n: ball(p, n, 0.53))
 kind("exact, a ball that leaves the grid", lambda p, n: ball(p + n * 0.3, n, 0.4))
 kind("exact, true CSG", lambda p, n: np.maximum(block(p, n), -ball(p, n, 0.2)))
 kind("exact, rounded to tenths of a voxel", change=lambda d: np.rint(d * 10) / 10 * H, form=H)
+kind("exact, rounded to whole voxels", change=np.rint, form=1, **MM)
 kind("exact, a wall thinner than a voxel", lambda p, n: np.abs(ball(p, n)) - 0.3, ends="either")
 
 # truncated and partly unknown distances
@@ -277,7 +286,6 @@ kind("border of 0", ball, bordered(0.0), form=H, ends="either")
 
 # densities, images, probabilities
 kind("density, sigmoid", **DENSITY)
-kind("density, sigmoid, no spacing", **DENSITY, **NO_SPACING)
 kind("density, steep sigmoid", change=lambda d: sigmoid(d, 0.15), **ABOVE)
 kind("density, wide sigmoid", ball, lambda d: sigmoid(d, 3.0), **ABOVE)
 kind("density, share of the voxel", block, **SHARE)
@@ -285,6 +293,10 @@ kind("density, share, level given", block, **SHARE, options={"level": 0.5})
 kind("density, 1 outside", change=lambda d: 1 - sigmoid(d), level=0.5)
 kind("density, the inside given", **DENSITY, options={"inside": "negative"})
 kind("density, blurred over five voxels", ball, lambda d: 0.5 - d / 5, clip=(0, 1), **ABOVE)
+kind("density, share, faces between samples", lambda p, n: bar(p + 0.4, n), **SHARE)
+kind("density, cut at its foot, level given", ball, lambda d: 1 - d / 9, clip=(0.5, 2),
+     options={"level": 0.9}, **ABOVE)  # fmt: skip
+kind("map of both signs, with noise", metaballs, lambda v: v - 0.02, noise=0.02, **ABOVE)
 kind("probability with noise", ball, **DENSITY, noise=0.02, clip=(0, 1))
 kind("image of 8 bits", change=lambda d: 255 * (0.5 - d / 12), dtype=np.uint8, level=127.5,
      above=True)  # fmt: skip
@@ -292,6 +304,8 @@ kind("image of 16 bits, with noise", change=lambda d: 300 + 3000 * sigmoid(d), n
      dtype=np.uint16, level=1800, above=True)  # fmt: skip
 kind("CT, int16, of bone in air", change=lambda d: -1000 + 2000 * sigmoid(d), dtype=np.int16,
      level=0, above=True, unit=0.7)  # fmt: skip
+kind("MR, int16, with overshoot", dtype=np.int16, **ABOVE,
+     change=lambda d: 500 + 2e4 * (sigmoid(d, 0.3) - 0.1 * np.exp(-((d - 1.5) ** 2))))  # fmt: skip
 kind("CT, int16, of bone in water, level given", change=lambda d: 40 + 900 * sigmoid(d), noise=20,
      dtype=np.int16, options={"level": 490}, level=490, above=True, unit=0.7)  # fmt: skip
 kind("logits", change=lambda d: -d / 0.3, above=True)
@@ -304,6 +318,7 @@ kind("mask, 0 and 255", change=lambda d: np.where(d <= 0, 255, 0), dtype=np.uint
 kind("mask, float 0 and 1", **INSIDE, dtype=np.float32)
 kind("mask, -1 and 1", change=lambda d: np.where(d <= 0, -1.0, 1.0), **SIGNS)
 kind("mask, 1 and 2", change=lambda d: np.where(d <= 0, 2, 1), dtype=np.int32, **MASK)
+kind("mask, solid at the border", change=lambda d: np.uint8(d > 0), **SIGNS, above=True)
 kind("mask, no spacing", **INSIDE, **NO_SPACING)
 kind("mask, slices 3 apart", ball, **INSIDE, steps=(1, 1, 3))
 kind("transform, signed", change=lambda d: signed_transform(d) * H, **SIGNS)
@@ -316,6 +331,10 @@ kind("transform, of the inside only", change=lambda d: transforms(d)[1] * H, **M
 kind("transform, of the outside only", change=lambda d: transforms(d)[0] * H, **SIGNS)
 kind("transform, Maurer's of ITK", **SIGNS, **MM, change=by_itk(
      lambda x: sitk.SignedMaurerDistanceMap(x, squaredDistance=False)))  # fmt: skip
+kind("transform, of a thin inside", lambda p, n: block(p, n, (0.3, 0.22, 0.06)), **MASK,
+     change=lambda d: transforms(d)[1] * H)  # fmt: skip
+kind("transform, chessboard", **SIGNS, change=lambda d: 1.0 * (
+     ndimage.distance_transform_cdt(d > 0) - ndimage.distance_transform_cdt(d <= 0)))  # fmt: skip
 kind("transform, squared, Maurer's of ITK", **SIGNS, **MM, change=by_itk(
      lambda x: sitk.SignedMaurerDistanceMap(x, squaredDistance=True)))  # fmt: skip
 kind("transform, blurred", form=1, **MM,
@@ -356,7 +375,6 @@ labels("labels 0, 1, 2, float32", (0, 1, 2), np.float32)
 labels("labels 1, 2, 3", (1, 2, 3), np.int16)
 labels("labels -1, 0, 1", (-1, 0, 1), np.int16)
 labels("labels of 64 bits", (0, 2**60 + 1, 2**60 + 2), np.uint64)
-labels("labels, no spacing", (0, 1, 2), np.uint8, **NO_SPACING)
 labels("labels, the inside given", (0, 1, 2, 3), np.uint8, options={"inside": "positive"})
 labels("labels, one chosen", (0, 1, 2, 3), np.uint8, options={"label": 2})
 
@@ -378,13 +396,13 @@ kind("label that is not there", change=lambda d: np.rint(sigmoid(d)), options={"
 
 # fields of another slope
 kind("quadric", quadric, **AS_IT_IS)
-kind("quadric, in world units", quadric, lambda f: f * 3 * H)
 kind("CSG of quadrics", cut_quadric, **AS_IT_IS)
-kind("CSG of quadrics, no spacing", cut_quadric, **AS_IT_IS, **NO_SPACING)
 kind("gyroid", gyroid, **AS_IT_IS)
+kind("gyroid's wall over its gradient", sheet)
+kind("learned, slope 1.5, with ripples",
+     lambda p, n: 1.5 * ball(p, n) + 0.1 * np.sin(p @ [1.9, 1.4, 2.3]))  # fmt: skip
 kind("metaballs", metaballs, **AS_IT_IS, **ABOVE)
 kind("smooth union", smooth_union)
-kind("smooth union, thirds", smooth_union, lambda d: 3 * d * H)
 kind("CSG by max, no distances", lambda p, n: np.maximum(quadric(p, n) * n / 8, -ball(p, n, 0.1)))
 kind("learned, slope .7", lambda p, n: 0.7 * ball(p, n) * (1 + 0.3 * (p[..., 0] / n - 0.5)))
 kind("slope by the place", lambda p, n: block(p, n) * np.where(p[..., 0] > p[..., 1], 0.9, 0.6))
@@ -395,6 +413,29 @@ kind("noise of .4", block, noise=0.4 * H)
 kind("re-initialised quadric", lambda p, n: quadric(p, n) * n / 8, lambda d: upwind(d) * H, form=H)
 kind("fast-marched by ITK", block, by_itk(
      lambda x: sitk.ApproximateSignedDistanceMap(x)), form=1, **MM)  # fmt: skip
+
+
+# parts that were not united: inside, distances to their faces, too
+
+
+def parts(name: str, *shifts: float) -> None:
+    """Add a kind of grid of boxes of 0.3 a side, shifted along x, each with its own faces."""
+    middle, half = (max(shifts) + min(shifts)) / 2, (max(shifts) - min(shifts)) / 2
+
+    def make(n: int) -> Kind:
+        def one(p: Array, shift: float, longer: float = 0.0) -> Array:
+            x, y, z = at(p, n)
+            return H * n * box((x - shift, y, z), 0.15 + longer, 0.15, 0.15)
+
+        p = places((n, n, n))
+        faces = np.min([np.abs(one(p, shift)) for shift in shifts], 0)
+        return Kind(np.copysign(faces, one(p, middle, half)), lambda q: one(q, middle, half))
+
+    KINDS[name] = make
+
+
+parts("parts that touch", -0.15, 0.15)
+parts("parts that overlap", -0.15, -0.05, 0.04, 0.1)
 
 # small and odd grids
 kind("two slices of a mask", lambda p, n: n * (np.hypot(*at(p, n)[:2]) - 0.3),

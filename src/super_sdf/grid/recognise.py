@@ -193,7 +193,7 @@ def _step_of_transform(look: Look, given: Floats | None) -> float:
         x = middle[free]
         if len(x) < max(ENOUGH, ring.sum() / 2):
             continue
-        typical = float(np.median(np.abs(x)))
+        typical = float(np.quantile(np.abs(x), 0.5))
         alike = np.abs(np.abs(x) - typical) <= 0.01 * typical
         share = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
         key = np.ascontiguousarray(np.packbits(signs[free], axis=1)).view(np.uint32).ravel()
@@ -302,7 +302,7 @@ def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> An
     slope = np.sort(np.sqrt((gradients**2).sum(1)))
     third = max(len(slope) // 3, 1)  # the narrowest range that holds a third of them
     at = int(np.argmin(slope[third:] / slope[:-third]))
-    facts["unit"] = unit = float(np.median(slope[at : at + third + 1]))
+    facts["unit"] = unit = float(np.quantile(slope[at : at + third + 1], 0.5))
     facts["error"] = SAME_UNIT if fourth >= ENOUGH else 3 * SAME_UNIT
     error = EXACT + min(facts["digit"] / unit / h, MOST_DIGIT) / 2
     facts["slopes"] = float((np.abs(slope / unit - 1) < error).mean())
@@ -420,8 +420,6 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
             return Answer("noisy", why, facts | {"spacing": steps})
         if not look.cut or abs(look.low + look.high) >= ALIKE * look.high:
             return Answer("density", "", facts, which_level(look, signed=True))
-    if given is not None and _is_noise(look, given, facts):
-        return Answer("noisy", "distances with noise", facts | {"spacing": given})
     middle = look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]
     if len(middle) >= ENOUGH:
         size, (one, other) = np.abs(middle), look.pairs
@@ -430,6 +428,8 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
         facts["area"] = float(at_0 / max(best, 1))
         if facts["centred"] < CENTRED and facts["area"] > AREA:
             return Answer("density", "", facts, which_level(look, signed=True))
+    if given is not None and _is_noise(look, given, facts):
+        return Answer("noisy", "distances with noise", facts | {"spacing": given})
     return Answer("smooth", "the slope is not that of a distance everywhere", facts)
 
 
