@@ -307,12 +307,9 @@ def side_of_zeros(look: Look) -> int:
 
 def parting_level(values: Floats) -> float:
     """Return the level that parts the values into two of least variance (Otsu's)."""
-    counts, edges = np.histogram(values, 512)
-    mids = (edges[1:] + edges[:-1]) / 2
-    below, mean = np.cumsum(counts)[:-1], np.cumsum(counts * mids)[:-1]
-    above, other = counts.sum() - below, (counts * mids).sum() - mean
-    apart = below * above * (mean / np.maximum(below, 1) - other / np.maximum(above, 1)) ** 2
-    return float(edges[1:-1][apart.argmax()])
+    ordered, below = np.sort(values), np.arange(1, len(values))
+    apart = np.cumsum(ordered - ordered.mean())[:-1] ** 2 / (below * below[::-1])
+    return float(ordered[apart.argmax()])
 
 
 def last_digit(look: Look) -> float:

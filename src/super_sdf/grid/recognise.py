@@ -165,13 +165,12 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
     if len(distinct) > 3:  # images are cut off at their ends
         inner &= (part != distinct[0]) & (part != distinct[-1])
     equal = equal_neighbours(part)[inner]
-    facts["amid"] = float((equal == 6).mean()) if len(equal) else 1.0
+    amid, level = ((equal >= n).mean() if len(equal) else 1.0 for n in (6, 4))
     if len(distinct) > 3 and facts["by_rank"] >= BY_RANK:
-        return bool(facts["amid"] >= AMID)
-    facts["plateaus"] = float((equal >= 4).mean()) if len(equal) else 1.0
+        return bool(amid >= AMID)
     few = len(distinct) <= FEW_LABELS and look.low >= 0
-    has_cores = facts["amid"] >= AMID or look.is_one_sided  # distances to boxes have none
-    return bool(few or (facts["plateaus"] >= PLATEAUS and has_cores))
+    has_cores = amid >= AMID or look.is_one_sided  # distances to boxes have none
+    return bool(few or (level >= PLATEAUS and has_cores))
 
 
 def _step_of_transform(look: Look, given: Floats | None) -> float:
