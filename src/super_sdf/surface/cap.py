@@ -26,7 +26,6 @@ from ..refine.nodes import (
     BARELY_INSIDE,
     BARELY_OUTSIDE,
     SHARING,
-    SharedParts,
     block_ijk,
     nodes_of_part,
     seen_from,
@@ -72,11 +71,12 @@ def close(field: FineField, *, cap: bool, border: IntArray | None = None) -> Fin
     column_of[order] = np.arange(len(order))
     known_at, filled_at = column_of[: len(known)], column_of[len(known) :][: len(filled)]
     blocks = np.full((len(field.blocks), len(voxel_ijk)), BARELY_OUTSIDE, np.float32)
-    _set_blocks(BARELY_INSIDE, filled_at, blocks, parts, field.factor)
+    closed = replace(field, voxel_ijk=voxel_ijk, blocks=blocks, parts=parts)
+    _set_blocks(closed, filled_at, BARELY_INSIDE)
     near = ((known <= border[0] + 1) | (known >= border[1] - 2)).any(1)  # others have no new voxel
     blocks[:, known_at[~near]] = field.blocks[:, ~near]  # beside them
-    _set_blocks(field.blocks[:, near], known_at[near], blocks, parts, field.factor)
-    return replace(field, voxel_ijk=voxel_ijk, blocks=blocks, parts=parts)
+    _set_blocks(closed, known_at[near], field.blocks[:, near])
+    return closed
 
 
 def find_border_inside(field: FineField, border: IntArray | None = None) -> IntArray:
@@ -99,22 +99,16 @@ def find_border_inside(field: FineField, border: IntArray | None = None) -> IntA
     return np.concatenate(found).astype(np.int32)
 
 
-def _set_blocks(
-    values: FloatArray | np.float32,
-    columns: IntArray,
-    blocks: FloatArray,
-    parts: SharedParts,
-    factor: int,
-) -> None:
-    """Set the blocks of some voxels, columns of ``blocks``, and what others share with them."""
-    values = np.broadcast_to(values, (len(blocks), len(columns)))
-    nodes = nodes_of_part(factor)
+def _set_blocks(field: FineField, columns: IntArray, values: FloatArray | np.float32) -> None:
+    """Set the blocks of some voxels, columns of all blocks, and what others share with them."""
+    values = np.broadcast_to(values, (len(field.blocks), len(columns)))
+    nodes = nodes_of_part(field.factor)
     for part, sharing in enumerate(SHARING):
         for place in sharing:
-            neighbour = parts.table[place, columns]
+            neighbour = field.parts.table[place, columns]
             there = np.flatnonzero(neighbour >= 0)
             seen = nodes[seen_from(part, place)]
-            blocks[seen[:, None], neighbour[there]] = values[nodes[part][:, None], there]
+            field.blocks[seen[:, None], neighbour[there]] = values[nodes[part][:, None], there]
 
 
 def outer_voxels(voxel_ijk: IntArray, border: NDArray[Any]) -> IntArray:

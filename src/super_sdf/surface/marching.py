@@ -28,7 +28,7 @@ import numpy as np
 from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 
-from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
+from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, Index, IntArray
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, part_of_node
 from ..threads import chunks_of, map_chunks, over_threads, worthwhile_threads
@@ -143,9 +143,7 @@ def _crossings_of_chunk(field: FineField, chunk: slice) -> tuple[NDArray[Any], .
     return row[own], edge[own], row[~own], edge[~own], cell_row, cell, case
 
 
-def _split(
-    places: NDArray[np.intp], rows: IntArray, width: int
-) -> tuple[IntArray, NDArray[np.int16]]:
+def _split(places: Index, rows: IntArray, width: int) -> tuple[IntArray, NDArray[np.int16]]:
     """Return the row and the column of flat indices into a table; ``rows`` names its rows."""
     line = places // width
     return rows[line], (places - line * width).astype(np.int16)
@@ -289,7 +287,8 @@ def edge_table(
     number_at[slot(crossings.own_row[own]) * edges + crossings.own_edge[own]] = numbers
     row, edge = crossings.other_row[others], crossings.other_edge[others].astype(np.int64)
     place, owner = owners_of(field, crossings, others)
-    same_edge = slot(owner) * edges + edge - edge_shifts(field.factor)[place]
+    step = field.factor * NEIGHBOURHOOD @ strides(field.factor)  # of its number, from the owner's
+    same_edge = slot(owner) * edges + edge - step[place]
     number_at[slot(row) * edges + edge] = number_at.take(same_edge)
     return number_at
 
@@ -301,12 +300,6 @@ def owners_of(
     row = crossings.other_row[others]
     place = field.parts.owner[part_of_edge(field.factor)[crossings.other_edge[others]], row]
     return place, field.parts.table[place, row]
-
-
-@lru_cache
-def edge_shifts(factor: int) -> NDArray[np.int64]:
-    """Return an edge's number in a block minus its number in each neighbouring block, (27,)."""
-    return np.asarray(factor * NEIGHBOURHOOD @ strides(factor), np.int64)
 
 
 def strides(factor: int) -> NDArray[np.int64]:

@@ -344,7 +344,7 @@ def _measure(
     how much a sphere is pierced; how many are touched; how far spheres moved the point; how far it
     is outside.
     """
-    patches, factor = patches.chosen(rows), field.factor
+    patches, factor = patches.chosen(np.arange(rows.start, rows.stop)), field.factor
     crossing, count = patches.crossing.T, len(patches.row)
     there = crossing >= 0
     point, normal = planes.point.take(crossing, 0), planes.normal.take(crossing, 0)

@@ -3,8 +3,8 @@
 A fan whose vertex lies in its cell, with crossings on their lattice edges, meets no fan of another
 cell. So what intersects has a feature's vertex outside its cell, a moved crossing or a turned side.
 
-1. Suspects are vertices round which the surface does not face one way. Their triangles are tested
-   against all others whose boxes they overlap.
+1. Suspects are vertices round which the surface does not face one way, and those of triangles that
+   pierce another sheet. Their triangles are tested against all others whose boxes they overlap.
 2. Of a pair that intersects, the feature's vertex that is least outside its cell is pulled into it:
    a corner, which may be farther out, stays. If there is none, all vertices are put back.
 3. Triangles that this changes are tested again. Of those that intersect now, all vertices of
@@ -23,7 +23,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import NEIGHBOURHOOD, BoolArray, Index, Vectors, dot, length, sums_at, unit
+from ...arrays import NEIGHBOURHOOD, BoolArray, Index, Vectors, dot, face_normals, sums_at, unit
+from ...threads import chunks_of
+from ..mesh import CLEARANCE
 from .patches import Patches, Placed, nth_of_run, triangles_of
 
 # Vertices of triangles that intersect are in cells at most 3 apart: none is more than half a cell
@@ -31,12 +33,13 @@ from .patches import Patches, Placed, nth_of_run, triangles_of
 APART = 3
 # Whether only the vertex least outside its cell is pulled back, and whether features are dropped.
 ROUNDS = ((True, False), (False, False), (False, True), (False, True))
-# Cells that the vertices depend on: in each round on such triangles, and on those beside that are
-# suspects.
-REACH = len(ROUNDS) * (APART + 1) + 2
+# Cells that the vertices depend on: in each round, and where suspects are found, on such triangles,
+# and on those beside.
+REACH = (len(ROUNDS) + 1) * (APART + 1)
 ONE_WAY = 0.1  # least cosine between normals and their mean where a surface faces one way
 LEAST_MOVE = 0.1  # of the way to the nearest node, from which a crossing may fold the surface
 INSIDE_CELL = 0.02  # fine spacings from its faces that a vertex is pulled into a cell
+ENTERING_TEMPORARIES = 100  # numbers per triangle that may enter other cells
 FARTHEST = 1 << 20  # more cells than along any axis
 TOUCHING = 1e-5  # fine spacings at which triangles intersect ...
 STEEP = 1e-2  # ... if a side rises by this over the other triangle ...
@@ -54,14 +57,11 @@ def without_folds(patches: Patches, placed: Placed, lattice: Vectors, rounded: R
     """
     suspect = find_suspects(patches, placed, lattice)
     keys = keys_of(np.floor(patches.low / APART))
-    order = np.argsort(keys)
-    keys = keys[order]
+    matching = finder(keys)
     for least, drop in ROUNDS:
-        close = np.zeros(len(keys), bool)  # patches in cells from which triangles reach suspects
-        cells = np.unique(keys_of(np.floor(patches.low[_having(patches, placed, suspect)] / APART)))
-        around = np.unique(cells[:, None] + keys_of(NEIGHBOURHOOD))
-        start, stop = np.searchsorted(keys, around), np.searchsorted(keys, around, "right")
-        close[order[np.repeat(start, stop - start) + nth_of_run(stop - start)]] = True
+        cells = np.unique(keys[_having(patches, placed, suspect)])
+        close = np.zeros(len(keys), bool)  # patches from which triangles reach suspects
+        close[matching((cells[:, None] + keys_of(NEIGHBOURHOOD)).ravel())[1]] = True
         _, triangles = triangles_of(patches, placed, close)
         points, step = rounded(placed.points), np.zeros(len(suspect))
         one, other = overlapping_boxes(points, triangles, suspect)
@@ -88,30 +88,43 @@ def without_folds(patches: Patches, placed: Placed, lattice: Vectors, rounded: R
 def find_suspects(patches: Patches, placed: Placed, lattice: Vectors) -> BoolArray:
     """Return the vertices, (n + f,), where fans and moved crossings may fold the surface.
 
-    There it does not face one way: the triangles at the vertex, or the planes of the crossings
-    round a node of the lattice, where two sheets may pass.
+    There the triangles at a vertex do not face one way, or one of them pierces another sheet.
     """
-    to_node = length(lattice - np.rint(lattice))
-    moved = length(placed.position - lattice) > LEAST_MOVE * to_node
+    points, shift, to_node = placed.points, placed.position - lattice, lattice - np.rint(lattice)
+    moved = dot(shift, shift) > LEAST_MOVE**2 * dot(to_node, to_node)
     changed = np.concatenate([moved, np.ones(len(placed.feature), bool)])
-    _, triangles = triangles_of(patches, placed, _having(patches, placed, changed))
-    a, b, c = (placed.points.take(corner, 0) for corner in triangles.T)
-    normals = np.tile(unit(np.cross(b - a, c - a)), (3, 1))
-    suspect = _turns(triangles.T.ravel(), normals, len(changed))
-    nodes, node = np.unique(keys_of(np.rint(lattice)), return_inverse=True)
-    sheets = _turns(node, placed.normal, len(nodes))[node]
-    used = np.zeros(len(changed), bool)
-    used[triangles] = True
-    suspect[: len(lattice)] |= sheets & used[: len(lattice)]
+    near = patches.dilate(_having(patches, placed, changed), 1, len(moved))
+    own, triangles = triangles_of(patches, placed, patches.having(near))
+    corner, normals = triangles.T.ravel(), np.tile(unit(face_normals(points, triangles)), (3, 1))
+    mean = unit(sums_at(corner, normals, len(changed)))
+    suspect: BoolArray = np.zeros(len(changed), bool)
+    suspect[corner[dot(normals, mean.take(corner, 0)) < ONE_WAY]] = True
+    some = np.flatnonzero(np.logical_or.reduce([changed.take(corner) for corner in triangles.T]))
+    low, high = _boxes(points, triangles[some])
+    one, other = entering(patches, own[some], low + CLEARANCE, high - CLEARANCE)
+    patch, sheet = triangles_of(patches, placed, np.bincount(other, minlength=len(patches.row)) > 0)
+    pair, other = finder(patch)(other)
+    pierced = intersecting(points, triangles[some[one[pair]]], sheet[other])
+    suspect[np.concatenate(pierced)] = True
     return suspect
 
 
-def _turns(place: Index, normals: Vectors, count: int) -> BoolArray:
-    """Return which of ``count`` places have normals that do not face one way."""
-    mean = unit(sums_at(place, normals, count))
-    found: BoolArray = np.zeros(count, bool)
-    found[place[dot(normals, mean.take(place, 0)) < ONE_WAY]] = True
-    return found
+def entering(patches: Patches, own: Index, low: Vectors, high: Vectors) -> Index:
+    """Return pairs of a box of a triangle and a patch of another sheet, whose cell it enters.
+
+    Such a patch has no crossing in common with the triangle's ``own`` patch.
+    """
+    matching, found = finder(keys_of(patches.low)), [np.empty((2, 0), np.int64)]
+    columns = np.ascontiguousarray(patches.crossing.T, np.int32)
+    for some in chunks_of(len(own), ENTERING_TEMPORARIES):
+        row, cell = _cells_of(low[some], high[some])
+        pair, other = matching(cell)
+        one = some.start + row[pair]
+        mine, theirs = columns.take(own[one], 1), columns.take(other, 1)
+        theirs[theirs < 0] = -2  # no crossing
+        shared = np.logical_or.reduce([a == b for a in mine for b in theirs])
+        found.append(np.stack([one, other])[:, ~shared])
+    return np.concatenate(found, 1)
 
 
 def _having(patches: Patches, placed: Placed, chosen: BoolArray) -> BoolArray:
@@ -144,17 +157,12 @@ def overlapping_boxes(points: Vectors, triangles: Index, suspect: BoolArray) -> 
 
     A triangle is listed in the cells from which it reaches into the next, or in its only one.
     """
-    a, b, c = (points.take(corner, 0) for corner in triangles.T)
-    low, high = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
-    first, last = np.floor(low).astype(np.int64), np.floor(high).astype(np.int64)
+    low, high = _boxes(points, triangles)
     chosen: BoolArray = np.any(suspect[triangles], axis=1)
-    mine, my_cell = _cells_of(first - 1, last, np.flatnonzero(chosen))
-    listed, cell = _cells_of(first, np.maximum(first, last - 1), np.arange(len(chosen)))
-    order = np.argsort(cell)
-    cell, listed = cell[order], listed[order]
-    start, stop = np.searchsorted(cell, my_cell), np.searchsorted(cell, my_cell, "right")
-    pair = np.repeat(np.arange(len(mine)), stop - start)
-    one, other = mine[pair], listed[start[pair] + nth_of_run(stop - start)]
+    mine, cell = _cells_of(low[chosen] - 1, high[chosen])
+    listed, other_cell = _cells_of(low, np.maximum(low, high - 1))
+    one, other = finder(other_cell)(cell)
+    one, other = np.flatnonzero(chosen)[mine[one]], listed[other]
     for lower, upper in zip(low.T, high.T):
         kept = (lower[one] <= upper[other]) & (lower[other] <= upper[one])
         one, other = one[kept], other[kept]
@@ -162,14 +170,35 @@ def overlapping_boxes(points: Vectors, triangles: Index, suspect: BoolArray) -> 
     return one[once], other[once]
 
 
-def _cells_of(first: Index, last: Index, rows: Index) -> tuple[Index, Index]:
-    """Return the cells from the first to the last, (b, 3), of some rows: which row, and key."""
-    size = last[rows] - first[rows] + 1
+def _boxes(points: Vectors, triangles: Index) -> tuple[Vectors, Vectors]:
+    """Return the lowest and the highest corners of boxes round triangles, (t, 3)."""
+    a, b, c = (points.take(corner, 0) for corner in triangles.T)
+    return np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+
+
+def _cells_of(low: Vectors, high: Vectors) -> tuple[Index, Index]:
+    """Return the cells that boxes between two corners reach into: which box, and the cell's key."""
+    first = np.floor(np.minimum(low, high)).astype(np.int64)
+    size = np.floor(np.maximum(low, high)).astype(np.int64) - first + 1
     times = size[:, 0] * size[:, 1] * size[:, 2]
-    row = np.repeat(np.arange(len(rows)), times)
+    row = np.repeat(np.arange(len(size)), times)
     nth, k = np.divmod(nth_of_run(times), size[row, 2])
     i, j = np.divmod(nth, size[row, 1])
-    return rows[row], keys_of(first[rows])[row] + (i * FARTHEST + j) * FARTHEST + k
+    return row, keys_of(first)[row] + (i * FARTHEST + j) * FARTHEST + k
+
+
+def finder(keys: Index) -> Callable[[Index], tuple[Index, Index]]:
+    """Return a function that returns pairs of equal keys: places in its argument, and in these."""
+    order = np.argsort(keys, kind="stable")  # most are in order
+    distinct, first, times = np.unique(keys[order], return_index=True, return_counts=True)
+
+    def find(wanted: Index) -> tuple[Index, Index]:
+        at = np.searchsorted(distinct[:-1], wanted)  # the last also stands for larger ones
+        each = np.where(distinct[at] == wanted, times[at], 0)
+        pair = np.repeat(np.arange(len(wanted)), each)
+        return pair, order[first[at][pair] + nth_of_run(each)]
+
+    return find
 
 
 def keys_of(ijk: NDArray[Any]) -> Index:
@@ -194,9 +223,8 @@ def intersecting(points: Vectors, first: Index, second: Index) -> tuple[Index, I
 
 def _heights_over(points: Vectors, first: Index, second: Index) -> Vectors:
     """Return how far over the first triangles the second's corners are, (3, m); NaN if common."""
-    a, b, c = (points.take(corner, 0) for corner in first.T)
-    normals = unit(np.cross(b - a, c - a))
-    heights = np.stack([dot(points.take(corner, 0) - a, normals) for corner in second.T])
+    start, normals = points.take(first[:, 0], 0), unit(face_normals(points, first))
+    heights = np.stack([dot(points.take(corner, 0) - start, normals) for corner in second.T])
     heights[np.any(second.T[:, None] == first.T, axis=1)] = np.nan
     return heights
 

@@ -33,6 +33,7 @@ from ...arrays import (
     Numbers,
     Vectors,
     dot,
+    face_normals,
     unit,
 )
 from ...refine.field import FineField
@@ -105,19 +106,15 @@ class Patches:
     # (P, S), its crossings in order, counter-clockwise from outside, -1 after the last
     crossing: Index
 
-    def chosen(self, rows: Any) -> Patches:
-        """Return some of the patches, by their rows or a slice."""
-        if isinstance(rows, slice):
-            return Patches(*(values[rows] for values in vars(self).values()))
+    def chosen(self, rows: Index) -> Patches:
+        """Return some of the patches, by their rows."""
         return Patches(*(values.take(rows, 0) for values in vars(self).values()))
 
     def mean(self, vectors: Vectors) -> Vectors:
         """Return the mean of the vectors (n, 3) at the crossings of each patch, (P, 3)."""
-        total = np.zeros((len(self.sides), 3))
-        for crossing in self.crossing.T:
-            there = np.flatnonzero(crossing >= 0)
-            total[there] += vectors.take(crossing[there], 0)
-        return total / self.sides[:, None]
+        vectors = np.concatenate([vectors, np.zeros((1, 3))])  # -1 reads the last
+        total = np.sum([vectors.take(crossing, 0) for crossing in self.crossing.T], 0)
+        return np.asarray(total / self.sides[:, None])
 
     def having(self, chosen: BoolArray) -> BoolArray:
         """Return which patches have some of the chosen crossings, (P,)."""
@@ -134,21 +131,19 @@ class Patches:
         return near[:-1]
 
 
-def find_patches(
-    field: FineField, crossings: Crossings, voxels: BoolArray
-) -> tuple[Patches, Index]:
-    """Return the patches in the crossed cells of some voxels, and the crossings that they use.
+def find_patches(field: FineField, crossings: Crossings, where: BoolArray) -> tuple[Patches, Index]:
+    """Return the patches in the crossed cells of voxels (D,), and the crossings that they use.
 
     These are own edges of ``crossings``; patches count among those used.
     """
     table, factor = tables(), field.factor
-    others = np.flatnonzero(voxels[crossings.other_row])
-    listed = voxels.copy()
+    others = np.flatnonzero(where[crossings.other_row])
+    listed = where.copy()
     listed[owners_of(field, crossings, others)[1]] = True
     slot = np.cumsum(listed) - 1
     own = np.flatnonzero(listed[crossings.own_row])
     edge_at = edge_table(field, crossings, slot.take, int(listed.sum()), own, others, own)
-    some = np.flatnonzero(voxels[crossings.cell_row])
+    some = np.flatnonzero(where[crossings.cell_row])
     count = table.loops[crossings.case[some]]
     cell = np.repeat(some, count)
     loop = table.first_loop[crossings.case[cell]] + nth_of_run(count)
@@ -190,8 +185,7 @@ class Placed:
 
     def facing(self, corners: tuple[Index, Index, Index], *crossings: Index) -> Numbers:
         """Return the least cosine between triangles, corners (t,) each, and planes of crossings."""
-        a, b, c = (self.points.take(corner, 0) for corner in corners)
-        normal = unit(np.cross(b - a, c - a))
+        normal = unit(face_normals(self.points, np.stack(corners, 1)))
         least = [dot(normal, self.normal.take(at, 0)) for at in crossings]
         return least[0] if len(least) == 1 else np.minimum(*least)
 
@@ -205,10 +199,6 @@ class Placed:
         middle = patches.chosen(self.feature).mean(self.position)
         inwards = np.where(folded[:, None], PULL * (middle - self.peak), 0)
         return replace(self, peak=self.peak + inwards)
-
-
-Triangles = tuple[Index, Index]
-"""Patches (t,), and the corners of a triangle of each, (t, 3)."""
 
 
 class Sides(NamedTuple):
@@ -230,8 +220,11 @@ def _sides_of(patches: Patches, placed: Placed) -> Sides:
     return Sides(patch, start, end, len(placed.position) + fan)
 
 
-def triangles_of(patches: Patches, placed: Placed, chosen: BoolArray) -> Triangles:
-    """Return the triangles of chosen patches, (P,), as if there were no others."""
+def triangles_of(patches: Patches, placed: Placed, chosen: BoolArray) -> tuple[Index, Index]:
+    """Return the triangles of chosen patches, (P,), as if there were no others.
+
+    Returned are the patches, (t,), and the corners of a triangle of each, (t, 3).
+    """
     known = np.flatnonzero(chosen[placed.feature])
     flat = chosen.copy()
     flat[placed.feature] = False
@@ -249,7 +242,7 @@ def triangles_of(patches: Patches, placed: Placed, chosen: BoolArray) -> Triangl
     )
 
 
-def _fan_triangles(patches: Patches, placed: Placed) -> list[Triangles]:
+def _fan_triangles(patches: Patches, placed: Placed) -> list[tuple[Index, Index]]:
     """Return the triangles of patches with a feature: fans, and pairs across turned sides."""
     sides = _sides_of(patches, placed)
     one, other = _turned(sides, placed)

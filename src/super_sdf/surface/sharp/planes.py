@@ -14,7 +14,7 @@ Positions are in fine spacings, from node (0, 0, 0) of the fine lattice.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,11 +48,6 @@ class Planes:
     normal: Vectors
     # (n,), 1 where the field is a distance, less where its slope is not 1, or the ground not flat
     trust: Numbers
-
-    @cached_property
-    def height(self) -> Numbers:
-        """How far each plane lies from node (0, 0, 0), along its normal, (n,)."""
-        return dot(self.point, self.normal)
 
 
 def planes_at_crossings(
@@ -170,7 +165,7 @@ def settle_planes(patches: Patches, own: Planes, threads: int = 1) -> Planes:
     if not chunks:
         return Planes(own.point, own.normal, trust)
     rows, crossing = np.flatnonzero(near), np.concatenate([loop.ravel() for loop in chunks])
-    table = np.concatenate([normal, [own.height, trust]])
+    table = np.concatenate([normal, [dot(own.point, own.normal), trust]])
     work = [(point.take(loop, 1), loop) for loop in chunks]
     start = point.take(rows, 1)
     placed = start.copy()
@@ -211,9 +206,7 @@ def _sums_in_loops(table: Vectors, work: tuple[Vectors, Index]) -> Vectors:
     """
     start, loop = work
     sides, sums, here = len(loop), np.zeros((6, *loop.shape)), table.take(loop, 1)
-    twice = np.concatenate(
-        [here, here[:, :-1]], 1
-    )  # so that the next ones of all follow each other
+    twice = np.concatenate([here, here[:, :-1]], 1)  # so that the next ones follow each other
     bends: list[Numbers] = []
     for turn in range(1, sides):
         other = twice[:, turn : turn + sides]
