@@ -296,7 +296,7 @@ kind("density, blurred over five voxels", ball, lambda d: 0.5 - d / 5, clip=(0, 
 kind("density, share, faces between samples", lambda p, n: bar(p + 0.4, n), **SHARE)
 kind("density, cut at its foot, level given", ball, lambda d: 1 - d / 9, clip=(0.5, 2),
      options={"level": 0.9}, **ABOVE)  # fmt: skip
-kind("map of both signs, with noise", metaballs, lambda v: v - 0.02, noise=0.05, **ABOVE)
+kind("map of both signs, with noise", metaballs, lambda v: v - 0.02, noise=0.02, **ABOVE)
 kind("probability with noise", ball, **DENSITY, noise=0.02, clip=(0, 1))
 kind("image of 8 bits", change=lambda d: 255 * (0.5 - d / 12), dtype=np.uint8, level=127.5,
      above=True)  # fmt: skip

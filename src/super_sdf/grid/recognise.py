@@ -432,8 +432,6 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
             return Answer("noisy", why, facts | {"spacing": steps})
         if not facts["cut"] or abs(look.low + look.high) >= ALIKE * look.high:
             return Answer("density", "", facts, which_level(look, signed=True))
-    if given is not None and _is_noise(look, given, facts):
-        return Answer("noisy", "distances with noise", facts | {"spacing": given})
     middle = look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]
     if len(middle) >= ENOUGH:
         size, (one, other) = np.abs(middle), look.pairs
@@ -442,6 +440,8 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
         facts["area"] = float(at_0 / max(best, 1))
         if facts["centred"] < CENTRED and facts["area"] > AREA:
             return Answer("density", "", facts, which_level(look, signed=True))
+    if given is not None and _is_noise(look, given, facts):
+        return Answer("noisy", "distances with noise", facts | {"spacing": given})
     return Answer("smooth", "the slope is not that of a distance everywhere", facts)
 
 
