@@ -22,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from super_sdf.errors import FileError, OptionError, seen
-from super_sdf.options import DEFAULT_QUALITY, PRECISIONS
+from super_sdf.options import DEFAULT_QUALITY, OPTIONS
 from super_sdf.threads import count_cores
 
 from . import parser_of
@@ -151,7 +151,7 @@ def main() -> int:
     parser.add_argument("--limit", type=int, help="use only this many meshes, spread over the list")
     parser.add_argument("--turned", type=int, metavar="SEED", help="turn meshes at random first")
     parser.add_argument("--model", default=DEFAULT_QUALITY, help="shipped network or ONNX file")
-    parser.add_argument("--precision", choices=PRECISIONS, default="auto")
+    parser.add_argument("--precision", choices=OPTIONS["precision"].kind.choices, default="auto")
     parser.add_argument("--quiet", action="store_true", help="print errors only")
     add_jobs(parser)
     add_ndc(parser)

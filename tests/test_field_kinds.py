@@ -14,7 +14,7 @@ from super_sdf import SdfGrid, make_grid, reconstruct
 from super_sdf.errors import GridError, OptionError
 from super_sdf.grid import look, samples
 from super_sdf.grid.sdf_grid import crop
-from super_sdf.options import FIELDS
+from super_sdf.options import OPTIONS
 
 PLACE = {"spacing": 1.0, "origin": 0.0}
 
@@ -145,7 +145,7 @@ def test_another_unit_than_that_of_the_spacing_is_an_error(unit):
     assert make_grid(values, **PLACE, field="distance").spacing == (1, 1, 1)
 
 
-@pytest.mark.parametrize("field", FIELDS[1:])
+@pytest.mark.parametrize("field", OPTIONS["field"].kind.choices[1:])
 def test_the_user_may_overrule_the_evidence(field):
     grid = make_grid(torus(), **PLACE, field=field)
     assert (grid.field.kind, grid.field.given) == (field, True)

@@ -6,7 +6,7 @@ from conftest import ball, refusal, trilinear, walled
 from hypothesis import given, settings, strategies as st
 from hypothesis.extra import numpy as hnp
 
-from super_sdf import Mesh, SdfGrid, make_grid, reconstruct
+from super_sdf import Mesh, make_grid, reconstruct
 from super_sdf.errors import GridError
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -21,7 +21,8 @@ fields = hnp.arrays(
 
 def mesh_of(values: np.ndarray, spacing: float = 1.0, *, flipped: bool = False) -> Mesh:
     """Refine any values, distances or not, with a stand-in for the network."""
-    grid = SdfGrid.trusted(values, spacing, positive_inside=flipped)
+    inside = "positive" if flipped else "negative"
+    grid = make_grid(values, spacing=spacing, field="distance", inside=inside)
     return reconstruct(grid, trilinear, 2)
 
 

@@ -41,7 +41,7 @@ def group(name, most, taken, kept=0):
         ("0::/", {}, FREE),
         ("4:memory:/\n1:cpu:/", group("", 100, 80), FREE),
         ("0::/", group("", 500 * MB, 450 * MB, 400 * MB), 450 * MB),
-        ("0::/a/b", group("a/b/", 90, "what?") | group("a/", 100, 30) | group("", 300, 250), 50),
+        ("0::/a/b", group("a/b/", "max", 90) | group("a/", 100, 30) | group("", 300, 250), 50),
         ("4:memory:/x\n0::/not/mounted/here", group("", 100, 40), 60),
     ],
 )

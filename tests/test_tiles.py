@@ -63,8 +63,7 @@ def test_tiles_make_the_same_mesh(options):
         many = mesh_grid(grid, CLOSE, options, least_tiles=count)
         assert many.tiles >= count
         assert_same(one.mesh, many.mesh, 5e-5)
-        assert (one.open_edges, one.counts) == (many.open_edges, many.counts)
-        assert one.leaves == many.leaves
+        assert (one.open_edges, one.whole.count) == (many.open_edges, many.whole.count)
 
 
 @settings(max_examples=15)
@@ -77,7 +76,7 @@ def test_tiles_of_random_fields_make_the_same_mesh(seed, count, cap, sharp):
     many = mesh_grid(grid, CLOSE, options, least_tiles=count)
     assert_same(one.mesh, many.mesh)
     assert one.open_edges == many.open_edges
-    assert one.counts == many.counts
+    assert one.whole.noisy == many.whole.noisy
 
 
 def stretched():
@@ -151,9 +150,7 @@ def spoilt(task, network):
     part = make_tile(task, network)
     if task.tile.inner_low != (0, 0, 0):
         return replace(part, worker="worker 7")
-    keys = part.keys.copy()
-    keys[~part.mine] += 1
-    return replace(part, keys=keys, worker="worker 3")
+    return replace(part, keys=part.keys + ~part.mine, worker="worker 3")
 
 
 @pytest.mark.parametrize("cap", [True, False])
@@ -168,7 +165,7 @@ def test_a_bound_of_memory_chooses_the_tiles(monkeypatch):
     grid, how = balls(), {"factor": 2, "mesher": "marching"}
     one, held = mesh_grid(grid, CLOSE, Options(**how)), 10**8
     monkeypatch.setattr(tiles, "held_memory", lambda: held)
-    need = held + tiles.FIXED + 1000 * one.counts["band_voxels"]
+    need = held + tiles.FIXED + 1000 * one.whole.count
     many = mesh_grid(grid, CLOSE, Options(max_memory=need, **how))
     assert many.tiles > 1
     assert_same(one.mesh, many.mesh)

@@ -15,7 +15,7 @@ from trimesh import grouping
 
 from super_sdf import SdfGrid, make_grid, reconstruct
 from super_sdf.errors import GridError
-from super_sdf.options import FIELDS
+from super_sdf.options import OPTIONS
 
 
 def truncated(cut: float = 2.0) -> np.ndarray:
@@ -138,7 +138,7 @@ def test_an_infinite_sample_beside_the_surface_is_refused():
     )
 
 
-@pytest.mark.parametrize("field", FIELDS[1:])
+@pytest.mark.parametrize("field", OPTIONS["field"].kind.choices[1:])
 def test_fields_of_all_kinds_have_unknown_samples(field):
     known = truncated(4.0)
     values = np.where(np.abs(known) < 4, known, np.nan)

@@ -24,13 +24,6 @@ def store(path, array=VALUES.T, version=3, name=None, **layout):
     zarr.create_array(path, name=name, zarr_format=version, **about)[:] = array
 
 
-def edited(path, change):
-    """Change the JSON document in a file."""
-    found = json.loads(Path(path).read_text())
-    change(found)
-    Path(path).write_text(json.dumps(found))
-
-
 def test_a_store_in_a_zip_file():
     with zarr.storage.ZipStore("a.zarr.zip", mode="w") as zipped:
         store(zipped, name="deep/field")
@@ -138,7 +131,9 @@ PICKLE_AT = {
 def test_a_codec_that_is_not_in_the_list_is_refused_by_its_name(place):
     version = 2 if place == "filters" else 3
     store("a.zarr", version=version, **({"shards": (16, 16, 16)} if "shard" in place else {}))
-    edited("a.zarr/.zarray" if version == 2 else "a.zarr/zarr.json", PICKLE_AT[place])
+    path = Path("a.zarr/.zarray" if version == 2 else "a.zarr/zarr.json")
+    PICKLE_AT[place](document := json.loads(path.read_text()))
+    path.write_text(json.dumps(document))
     assert said_of("a.zarr") == (
         "a.zarr names the codec 'pickle', which is not among those that are read "
         f"({', '.join(sorted(CODECS))}): store it with one of these"

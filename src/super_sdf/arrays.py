@@ -10,22 +10,18 @@ from numpy.typing import NDArray
 FloatArray: TypeAlias = NDArray[np.float32]
 IntArray: TypeAlias = NDArray[np.int32]
 BoolArray: TypeAlias = NDArray[np.bool_]
-Triple: TypeAlias = tuple[float, float, float]
-"""One number per axis: x, y, z."""
+Triple: TypeAlias = tuple[float, float, float]  # one number per axis: x, y, z
 
 NEIGHBOURHOOD: IntArray = np.indices((3, 3, 3)).reshape(3, 27).T.astype(np.int32) - 1
 """Steps from the centre voxel to the 27 of a patch or of a row of a neighbour table, (27, 3)."""
 CORNERS: IntArray = np.indices((2, 2, 2)).reshape(3, 8).T.astype(np.int32)
 """Steps from the lowest corner of a cell to all of them, (8, 3)."""
-CENTRE = 13
-"""Index of the centre voxel itself."""
-STRIDES = np.array([9, 3, 1])
-"""Difference of the indices of two places next to each other along each axis."""
+CENTRE = 13  # index of the centre voxel itself
+STRIDES = np.array([9, 3, 1])  # from a place to that beside it along each axis, in indices
 
 Index: TypeAlias = NDArray[np.int64]
 Numbers: TypeAlias = NDArray[np.float64]
-Vectors: TypeAlias = NDArray[np.float64]
-"""A vector in each row, (n, 3)."""
+Vectors: TypeAlias = NDArray[np.float64]  # a vector in each row, (n, 3)
 
 
 def dot(a: Vectors, b: Vectors) -> Numbers:
@@ -38,18 +34,10 @@ def inner(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
-def cross(a: Vectors, b: Vectors) -> Vectors:
-    """Return the cross products of vectors, (n, 3)."""
-    product: Vectors = np.empty_like(a)
-    for k in range(3):
-        product[..., k] = a[..., k - 2] * b[..., k - 1] - a[..., k - 1] * b[..., k - 2]
-    return product
-
-
 def face_normals(points: Vectors, faces: NDArray[Any]) -> Vectors:
     """Return normals of triangles (m, 3), as long as twice their areas."""
     a, b, c = (points.take(corner, 0) for corner in faces.T)
-    return cross(b - a, c - a)
+    return np.asarray(np.cross(b - a, c - a))
 
 
 def length(vectors: Vectors) -> Numbers:

@@ -204,10 +204,7 @@ class Certificate:
 def read_for_check(
     mesh: str | Path, grid: str | Path, options: Options, made: Any = None
 ) -> tuple[Mesh, SdfGrid]:
-    """Return a mesh and its grid: those that were ``made``, else read from their files.
-
-    ``options`` are those that the mesh was made with: how the grid is read, the unit.
-    """
+    """Return a mesh and its grid: those that were ``made``, else read as it was made from them."""
     if made is not None:
         return merged(made.mesh), made.grid
     samples, read = read_grid(grid, **options.reading()), read_mesh(mesh)

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from .files.formats import files_of
 from .files.grids import read_grid
 from .files.meshes import World, check_mesh_suffix, write_meshes
@@ -22,7 +24,6 @@ from .threads import STEPS, Progress, Steps
 if TYPE_CHECKING:
     from .network.contract import Decoder
     from .options import Options
-    from .simplify.simplify import Simplified
     from .surface.mesh import Mesh
 
 
@@ -73,23 +74,42 @@ def convert(
             check_has_volume(grid, options.offset, cap=options.cap)
         steps.finish("read")
         made = mesh_grid(grid, network, options, steps=steps, **how)
-        mesh, simplified, off = _reworked(made.mesh, grid, options)
-        steps.lap("simplify" if simplified else "isosurface")
+        facts = _facts(grid, made, options)
+        mesh = _finished(made.mesh, grid, options, facts)
+        steps.lap("simplify" if options.goals() else "isosurface")
         world, beside = World(options.unit, grid.space), [Path(save_field)] if save_field else []
         write_meshes({Path(target): {"": mesh}}, force=force, world=world, beside=beside)
         steps.lap("write")
-    facts = _facts(grid, mesh, made, options, simplified)
-    facts["inferred"] += off
     if saved:
         facts["saved_field"] = saved
     return Conversion(grid, mesh, facts, steps.seconds)
 
 
-def _reworked(
-    mesh: Mesh, grid: SdfGrid, options: Options
-) -> tuple[Mesh, Simplified | None, list[str]]:
-    """Return the mesh with the volume of its samples, and simplified, if so asked, and notes."""
-    simplified, volume = None, volume_of_samples(grid) if options.keep_volume else None
+def _facts(grid: SdfGrid, made: Result, options: Options) -> dict[str, Any]:
+    """Return what is known of how a mesh was made, for JSON."""
+    notes, capped = list(made.lattice.notes), options.cap and made.whole.leaves
+    if capped:
+        closed = "its surface is closed along the border (leave it open with --open)"
+        notes.append(f"the solid runs out of the grid: {closed}")
+    if options.mesher == "sharp" and not made.lattice.field.has_exact:
+        notes.append(f"{grid.field.kind} values show no edges: the mesh is that of marching cubes")
+    return {
+        **describe_place(grid),
+        "band_voxels": made.whole.count,
+        "noisy_voxels": made.whole.noisy,
+        "tiles": made.tiles,
+        "factor": options.factor_for(mask=grid.field.sides_only),
+        "closed": not made.open_edges,
+        "capped": capped,
+        "field": grid.field.report(),
+        "inferred": notes,
+        "warnings": _warnings(grid, made, options.offset),
+    }
+
+
+def _finished(mesh: Mesh, grid: SdfGrid, options: Options, facts: dict[str, Any]) -> Mesh:
+    """Return the mesh, with the volume of its samples and simplified, if so asked; add facts."""
+    volume = volume_of_samples(grid) if options.keep_volume else None
     if volume is not None:
         from .labels.volumes import keep_volume, volume_notes
 
@@ -97,52 +117,21 @@ def _reworked(
     if options.goals():
         from .simplify.simplify import simplify_mesh
 
-        simplified = simplify_mesh(
-            mesh,
-            error=options.error(grid.voxel_size),
-            triangles=options.triangles,
-            max_memory=options.max_memory,
-        )
-        mesh = simplified.mesh
-    if volume is None:
-        return mesh, simplified, []
-    return mesh, simplified, volume_notes({"the mesh": (mesh.volume(), volume)})  # may be off now
-
-
-def _facts(
-    grid: SdfGrid, mesh: Mesh, made: Result, options: Options, simplified: Simplified | None
-) -> dict[str, Any]:
-    """Return what is known of a mesh, for JSON."""
-    notes, warnings = list(made.lattice.notes), _warnings(grid, made, options.offset)
-    capped, columns = options.cap and made.leaves, mesh.vertices.T  # in world units
-    if capped:
-        closed = "its surface is closed along the border (leave it open with --open)"
-        notes.append(f"the solid runs out of the grid: {closed}")
-    if options.mesher == "sharp" and not made.lattice.field.has_exact:
-        notes.append(f"{grid.field.kind} values show no edges: the mesh is that of marching cubes")
-    facts = {
-        **describe_place(grid),
-        **made.counts,
-        "vertices": len(mesh.vertices),
-        "triangles": len(mesh.faces),
-        "tiles": made.tiles,
-        "factor": options.factor_for(mask=grid.field.sides_only),
-        "bounds": [[x.min().item() for x in columns], [x.max().item() for x in columns]],
-        "closed": mesh.is_closed() if simplified else not made.open_edges,
-        "capped": capped,
-        "field": grid.field.report(),
-        "inferred": notes,
-        "warnings": warnings,
-    }
-    if simplified:
-        facts["simplified"] = simplified.report(grid.voxel_size)
-        warnings += simplified.warnings
-    return facts
+        goal: Any = {"error": options.error(grid.voxel_size), "triangles": options.triangles}
+        made = simplify_mesh(mesh, **goal, max_memory=options.max_memory)
+        mesh, facts["simplified"] = made.mesh, made.report(grid.voxel_size)
+        facts["closed"] = mesh.is_closed()
+        facts["warnings"] += made.warnings
+    if volume is not None:
+        facts["inferred"] += volume_notes({"the mesh": (mesh.volume(), volume)})
+    facts |= {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+    facts["bounds"] = [[end(x).item() for x in mesh.vertices.T] for end in (np.min, np.max)]
+    return mesh
 
 
 def _warnings(grid: SdfGrid, made: Result, offset: float) -> list[str]:
     """Return a sentence on each thing that may be wrong with the mesh of a grid."""
-    counts, warnings = made.counts, list[str]()
+    warnings = list[str]()
     if made.open_edges and grid.field.unseen is not None:
         warnings.append("the surface ends where samples are unknown, and is open there")
     elif made.open_edges:
@@ -150,8 +139,8 @@ def _warnings(grid: SdfGrid, made: Result, offset: float) -> list[str]:
     if grid.low >= offset:
         thin = "no sample lies inside: the solid is thinner than the spacing"
         warnings.append(f"{thin}, and its mesh may have holes")
-    if counts["noisy_voxels"] and grid.field.network and not grid.field.sides_only:
-        share = 100 * counts["noisy_voxels"] / counts["band_voxels"]
+    if made.whole.noisy and grid.field.network and not grid.field.sides_only:
+        share = 100 * made.whole.noisy / made.whole.count
         differ = f"in {share:.3g} % of the band the values differ by more than distances can"
         warnings.append(f"{differ}: they are taken as noisy there, and corrected")
     return warnings

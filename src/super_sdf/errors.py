@@ -134,17 +134,14 @@ EXTRAS = {
 """The modules that each extra installs."""
 
 
-def missing_modules(modules: tuple[str, ...]) -> list[str]:
-    """Return the modules that are not installed."""
-    return [name for name in modules if find_spec(name) is None]
-
-
-def how_to_install(extra: str) -> str:
-    """Return the command that installs an extra, from a clone of the sources."""
-    return f"pip install -e '.[{extra}]' in a clone of super-sdf"
+def to_install(extra: str, modules: tuple[str, ...] | None = None) -> str:
+    """Return which modules of an extra, all or some, are missing and how to install them, or ""."""
+    missing = [name for name in modules or EXTRAS[extra] if find_spec(name) is None]
+    how = f"{', '.join(missing)}: pip install -e '.[{extra}]' in a clone of super-sdf"
+    return how if missing else ""
 
 
 def check_modules(what: str, extra: str, modules: tuple[str, ...] | None = None) -> None:
     """Raise FileError if modules that ``what`` needs, all of an extra or some, are missing."""
-    if missing := missing_modules(EXTRAS[extra] if modules is None else modules):
-        raise FileError(f"{what} needs {', '.join(missing)}: {how_to_install(extra)}")
+    if missing := to_install(extra, modules):
+        raise FileError(f"{what} needs {missing}")

@@ -10,9 +10,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import KW_ONLY, dataclass, field, fields
+from functools import partial
 from math import inf, isfinite
 from numbers import Real
-from operator import index
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypedDict, get_args
@@ -32,8 +32,6 @@ Device = Literal["auto", "cpu", "cuda"]
 Precision = Literal["auto", "float32", "int8"]
 
 DEFAULT_QUALITY: Final = "base"
-FIELDS: tuple[FieldKind, ...] = get_args(FieldKind)
-PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 """Units that mesh files state, in metres."""
@@ -49,11 +47,14 @@ class Kind(NamedTuple):
 
     give: str  # what to give instead of a wrong value
     make: Callable[[Any], Any]  # returns the value as the program takes it; TypeError, ValueError
+    types: Any = object  # what the value must be, a class or several
     choices: tuple[str, ...] = ()  # all values, if there are only some
 
     def check(self, value: Any, name: str) -> Any:
         """Return a value as the program takes it; OptionError, by a name, if it is wrong."""
         try:
+            if not isinstance(value, self.types):
+                raise TypeError
             return self.make(value)
         except (TypeError, ValueError, OverflowError) as error:
             shown = f"{value}" if isinstance(value, Real) else seen(value)
@@ -61,13 +62,26 @@ class Kind(NamedTuple):
             raise kind(f"{name} is {shown}: give {self.give}") from None
 
 
+BOOLEANS = bool, np.bool_
+FLAG = Kind("True or False, in JSON true or false", bool, BOOLEANS)
+PATH = Kind("the path of a file", Path, (str, PathLike))
+NETWORK = Kind("one from load_network()", lambda network: network, Callable)
+
+
+def one_of(names: Any) -> Kind:
+    """Return the kind of the names in a ``Literal``."""
+    choices = get_args(names)
+    give = f"one of {', '.join(choices)}"
+    return Kind(give, lambda value: choices[choices.index(value)], str, choices)
+
+
 def number(give: str, above: float = -inf, most: float = inf, step: int = 0) -> Kind:
     """Return the kind of numbers in a range, or of whole ones that are multiples of a step."""
 
     def make(value: Any) -> Any:
-        if isinstance(value, bool):
+        found = int(value) if step else float(value)
+        if isinstance(value, BOOLEANS) or (step and found != value and not isinstance(value, str)):
             raise TypeError
-        found = (int(value) if isinstance(value, str) else index(value)) if step else float(value)
         if not isfinite(found) or not above < found <= most or (step and found % step):
             raise ValueError
         return found
@@ -75,55 +89,24 @@ def number(give: str, above: float = -inf, most: float = inf, step: int = 0) -> 
     return Kind(give, make)
 
 
-def numbers(counts: tuple[int, ...], give: str) -> Kind:
-    """Return the kind of several numbers, of which there may be one; in text with commas."""
-
-    def make(value: Any) -> tuple[float, ...]:
-        parts = value.split(",") if isinstance(value, str) else value
-        found = tuple(map(ANY.make, parts if isinstance(parts, Iterable) else [parts]))
-        if len(found) not in counts:
-            raise ValueError
-        return found
-
-    return Kind(give, make)
-
-
-def one_of(names: Iterable[str]) -> Kind:
-    """Return the kind of some names."""
-    choices = tuple(names)
-
-    def make(value: Any) -> str:
-        if not isinstance(value, str):
-            raise TypeError
-        return choices[choices.index(value)]
-
-    return Kind(f"one of {', '.join(choices)}", make, choices)
-
-
-def having(give: str, test: Callable[[Any], bool], make: Callable[[Any], Any]) -> Kind:
-    """Return the kind of values that pass a test of their type."""
-
-    def checked(value: Any) -> Any:
-        if not test(value):
-            raise TypeError
-        return make(value)
-
-    return Kind(give, checked)
-
-
-def _label(value: Any) -> int:
-    """Return a whole number of 64 bits, signed or not."""
-    found = int(value)
-    is_whole = isinstance(value, str) or (found == value and not isinstance(value, bool))
-    if not is_whole or not -(2**63) <= found < 2**64:
+def numbers(counts: tuple[int, ...], value: Any) -> tuple[float, ...]:
+    """Return numbers, as many as one of the counts; there may be one, or text with commas."""
+    parts = value.split(",") if isinstance(value, str) else value
+    found = tuple(map(ANY.make, parts if isinstance(parts, Iterable) else [parts]))
+    if len(found) not in counts:
         raise ValueError
     return found
+
+
+ANY, ABOVE_0 = number("a finite number"), number("a number greater than 0", above=0)
+COUNT, POINT = number("", above=0, step=1), Kind("one number, or three", partial(numbers, (1, 3)))
+LABEL = number("a whole number, -2^63 to 2^64 - 1", -(2**63) - 1, 2**64 - 1, step=1)
 
 
 def _labels(value: Any) -> str | tuple[int | str, ...]:
     """Return "all", or some labels, numbers or names; in text with commas."""
     if not isinstance(value, str):
-        return tuple(each if isinstance(each, str) else _label(each) for each in value)
+        return tuple(each if isinstance(each, str) else LABEL.make(each) for each in value)
     parts = [part.strip() for part in value.split(",")]
     is_number = re.compile("[-+]?[0-9]+").fullmatch
     return "all" if value == "all" else tuple(int(n) if is_number(n) else n for n in parts)
@@ -137,27 +120,17 @@ def _bytes(value: Any) -> int:
     return int(COUNT.make(value))
 
 
-ANY, ABOVE_0 = number("a finite number"), number("a number greater than 0", above=0)
-COUNT, POINT = number("", above=0, step=1), numbers((1, 3), "one number, or three")
-LABEL = Kind("a whole number, -2^63 to 2^64 - 1", _label)
-FLAG = having(
-    "True or False, in JSON true or false", lambda value: isinstance(value, (bool, np.bool_)), bool
-)
-PATH = having("the path of a file", lambda value: isinstance(value, (str, PathLike)), Path)
-NETWORK = having("one from load_network()", callable, lambda network: network)
-
-
 class Option(NamedTuple):
     """A row of the table."""
 
-    name: str
-    default: Any
     group: str  # the heading in the help of a command
-    shows: frozenset[str]  # besides Options and upsample: in "read", "list", "labels"
+    shows: str  # besides Options and upsample: of "read", "list", "labels" those that hold
     kind: Kind
     help: str
     metavar: str | None = None
     off: str = ""  # a flag's opposite on the command line
+    name: str = ""
+    default: Any = None
 
     def check(self, value: Any) -> Any:
         """Return a value as the program takes it; OptionError if it is wrong."""
@@ -165,10 +138,9 @@ class Option(NamedTuple):
         return None if is_left_out else self.kind.check(value, flag(self.name))
 
 
-def _option(default: Any, group: str, shows: str, kind: Kind, text: str, **more: Any) -> Any:
+def _option(default: Any, *row: Any, **more: Any) -> Any:
     """Return a field of a dataclass that is a row of the table."""
-    row = {"group": group, "shows": frozenset(shows.split()), "kind": kind, "help": text, **more}
-    return field(default=default, metadata=row)
+    return field(default=default, metadata={"row": Option(*row, **more)})
 
 
 GRID, VALUES, MESH, WORK = "The grid", "Its values", "The mesh", "The work"
@@ -197,87 +169,82 @@ class Options:
     factor: int | None = _option(None, MESH, "list labels", number(
         "an even number from 2 to 16 (an odd one has no node on the samples)", 0, 16, step=2),
         "How many times finer than the grid per axis: an even number from 2 to 16. Default: 2 for "
-        "masks and labels, else 4.", metavar="K")
+        "masks and labels, else 4.", "K")
     _: KW_ONLY
     spacing: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
         "World distance between neighbouring samples: one number, or X,Y,Z. Default: from the "
-        "file, else estimated from the values.", metavar="H")
+        "file, else estimated from the values.", "H")
     origin: tuple[float, ...] | None = _option(None, GRID, "read list labels", POINT,
-        "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.", metavar="X,Y,Z")
+        "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.", "X,Y,Z")
     direction: tuple[float, ...] | None = _option(None, GRID, "read list labels",
-        numbers((9,), "nine numbers, row by row"),
+        Kind("nine numbers, row by row", partial(numbers, (9,))),
         "World directions of the array's axes, a matrix with a unit vector in each column, as nine "
-        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other files state it.",
-        metavar="MATRIX")
-    axes: AxisOrder | None = _option(None, GRID, "read list labels", one_of(get_args(AxisOrder)),
+        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other files state it.", "MATRIX")
+    axes: AxisOrder | None = _option(None, GRID, "read list labels", one_of(AxisOrder),
         "Axis order of an array in NumPy, TIFF, HDF5 or Zarr. Default: by the names of the axes, "
         "else xyz for NumPy, zyx for the others.")
-    space: Space | None = _option(None, GRID, "read list labels", one_of(get_args(Space)),
+    space: Space | None = _option(None, GRID, "read list labels", one_of(Space),
         "Anatomical space of the mesh, for files that state theirs. Default: that of the file.")
-    inside: Inside = _option("auto", VALUES, "read list", one_of(get_args(Inside)),
+    inside: Inside = _option("auto", VALUES, "read list", one_of(Inside),
         "Sign of the values inside the solid; auto takes the border of the grid as outside.")
-    field: FieldKind = _option("auto", VALUES, "read list", one_of(FIELDS),
+    field: FieldKind = _option("auto", VALUES, "read list", one_of(FieldKind),
         "What the values are: distances, distances with noise, a mask or its transform, or a "
         "smooth field, which has the surface of its own cubic spline; auto goes by the samples.")
     label: int | None = _option(None, VALUES, "read list", LABEL,
-        "Mesh the samples with the value N of a label image, or its name by --names.",
-        metavar="N")
+        "Mesh the samples with the value N of a label image, or its name by --names.", "N")
     labels: str | tuple[int | str, ...] | None = _option(None, VALUES, "list labels",
         Kind("all, or some labels such as 1,2,3", _labels),
         "Mesh all labels of a label image but 0, or those listed, with shared walls: as parts of "
-        "a .glb or .3mf, else each in its own file, NAME-N.ply.", metavar="all|N,N")
+        "a .glb or .3mf, else each in its own file, NAME-N.ply.", "all|N,N")
     level: float | None = _option(None, VALUES, "read list", ANY,
         "Mesh the surface at the value L of densities; above L is inside, unless --inside is "
-        "negative.", metavar="L")
+        "negative.", "L")
     scale: float | None = _option(None, VALUES, "read list", ABOVE_0,
-        "World units per unit of the values, if they have another unit than the spacing.",
-        metavar="S")
+        "World units per unit of the values, if they have another unit than the spacing.", "S")
     unknown: float | None = _option(None, VALUES, "read list", ANY,
-        "Samples with the value V are unknown, as those that are NaN.", metavar="V")
-    offset: float = _option(0.0, MESH, "list",
-        number("a finite number, in world units"),
-        "Mesh the offset surface at distance D, in world units; a positive D grows the solid.",
-        metavar="D")
+        "Samples with the value V are unknown, as those that are NaN.", "V")
+    offset: float = _option(0.0, MESH, "list", number("a finite number, in world units"),
+        "Mesh the offset surface at distance D, in world units; a positive D grows the solid.", "D")
     cap: bool = _option(True, MESH, "list", FLAG,
         "Close the surface along the border of the grid (default), or leave it open there, as one "
         "that ends at unknown samples must be.", off="open")
-    mesher: MesherName = _option("auto", MESH, "list", one_of(get_args(MesherName)),
+    mesher: MesherName = _option("auto", MESH, "list", one_of(MesherName),
         "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
         "them; auto is sharp for distances, marching for masks and noise.")
     simplify: float | None = _option(None, MESH, "list labels",
         number("a number greater than 0, in voxels (--tolerance takes world units)", above=0),
         "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
-        "Needs the extra simplify.", metavar="ERROR")
+        "Needs the extra simplify.", "ERROR")
     tolerance: float | None = _option(None, MESH, "list labels",
         number("a number greater than 0, in world units", above=0),
-        "Simplify as with --simplify, but within D in world units.", metavar="D")
+        "Simplify as with --simplify, but within D in world units.", "D")
     triangles: int | None = _option(None, MESH, "list",
         number("a whole number, 4 or more, as a closed mesh has", above=3, step=1),
-        "Simplify the mesh to at most N triangles, instead of --simplify.", metavar="N")
+        "Simplify the mesh to at most N triangles, instead of --simplify.", "N")
     keep_volume: bool = _option(False, MESH, "list labels", FLAG,
         "Of masks and labels: move each surface by a small part of a voxel until its volume is "
         "that of its samples, as boxes.")
-    unit: Unit | None = _option(None, MESH, "list labels", one_of(LENGTHS),
+    unit: Unit | None = _option(None, MESH, "list labels", one_of(Unit),
         "Unit of the world, which .3mf (default: millimetres) and .glb (metres) state. "
         "Coordinates stay as they are.")
-    quality: Quality | None = _option(None, WORK, "labels", one_of(QUALITIES),
+    quality: Quality | None = _option(None, WORK, "labels", one_of(Quality),
         "Network: fast is quicker than base, the default; best averages base over 4 turns of the "
         "grid, and takes 4 times as long.")
     model: str | None = _option(None, WORK, "labels",
-        Kind(PATH.give, lambda value: str(PATH.make(value))),
-        "Use the network in this ONNX file instead of --quality.", metavar="FILE")
-    precision: Precision = _option("auto", WORK, "labels", one_of(PRECISIONS),
+        PATH._replace(make=lambda value: str(Path(value))),
+        "Use the network in this ONNX file instead of --quality.", "FILE")
+    precision: Precision = _option("auto", WORK, "labels", one_of(Precision),
         "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "
         "it, else float32.")
-    device: Device = _option("auto", WORK, "labels", one_of(get_args(Device)),
+    device: Device = _option("auto", WORK, "labels", one_of(Device),
         "Where the network runs; auto uses CUDA if it works here, else the CPU.")
     threads: int = _option(0, WORK, "labels",
         number("1 or more, or 0 for one per core", above=-1, step=1),
-        "CPU threads; 0 means one per core.", metavar="N")
+        "CPU threads; 0 means one per core.", "N")
     max_memory: int | None = _option(None, WORK, "labels",
         Kind("a number of bytes greater than 0, such as 1500M or 4G", _bytes),
         "Memory limit of the process, such as 4G. Default: 60 % of the free memory. Larger grids "
-        "are refined in boxes, whose meshes are joined.", metavar="SIZE")
+        "are refined in boxes, whose meshes are joined.", "SIZE")
     # fmt: on
 
     def __post_init__(self) -> None:
@@ -285,8 +252,8 @@ class Options:
         for name, row in OPTIONS.items():
             object.__setattr__(self, name, row.check(getattr(self, name)))
         for names in EXCLUSIVE:
-            values = {name: getattr(self, name) for name in names}
-            some = [f"{flag(n)} {seen(value)}" for n, value in values.items() if value is not None]
+            given = [name for name in names if getattr(self, name) is not None]
+            some = [f"{flag(name)} {seen(getattr(self, name))}" for name in given]
             if len(some) > 1:
                 raise OptionError(f"{some[0]} and {some[1]}: give only one of them")
         if self.label is not None and self.field not in ("auto", "mask"):
@@ -325,20 +292,14 @@ class Options:
         return {"model": chosen, **{name: getattr(self, name) for name in names}}
 
 
-OPTIONS = {
-    each.name: Option(each.name, each.default, **each.metadata)
+OPTIONS: dict[str, Option] = {
+    each.name: each.metadata["row"]._replace(name=each.name, default=each.default)
     for each in fields(Options)
-    if each.metadata
 }
 READ, BATCH_LISTS, LABELS = (
     tuple(name for name, row in OPTIONS.items() if where in row.shows)
     for where in ("read", "list", "labels")
 )
-
-
-def check_path(path: Any, name: str = "path") -> Path:
-    """Return an argument as a path; OptionTypeError if it is neither a string nor a path."""
-    return Path(PATH.check(path, name))
 
 
 def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:

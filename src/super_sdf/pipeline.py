@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +25,7 @@ from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
 from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
 from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
-from .options import MesherName, Options
+from .options import Options
 from .refine import nodes
 from .refine.band import Band, BandSummary, neighbour_table, no_surface, survey
 from .refine.bounds import SampleSpheres, keep_within_bounds
@@ -38,16 +38,9 @@ from .surface.mesh import Mesh, vertex_type
 from .threads import MESHING, Progress, Steps, in_words, useful_threads
 from .tiles import Part, Room, Tile, check_closed, join, margin_of, own_part, plan
 
-if TYPE_CHECKING:
-    from .functions.function import Function
-
 
 def refine_band(
-    band: Band,
-    network: Adapter,
-    factor: int,
-    threads: int = 1,
-    steps: Steps | None = None,
+    band: Band, network: Adapter, factor: int, threads: int = 1, steps: Steps | None = None
 ) -> FineField:
     """Return the fine field of a band: the steps from the network to the final values."""
     steps = steps or Steps()
@@ -74,20 +67,12 @@ def refine_band(
         nodes.hold_sides(decoded, factor, patches[voxels, CENTRE])
     nodes.pin_to_skipped(decoded, parts, factor, own_ijk, patches[voxels], grid.shape)
     steps.finish("nodes")
-    unseen, exact = grid.field.unseen, band.exact
+    unseen, leaves, exact = grid.field.unseen, band.whole.leaves, band.exact
     number = np.ravel_multi_index(tuple(band.voxel_ijk[exact].T), grid.shape)
-    return FineField(
-        grid.shape,
-        factor,
-        own_ijk,
-        decoded,
-        parts,
-        grid,
-        band.offset,
-        SampleSpheres(grid.shape, number, patches[exact, CENTRE]),
-        band.whole.leaves,
-        octants=None if unseen is None else seen_octants(unseen, own_ijk),
-    )
+    spheres = SampleSpheres(grid.shape, number, patches[exact, CENTRE])
+    octants = None if unseen is None else seen_octants(unseen, own_ijk)
+    made: Any = {"spheres": spheres, "leaves": leaves, "octants": octants}
+    return FineField(grid.shape, factor, own_ijk, decoded, parts, grid, band.offset, **made)
 
 
 def upsample(
@@ -117,13 +102,13 @@ def upsample(
     """
     asked = Options(factor, offset=offset)  # checks them
     steps = Steps(progress, MESHING[:-1])
-    lattice, decoder = _prepared(grid, network, asked)
+    lattice, decoder, factor = _prepared(grid, network, asked)
     threads = useful_threads(decoder.threads)
     band = survey(lattice, asked.offset, threads=threads)  # Eqs. 2 and 4
     if not band.decoded.any():
         raise no_surface(grid, asked.offset)
     steps.finish("band")
-    field = refine_band(band, decoder, asked.factor_for(mask=grid.field.sides_only), threads, steps)
+    field = refine_band(band, decoder, factor, threads, steps)
     if not field.blocks.min(initial=1) <= 0 < field.blocks.max(initial=0):
         raise no_surface(grid, asked.offset)
     return field
@@ -161,7 +146,7 @@ def reconstruct(
     network: Decoder | None = None,
     factor: int | None = None,
     *,
-    function: Function | None = None,
+    function: Callable[[Any], Any] | None = None,
     bounds: ArrayLike | None = None,
     spacing: ArrayLike | None = None,
     quality: options.Quality | str | Path | None = None,
@@ -212,33 +197,32 @@ def reconstruct(
         values that are not finite; if not even small tiles of the grid fit in the memory.
     """
     chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
-    exact = None
     if function is not None or bounds is not None or spacing is not None:
-        from .functions.function import as_function, sampled  # imported here, as few need it
+        from .functions.function import sampled  # imported here, as few need it
 
-        exact = None if function is None else as_function(function)
-        grid = sampled(grid, exact, bounds, spacing, chosen.offset)
+        grid = sampled(grid, function, bounds, spacing, chosen.offset)
     grid = check_grid(grid)
-    where = {"model": quality, "device": device, "precision": precision, "threads": threads}
+    where = {"quality": quality, "device": device, "precision": precision, "threads": threads}
     asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
-    if network is not None and asked:
-        name = next(iter(asked)).replace("model", "quality")
-        raise OptionError(f"a network and {name} are given: give only one of them")
-    network = load_network(**asked) if network is None else network
+    if network is None:
+        network = load_network(asked.pop("quality", options.DEFAULT_QUALITY), **asked)
+    elif asked:
+        raise OptionError(f"a network and {next(iter(asked))} are given: give only one of them")
     mesh = mesh_grid(grid, network, chosen, steps=Steps(progress)).mesh
-    if exact is None:
+    if function is None:
         return mesh
     from .functions.zero import put_on_zero
 
-    return put_on_zero(mesh, exact, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
+    return put_on_zero(mesh, function, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
 
 
-def _prepared(grid: SdfGrid, network: Decoder, chosen: Options) -> tuple[SdfGrid, Adapter]:
-    """Check what is given; return the cubic lattice of a grid, and the network for its field."""
+def _prepared(grid: SdfGrid, network: Decoder, chosen: Options) -> tuple[SdfGrid, Adapter, int]:
+    """Check what is given; return the cubic lattice of a grid, its field's network and factor."""
     options.NETWORK.check(network, "network")
     lattice = cubic_grid(check_grid(grid), chosen.offset)
-    vertex_type(lattice, chosen.factor_for(mask=grid.field.sides_only))  # raises beyond float64
-    return lattice, adapt(network_for(network, grid.field.network))
+    factor = chosen.factor_for(mask=grid.field.sides_only)
+    vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
+    return lattice, adapt(network_for(network, grid.field.network)), factor
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,10 +231,8 @@ class Result:
 
     mesh: Mesh
     lattice: SdfGrid  # the grid, made cubic
+    whole: BandSummary
     open_edges: int
-    # ``band_voxels``, and ``noisy_voxels``, whose samples differ by more than distances can
-    counts: dict[str, int]
-    leaves: bool  # whether the solid leaves the grid: a sample on the border is inside
     tiles: int
 
 
@@ -261,9 +243,8 @@ class Task:
     tile: Tile
     grid: SdfGrid  # the samples of the tile
     shape: tuple[int, int, int]  # samples of the whole grid
-    options: Options
+    options: Options  # with the mesher that is used
     factor: int
-    mesher: MesherName
     threads: int
     whole: BandSummary | None = None  # of a tile that is not the whole grid
 
@@ -287,12 +268,12 @@ def mesh_grid(
     ``save_field`` is called with the fine field, which needs one piece. ``map_tiles`` has tiles
     made elsewhere, ``least_tiles`` or more, each within the memory bound.
     """
-    lattice, decoder = _prepared(grid, network, chosen)
+    lattice, decoder, factor = _prepared(grid, network, chosen)
     check_can_close(grid, cap=chosen.cap)
-    steps, factor = steps or Steps(), chosen.factor_for(mask=grid.field.sides_only)
-    mesher, shape = chosen.mesher_for(exact=lattice.field.has_exact), lattice.shape
+    chosen = replace(chosen, mesher=chosen.mesher_for(exact=lattice.field.has_exact))
+    steps, shape = steps or Steps(), lattice.shape
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
-    task = Task(everything, lattice, shape, chosen, factor, mesher, threads)
+    task = Task(everything, lattice, shape, chosen, factor, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
     in_one_piece = room.voxels() if map_tiles is None and least_tiles == 1 else -1  # at most
     bands = [survey(lattice, chosen.offset, threads=threads, most=in_one_piece)]
@@ -307,7 +288,7 @@ def mesh_grid(
             "smaller factor, allow more (--max-memory), or leave --save-field out"
         )
     else:
-        margin = margin_of(lattice, decoder.receptive_field, mesher, factor)
+        margin = margin_of(lattice, decoder.receptive_field, chosen.mesher, factor)
         tiles, parts = plan(shape, whole, margin, room, least_tiles), list[Part]()
         tasks = (
             replace(task, tile=tile, grid=crop(lattice, tile.low, tile.high), whole=whole)
@@ -317,16 +298,12 @@ def mesh_grid(
             parts.append(part)
             steps.show(steps.done + (1 - steps.done) * len(parts) / len(tiles))
         parts.sort(key=lambda part: part.tile.low)
-    count = len(parts)
-    leaves = any(part.leaves for part in parts)
-    counts = {"band_voxels": whole.count, "noisy_voxels": whole.noisy}
     mesh, names = join(parts)
     if not len(mesh.faces):
         raise no_surface(grid, chosen.offset)
-    ends = lattice.field.unseen is not None
-    edges = check_closed(mesh, lattice, names, cap=chosen.cap, ends=ends)
+    edges = check_closed(mesh, lattice, names, cap=chosen.cap)
     steps.finish("isosurface")
-    return Result(mesh, lattice, edges, counts, leaves, count)
+    return Result(mesh, lattice, whole, edges, len(names))
 
 
 def make_tile(
@@ -345,8 +322,7 @@ def make_tile(
     del band
     if save_field:
         save_field(field)
-    how: Any = {"mesher": task.mesher, "cap": chosen.cap, "threads": threads}
+    how: Any = {"mesher": chosen.mesher, "cap": chosen.cap, "threads": threads}
     mesh, keys = extract(field, task.grid, first=tile.low, shape=task.shape, **how)
-    leaves = field.leaves
     del field
-    return own_part(mesh, keys, tile, task.shape, factor, leaves)
+    return own_part(mesh, keys, tile, task.shape, factor)

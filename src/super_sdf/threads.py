@@ -24,7 +24,7 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 CHUNK = 1 << 19  # temporaries (array elements) per chunk, so that they stay in cache
-MIN_PER_THREAD = 1 << 20  # array elements; with fewer, a thread costs more than it saves
+MIN_PER_THREAD = 1 << 21  # array elements; with fewer, a thread costs more than it saves
 MAX_INDEX = 2**31 - 1  # of vertices and nodes, as in mesh files; beyond, one would mean another
 
 GROUPS, OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
@@ -48,7 +48,7 @@ def cores_of_system() -> int:
 
 def count_cores() -> int:
     """Return the number of cores this process may use; in a container its quota, rounded up."""
-    quotas = _of_groups(lambda quota, period: int(quota) / int(period), "cpu.max")
+    quotas = [float(quota) / int(period) for quota, period in _of_groups("cpu.max")]
     return max(ceil(min([cores_of_system(), *quotas])), 1)
 
 
@@ -63,14 +63,9 @@ def worthwhile_threads(size: int, threads: int) -> int:
     return max(min(threads, size // MIN_PER_THREAD), 1)
 
 
-def rows_in_chunk(width: int) -> int:
-    """Return the rows per chunk when each row needs ``width`` temporaries."""
-    return max(CHUNK // width, 1)
-
-
 def chunks_of(count: int, width: int) -> list[slice]:
     """Cut ``count`` rows into chunks, when each row needs ``width`` temporaries."""
-    step = rows_in_chunk(width)
+    step = max(CHUNK // width, 1)
     return [slice(first, min(first + step, count)) for first in range(0, count, step)]
 
 
@@ -78,11 +73,8 @@ def over_threads(
     work: Callable[[Piece], Result], pieces: Sequence[Piece], threads: int = 1
 ) -> Iterator[Result]:
     """Yield ``work(piece)`` for each piece, in order, with up to ``threads`` threads."""
-    if min(threads, len(pieces)) < 2:
-        yield from map(work, pieces)
-        return
-    with ThreadPoolExecutor(threads) as pool:
-        yield from pool.map(work, pieces)
+    with ThreadPoolExecutor(threads) as pool:  # starts its threads when it gets work
+        yield from (pool.map if min(threads, len(pieces)) > 1 else map)(work, pieces)
 
 
 def map_chunks(
@@ -93,28 +85,13 @@ def map_chunks(
     return list(over_threads(work, chunks_of(count, width), threads))
 
 
-def call_beside(work: Callable[[], object], stop: Callable[[], object]) -> None:
-    """Do some work in another thread, and ``stop`` it at an interrupt; errors are passed on."""
-    with ThreadPoolExecutor(1) as pool:  # waits at the end
-        try:
-            pool.submit(work).result()
-        except BaseException:
-            stop()
-            raise
-
-
 def free_memory() -> int:
-    """Return the bytes of memory that are free; in a container at most what is left of its limit.
-
-    Inactive cached files of a container can be dropped.
-    """
-
-    def left(most: str, taken: str, *stat: str) -> int:
-        cached = int(stat[stat.index("inactive_file") + 1])
-        return max(int(most) - max(int(taken) - cached, 0), 0)
-
-    files = "memory.max", "memory.current", "memory.stat"
-    return min([int(psutil.virtual_memory().available), *_of_groups(left, *files)])
+    """Return the bytes of memory that are free; in a container what is left of its limit."""
+    left = [float(psutil.virtual_memory().available)]
+    for most, taken, *stat in _of_groups("memory.max", "memory.current", "memory.stat"):
+        cached = int(stat[stat.index("inactive_file") + 1])  # can be dropped
+        left.append(max(float(most) - max(int(taken) - cached, 0), 0))
+    return int(min(left))
 
 
 def held_memory() -> int:
@@ -123,10 +100,7 @@ def held_memory() -> int:
 
 
 def memory_bound(max_memory: int | None = None) -> int:
-    """Return how many bytes this process may hold in all.
-
-    ``max_memory`` if given; else what the process holds, and ``SHARE`` of what is free.
-    """
+    """Return how many bytes this process may hold: by default, ``SHARE`` of what is free more."""
     return max_memory or held_memory() + int(SHARE * free_memory())
 
 
@@ -154,8 +128,8 @@ def give_back() -> None:
         ctypes.CDLL(None).malloc_trim(0)
 
 
-def _of_groups(take: Callable[..., Result], *names: str) -> Iterator[Result]:
-    """Yield what is taken of the words in files of the control groups that this process is in.
+def _of_groups(*names: str) -> Iterator[list[str]]:
+    """Yield the words in files of each control group that this process is in; "inf" for "max".
 
     Groups (version 2), such as those of containers, are nested; the tightest limit counts. In a
     container the path of the group may not exist: what is mounted there is the group itself.
@@ -163,8 +137,9 @@ def _of_groups(take: Callable[..., Result], *names: str) -> Iterator[Result]:
     with suppress(OSError, IndexError):  # not Linux, or version 1
         inner = GROUPS / OWN.read_text().split("0::/")[1].split("\n")[0]
         for group in (inner, *inner.parents):
-            with suppress(OSError, ValueError):  # no such file, or the limit is "max"
-                yield take(*" ".join((group / name).read_text() for name in names).split())
+            with suppress(OSError):  # no such file
+                words = " ".join((group / name).read_text() for name in names).split()
+                yield ["inf" if word == "max" else word for word in words]
 
 
 Progress = Callable[[int, int], None]
@@ -172,32 +147,24 @@ Progress = Callable[[int, int], None]
 
 If it raises an exception, the work stops with that exception.
 """
-TOTAL = 1000
 # Share of the time that each step takes with a network on a CPU.
 STEPS = {"read": 0.1, "band": 0.03, "network": 0.4, "nodes": 0.14, "isosurface": 0.33}
 MESHING = ("band", "network", "nodes", "isosurface")
 
 
 class Steps:
-    """Measures the time of steps, by name, and reports what is done of the work from ``begin``.
+    """Measures the time of steps, by name, and reports the share of the work that is ``done``.
 
-    ``names`` are the steps that ``finish`` ends, in order; together they reach the share ``end``.
+    ``names`` are the steps that ``finish`` ends, each as often as it does.
     """
 
-    def __init__(
-        self,
-        progress: Progress | None = None,
-        names: Iterable[str] = MESHING,
-        begin: float = 0.0,
-        end: float = 1.0,
-    ) -> None:
+    def __init__(self, progress: Progress | None = None, names: Iterable[str] = MESHING) -> None:
         if not (progress is None or callable(progress)):
             said = "give a function of (done, total), in thousandths"
             raise OptionTypeError(f"progress is {seen(progress)}: {said}")
-        self.progress, self.done, self.clock = progress, begin, time.perf_counter()
+        self.progress, self.done, self.clock = progress, 0.0, time.perf_counter()
+        self.scale = 1 / sum(STEPS[name] for name in names)
         self.seconds: dict[str, float] = {}
-        lengths = {name: STEPS[name] for name in names}
-        self.lengths = {n: (end - begin) * x / sum(lengths.values()) for n, x in lengths.items()}
 
     def lap(self, name: str) -> None:
         """Add the time since the last lap to a step."""
@@ -207,15 +174,15 @@ class Steps:
     def show(self, share: float) -> None:
         """Report the share of all work that is done."""
         if self.progress:
-            self.progress(round(TOTAL * share), TOTAL)
+            self.progress(round(1000 * share), 1000)
 
     def finish(self, name: str) -> None:
         """Report that a step is done, and record its time."""
         self.lap(name)
-        self.done += self.lengths[name]
+        self.done += self.scale * STEPS[name]
         self.show(self.done)
 
     def within(self, name: str) -> Callable[[float], None] | None:
         """Return a callback for the share of a step that starts now; None without ``progress``."""
-        begin, length = self.done, self.lengths[name]
+        begin, length = self.done, self.scale * STEPS[name]
         return (lambda share: self.show(begin + share * length)) if self.progress else None

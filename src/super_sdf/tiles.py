@@ -62,14 +62,13 @@ class Part:
     mesh: Mesh
     keys: NDArray[np.int64]  # (n,), of its vertices
     mine: NDArray[np.bool_]  # (n,), which of these it owns
-    leaves: bool  # whether the solid leaves the whole grid
     worker: str = ""  # the process that made it, if that was another one
 
     @classmethod
     def without_surface(cls, tile: Tile) -> Part:
         """Return the part of a tile in which no surface is."""
         mesh = Mesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32))
-        return cls(tile, mesh, np.empty(0, np.int64), np.empty(0, bool), False)
+        return cls(tile, mesh, np.empty(0, np.int64), np.empty(0, bool))
 
     def __str__(self) -> str:
         return str(self.tile) + f" ({self.worker})" * bool(self.worker)
@@ -203,17 +202,10 @@ def voxels_of(keys: NDArray[np.int64], shape: Index, factor: int) -> NDArray[np.
     return np.clip(node_ijk // factor - 1, 0, np.array(shape) - 1)
 
 
-def own_part(
-    mesh: Mesh,
-    keys: NDArray[np.int64],
-    tile: Tile,
-    shape: Index,
-    factor: int,
-    leaves: bool,
-) -> Part:
+def own_part(mesh: Mesh, keys: NDArray[np.int64], tile: Tile, shape: Index, factor: int) -> Part:
     """Return what belongs to a tile of the mesh that it makes, which has the margin, too."""
     if tile.inner_low == (0, 0, 0) and tile.inner_high == shape:
-        return Part(tile, mesh, keys, np.ones(len(keys), bool), leaves)
+        return Part(tile, mesh, keys, np.ones(len(keys), bool))
     mine = tile.owns(voxels_of(keys, shape, factor))
     of_corner = keys[mesh.faces]
     first = np.take_along_axis(mesh.faces, of_corner.argmin(1)[:, None], 1)[:, 0]
@@ -222,7 +214,7 @@ def own_part(
     used[faces] = True
     number = np.cumsum(used, dtype=np.int32) - np.int32(1)
     part = Mesh(mesh.vertices[used], number[faces])
-    return Part(tile, part, keys[used], mine[used], leaves)
+    return Part(tile, part, keys[used], mine[used])
 
 
 def join(parts: list[Part]) -> tuple[Mesh, list[tuple[str, int]]]:
@@ -257,15 +249,15 @@ def join(parts: list[Part]) -> tuple[Mesh, list[tuple[str, int]]]:
 
 
 def check_closed(
-    mesh: Mesh, lattice: SdfGrid, names: Sequence[tuple[str, int]], *, cap: bool, ends: bool
+    mesh: Mesh, lattice: SdfGrid, names: Sequence[tuple[str, int]], *, cap: bool
 ) -> int:
     """Return how many edges of a mesh are open; MeshError if some are that should not be.
 
     Open are those on the border of the grid, if there is no ``cap``, and any others if the surface
-    ``ends`` at unknown samples. ``names`` are those of ``join``.
+    may end at unknown samples. ``names`` are those of ``join``.
     """
     edges = mesh.boundary()
-    if ends or not len(edges):
+    if lattice.field.unseen is not None or not len(edges):
         return len(edges)
     bad = edges
     if not cap:

@@ -88,8 +88,8 @@ def run_checks(device: Device, check: bool) -> Iterator[tuple[str, str, str]]:
         for each in devices[:1] if name.endswith("-int8") else devices:
             yield check_network(name, each)
     for name, modules in errors.EXTRAS.items():
-        lacking = ", ".join(errors.missing_modules(modules))
-        says = f"no {lacking}: {errors.how_to_install(name)}" if lacking else ", ".join(modules)
+        lacking = errors.to_install(name)
+        says = f"no {lacking}" if lacking else ", ".join(modules)
         yield MISSING if lacking else OK, f"extra {name}", says
 
 

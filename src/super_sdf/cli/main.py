@@ -19,6 +19,9 @@ from typing import Any
 
 import click
 
+# NumPy's BLAS has only small matrices to multiply, and its idle threads would keep cores busy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is imported
+
 from .. import __version__
 from ..errors import OptionError, SuperSdfError, check_modules, flag, in_a_line
 from ..files.formats import LISTED, NAMED, files_of
@@ -34,7 +37,6 @@ COMMANDS = {
 }
 SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, n)]
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
-OUTPUT = "Output"
 HEADINGS = {name: row.group for name, row in OPTIONS.items()} | {"names": VALUES}
 HEADINGS |= dict.fromkeys(("cluster", "jobs", "retry", "dry_run"), WORK)
 FILE = click.Path(path_type=Path)
@@ -81,10 +83,10 @@ class Command(click.Command):
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the options, each under its heading."""
-        rows: dict[str, list[Any]] = {name: [] for name in (GRID, VALUES, MESH, WORK, OUTPUT)}
+        rows: dict[str, list[Any]] = {name: [] for name in (GRID, VALUES, MESH, WORK)}
         for param in self.get_params(ctx):
             if isinstance(param, click.Option) and (record := param.get_help_record(ctx)):
-                rows[HEADINGS.get(str(param.name), OUTPUT)].append(record)
+                rows.setdefault(HEADINGS.get(str(param.name), "Output"), []).append(record)
         headings = [heading for heading, some in rows.items() if some]
         for heading in headings:
             with formatter.section(heading if len(headings) > 1 else "Options"):
@@ -185,8 +187,6 @@ def main() -> None:
     A signal raises KeyboardInterrupt, so that files that were begun are removed; one that the
     parent process ignores, as ``nohup`` does, stays ignored. Every error is one line on stderr.
     """
-    # NumPy's BLAS has only small matrices to multiply, and its idle threads would keep cores busy.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         pass  # a standard stream was closed, and the next file would get its text
     os.close(number)

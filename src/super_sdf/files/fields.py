@@ -20,7 +20,7 @@ from numpy.lib.npyio import NpzFile
 from ..errors import FileError, OptionError, OptionTypeError, check_modules, seen
 from ..grid.interpret import Field
 from ..grid.sdf_grid import SdfGrid
-from ..options import OPTIONS, check_path
+from ..options import OPTIONS, PATH
 from ..refine.band import neighbour_table
 from ..refine.bounds import SampleSpheres
 from ..refine.field import FineField, FineLattice, fine_grid
@@ -109,7 +109,7 @@ def saving_field(
     path: str | Path, *, force: bool = False
 ) -> Iterator[Callable[[FineField], dict[str, Any]]]:
     """Yield what writes a field, and returns facts of the file, which appears after the block."""
-    path = check_path(path)
+    path = Path(PATH.check(path, "path"))
     kind = path.suffix.lower()
     if kind not in FIELD_TABLE:
         raise OptionError(f"{path} is not a field file: give one of {', '.join(FIELD_TABLE)}")
@@ -171,7 +171,7 @@ def read_field(path: str | Path) -> FineField:
     FileError
         If the file is missing, damaged, or holds something else.
     """
-    path = check_regular_file(check_path(path))
+    path = check_regular_file(PATH.check(path, "path"))
     try:
         with path.open("rb") as file, NpzFile(file) as archive:
             if (version := archive["version"]) != VERSION:

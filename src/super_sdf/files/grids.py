@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError, check_modules
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
-from ..options import OPTIONS, AxisOrder, Options, Space, Values, check_path
+from ..options import OPTIONS, PATH, AxisOrder, Options, Space, Values
 from .formats import DICOM, check_regular_file, find_format, is_store, split_member
 from .output import check_free, replacing
 from .readers import Names, Request, Volume, axes_direction, find_placement
@@ -85,7 +85,7 @@ def read_array(
     max_memory: int | None,
 ) -> dict[str, Any]:
     """Return values, place (unless ``given``), hint, space and notes: see ``read_grid``."""
-    path, direction = check_path(path), given["direction"]
+    path, direction = PATH.check(path, "path"), given["direction"]
     with open_volume(path, axes, max_memory, direction) as (volume, request):
         volume = volume.in_space(space, str(path))
         if direction is not None:  # of x, y and z
@@ -192,7 +192,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
     No sample is read where the format allows it. What the file does not state is None or missing.
     Raises as ``read_grid``.
     """
-    path = check_path(path)
+    path = Path(PATH.check(path, "path"))
     with open_volume(path) as (volume, _):
         order, _, place = find_placement(volume, {})
     shape = [volume.shape[axis] for axis in order]

@@ -10,7 +10,6 @@ A new format is a name in ``options.MESH_FORMATS`` and a function ``write_NAME``
 
 from __future__ import annotations
 
-import html
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
@@ -22,9 +21,9 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, cross, unit as of_length_1
+from ..arrays import FloatArray, unit as of_length_1
 from ..errors import FileError, OptionError
-from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Unit, check_path
+from ..options import LENGTHS, MESH_FORMATS, OPTIONS, PATH, Unit
 from ..surface.mesh import Mesh, check_mesh
 from .output import check_free, replacing
 
@@ -108,7 +107,7 @@ def write_mesh(
         finite, or corners of a triangle would coincide.
     """
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
-    path = check_free(check_mesh_suffix(check_path(path), world.unit), force=force)
+    path = check_free(check_mesh_suffix(PATH.check(path, "path"), world.unit), force=force)
     write_meshes({path: {"": mesh}}, force=force, world=world)
 
 
@@ -176,7 +175,7 @@ def write_stl(file: IO[bytes], parts: Parts, world: World) -> None:
         corners = vertices[mesh.faces[first : first + STL_CHUNK]]
         sides = corners[:, 1:].astype(np.float64) - corners[:, :1]
         rows = np.zeros(len(corners), STL_ROW)
-        rows["normal"], rows["corners"] = of_length_1(cross(sides[:, 0], sides[:, 1])), corners
+        rows["normal"], rows["corners"] = of_length_1(np.cross(sides[:, 0], sides[:, 1])), corners
         file.write(rows.data)
 
 
@@ -257,6 +256,8 @@ COMPRESSION = 1  # the fastest level: higher ones save a tenth and take three ti
 
 def write_3mf(target: IO[bytes], parts: Parts, world: World) -> None:
     """Write 3MF, an object for each part; members have no date: a mesh gives the same bytes."""
+    import html  # imported here, as few meshes need it
+
     with ZipFile(target, "w", ZIP_DEFLATED, compresslevel=COMPRESSION) as archive:
         for member, text in MEMBERS.items():
             with archive.open(member, "w") as file:

@@ -141,31 +141,23 @@ class DistanceFunction:
             raise
 
 
-Function: TypeAlias = DistanceFunction | Callable[[Vectors], Any]
-"""A function of points; one that counts what it is asked, or any other."""
-
-
-def as_function(function: Function) -> DistanceFunction:
-    """Return a function that counts at how many points it is evaluated."""
-    return function if isinstance(function, DistanceFunction) else DistanceFunction(function)
-
-
 def sampled(
     grid: SdfGrid | None,
-    function: DistanceFunction | None,
+    function: Callable[[Vectors], Any] | None,
     bounds: ArrayLike | None,
     spacing: ArrayLike | None,
     offset: float,
 ) -> SdfGrid:
     """Return the grid, or the samples that an offset needs of a function in bounds."""
-    if grid is not None or function is None:
+    exact = None if function is None else DistanceFunction(function)  # checks it
+    if grid is not None or exact is None:
         if bounds is not None or spacing is not None:
             raise OptionError("bounds and spacing are those of a function's samples: give function")
         return check_grid(grid)
     if bounds is None or spacing is None:
         raise OptionError("a function needs bounds and spacing, or a grid of its samples")
     reach = REACH * max(check_spacing(spacing)) + abs(offset)
-    return function.sample(bounds, spacing, reach)
+    return exact.sample(bounds, spacing, reach)
 
 
 def sample_near(at: At, shape: IntArray, step: Numbers, reach: float) -> tuple[FloatArray, float]:

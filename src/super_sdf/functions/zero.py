@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, Numbers, Vectors, cross, dot, face_normals, length, sums_at, unit
+from ..arrays import BoolArray, Numbers, Vectors, dot, face_normals, length, sums_at, unit
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..surface.mesh import Mesh
@@ -46,7 +46,7 @@ NEAR = 0.05  # fine spacings from the surface at which the planes' point is take
 
 @np.errstate(invalid="ignore", over="ignore", divide="ignore")  # values may be infinite
 def put_on_zero(
-    mesh: Mesh, function: DistanceFunction, grid: SdfGrid, factor: int, offset: float = 0.0
+    mesh: Mesh, function: Callable[[Vectors], Any], grid: SdfGrid, factor: int, offset: float = 0.0
 ) -> Mesh:
     """Return a mesh with the vertices moved to where a function is 0, or has an ``offset``.
 
@@ -54,12 +54,13 @@ def put_on_zero(
     """
     if offset and not grid.field.has_exact:
         raise OptionError(f"offset is {offset:g}: the function is no distance, leave it out")
-    fine, scale, shape = grid.voxel_size / factor, unit_of(function, grid), np.array(grid.shape)
+    fine, shape, at = grid.voxel_size / factor, np.array(grid.shape), DistanceFunction(function)
+    scale = unit_of(at, grid)
     middle, kind = grid.to_world((shape - 1) / 2), mesh.vertices.dtype
 
     def value(points: Vectors) -> Numbers:
         """Return values at points, both in fine spacings, so that slopes of distances are 1."""
-        return (function(middle + fine * points) / scale - offset) / fine
+        return (at(middle + fine * points) / scale - offset) / fine
 
     def written(points: Vectors) -> NDArray[Any]:
         return (middle + fine * points).astype(kind)
@@ -239,7 +240,7 @@ def overlapping_in_plane(points: Vectors, first: NDArray[Any], second: NDArray[A
     one, other, normals = one[rows], other[rows], normals[rows]
     for triangle in (one, other):
         for k in range(3):
-            across = cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
+            across = np.cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
             mine, theirs = dot(one, across), dot(other, across)
             beyond = np.minimum(mine.max(1), theirs.max(1)) - np.maximum(mine.min(1), theirs.min(1))
             overlap[rows] &= beyond > TOUCHING

@@ -52,32 +52,19 @@ Steps: TypeAlias = tuple[float, float]
 
 def mask_distances(inside: BoolArray) -> FloatArray:
     """Return distances to the boundary of a mask, in voxels, negative inside, of 0.5 to 3.5."""
-    roots = np.sqrt(np.arange(REACH * REACH + 1, dtype=np.float32)) - np.float32(0.5)
-    squared = _squared_distances(inside)
-    np.copyto(squared, _squared_distances(~inside), where=inside)
-    distances = np.empty(inside.shape, np.float32)
-    for plane, numbers in zip(distances, squared):  # one by one, to save memory
-        plane[...] = roots[numbers]
-    return np.negative(distances, out=distances, where=inside)
-
-
-def _squared_distances(marked: BoolArray) -> NDArray[np.uint8]:
-    """Return the squared distance of each sample to the nearest marked one, at most ``REACH``^2."""
-    squared = np.full(marked.shape, REACH * REACH, np.uint8)
-    squared[marked] = 0
-    for axis in range(3):
+    # of each sample, the squared distances to the nearest one outside and inside: one of them is 0
+    squared = np.stack([inside, ~inside]).astype(np.uint8) * np.uint8(REACH * REACH)
+    for axis in (1, 2, 3):
         before = np.moveaxis(squared, axis, 0)
         after = before.copy()
         for step in range(1, min(REACH, len(before))):
             np.minimum(after[step:], before[:-step] + np.uint8(step * step), out=after[step:])
             np.minimum(after[:-step], before[step:] + np.uint8(step * step), out=after[:-step])
         squared = np.moveaxis(after, 0, axis)
-    return squared
-
-
-def mask_planes(inside: SampleArray, h: float) -> MadePlanes:
-    """Return the distances of a mask in world units; ``h`` is the spacing."""
-    return MadePlanes(inside, lambda planes: mask_distances(planes).astype(float) * h, REACH)
+    roots = np.sqrt(np.arange(REACH * REACH + 1, dtype=np.float32)) - np.float32(0.5)
+    distances: FloatArray = np.stack([roots[plane] for plane in squared.sum(0, dtype=np.uint8)])
+    np.negative(distances, out=distances, where=inside)
+    return distances
 
 
 def extremes_of_masks(h: float) -> Extremes:
@@ -153,14 +140,14 @@ def _gradient(values: FloatArray, at: IntArray, steps: Floats, hidden: BoolArray
     Amid two hidden ones, the larger difference is a lower bound.
     """
     around, unknown = np.pad(values, 1, mode="edge"), np.pad(hidden, 1, constant_values=True)
-    gradient, centre = np.empty((len(at), 3)), values[tuple(at.T)]
+    gradient, centre, nth = np.empty((len(at), 3)), values[tuple(at.T)], np.arange(len(at))
     for axis, step in enumerate(np.eye(3, dtype=int)):
-        after, before = tuple((at + 1 + step).T), tuple((at + 1 - step).T)
-        ahead, back = around[after] - centre, centre - around[before]
-        larger = np.where(np.abs(ahead) > np.abs(back), ahead, back)
-        no_ahead, no_back = unknown[after], unknown[before]
-        one = np.where(no_ahead, np.where(no_back, larger, back), ahead)
-        gradient[:, axis] = np.where(no_ahead | no_back, one, (ahead + back) / 2) / steps[axis]
+        before, after = tuple((at + 1 - step).T), tuple((at + 1 + step).T)
+        rises = np.stack([centre - around[before], around[after] - centre])
+        known = ~np.stack([unknown[before], unknown[after]])
+        larger = rises[np.abs(rises).argmax(0), nth]
+        mean = (rises * known).sum(0) / np.maximum(known.sum(0), 1)
+        gradient[:, axis] = np.where(known.any(0), mean, larger) / steps[axis]
     return gradient
 
 

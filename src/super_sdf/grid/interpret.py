@@ -6,19 +6,20 @@ What the user says of the values wins, then what the file says; the rest is reco
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from math import prod
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..arrays import Triple
+from ..arrays import BoolArray, Triple
 from ..errors import GridError
 from ..options import Options
 from .look import (
     Extremes,
-    Floats,
     Look,
     as_labels,
     border_share,
@@ -31,20 +32,16 @@ from .recognise import Answer, recognise
 from .samples import (
     LEAST_SPACING,
     MOST_SPACING,
+    MadePlanes,
     SampleArray,
     changed,
     check_kind,
     check_spacing,
-    is_cubic,
     steps_of,
 )
 
-if TYPE_CHECKING:
-    from .unknown import Known
-
 INNER = 0.25  # spacings: as deep at least samples inside are, where parts of a solid touch
 NONE_EXACT: Extremes = (0.0, 0.0)
-DENSITY = "density"  # what values with a level are
 # Voxels from the surface at which values are cut off: where the rest is filled in, and below which
 # too few are left for that.
 FILLED, TOO_NEAR = 1.75, 0.85
@@ -81,16 +78,47 @@ class Field:
         return {"kind": self.kind, "given": self.given, **facts}
 
 
-@dataclass(frozen=True, eq=False)
+MASK = Field("mask", exact=NONE_EXACT, network="mask", sides_only=True)
+
+
+@dataclass(eq=False)
 class Case:
-    """Samples, what they look like, what the user says of them, and sentences for the user."""
+    """Values on their way to a grid: the steps change them, and add notes for the user."""
 
     samples: SampleArray
     look: Look
     wanted: Options
     spacing: Triple | None
+    given: SampleArray  # the samples without level and scale: levels that are named are of these
     notes: list[str]
-    known: Known | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+    was_unknown: bool = False  # whether unknown samples were filled in
+    unseen: BoolArray | None = None
+    why_open: str = ""
+
+    def taken(
+        self, kind: Field, positive_inside: bool | None = None, extremes: Extremes | None = None
+    ) -> dict[str, Any]:
+        """Return the arguments with which a grid is made of the samples, negative inside."""
+        kind = replace(
+            kind,
+            given=self.wanted.field == kind.kind,
+            facts={name: x for name, x in self.facts.items() if name != "spacing"},
+            unseen=self.unseen,
+            why_open=self.why_open,
+        )
+        samples, (low, high) = self.samples, extremes or (self.look.low, self.look.high)
+        if self.choose_side() if positive_inside is None else positive_inside:
+            floats = np.promote_types(samples.dtype, np.float32)  # unsigned integers have no sign
+            samples = MadePlanes(samples, partial(np.negative, dtype=floats), dtype=floats)
+            low, high = -high, -low
+        return {
+            "samples": samples,
+            "spacing": self.spacing,
+            "notes": tuple(self.notes),
+            "extremes": (low, high),
+            "field": kind,
+        }
 
     def choose_side(self) -> bool:
         """Whether values are positive inside; unless it is said, the border is outside."""
@@ -108,25 +136,26 @@ class Case:
             )
         return positive
 
-    def spacing_or(self, spacing: float, why: str) -> Triple:
-        """Return the spacing that is given, else another, and why in a note."""
-        if self.spacing is not None:
-            return self.spacing
-        self.notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
-        return check_spacing(spacing)
+    def set_spacing(self, spacing: float, why: str) -> None:
+        """Take a spacing unless one is given, and say why."""
+        if self.spacing is None:
+            self.notes.append(f"spacing not given: taken as {spacing:.6g}, {why}")
+            self.spacing = check_spacing(spacing)
 
-    def taken(
-        self, spacing: Triple, field: Field, facts: dict[str, Any], **more: Any
-    ) -> dict[str, Any]:
-        """Return the arguments with which a grid is made of the samples."""
-        facts = {name: x for name, x in facts.items() if name != "spacing"}
-        field = replace(field, facts=facts, given=self.wanted.field == field.kind)
-        if self.known is not None and self.known.unseen is not None:
-            field = replace(field, unseen=self.known.unseen, why_open=self.known.why_open)
-        if "positive_inside" not in more:
-            more["positive_inside"] = self.choose_side()
-        kept = {"values": self.samples, "extremes": (self.look.low, self.look.high)}
-        return {**kept, **more, "spacing": spacing, "field": field, "notes": tuple(self.notes)}
+    def scaled(self, slope: float) -> None:
+        """Divide the samples by a slope."""
+        self.samples = changed(self.samples, lambda planes: planes / slope)
+        self.look = replace(self.look, low=self.look.low / slope, high=self.look.high / slope)
+
+    def fill_in(self, values: Sequence[float] = ()) -> None:
+        """Fill in unknown samples, for which some values stand, too, if there are some."""
+        if self.look.is_finite and not values:
+            return
+        from .unknown import with_known  # imported where it is needed, as few need it
+
+        filled = with_known(self.samples, self.look, values, self.notes)
+        self.samples, self.unseen, self.why_open = filled
+        self.look, self.was_unknown = look_at(self.samples), True
 
 
 def interpret(
@@ -136,9 +165,8 @@ def interpret(
 
     ``hint`` is a kind that the file states.
     """
-    steps = None if spacing is None else check_spacing(spacing)
+    steps, notes = None if spacing is None else check_spacing(spacing), list[str]()
     check_kind(samples.dtype, samples.shape)
-    notes: list[str] = []
     if wanted.inside == "auto" and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
     if wanted.label is not None:
@@ -153,30 +181,30 @@ def interpret(
         notes.append(f"values {which} {wanted.level:g} are taken as inside (see --inside)")
     if wanted.scale is not None and samples.dtype.kind != "b":
         samples = changed(samples, partial(np.multiply, float(wanted.scale)))
-    case = Case(samples, look_at(samples), wanted, steps, notes)
-    look = case.look
+    look = look_at(samples)
     _check_size(look)
+    case = Case(samples, look, wanted, steps, given, notes)
     if samples.dtype.kind == "b":
         return _of_mask(case, samples)
     if look.infinite:
-        from .unknown import check_infinite  # imported where they are needed, as few are
+        from .unknown import check_infinite
 
         check_infinite(samples)
     if wanted.level is not None:
-        return _of_level(case, given)
+        return _of_level(case)
     if wanted.field == "mask":
-        return _of_sides(case if look.is_finite else _with_known(case), {}, given)
-    steps_given = None if steps is None else np.array(steps_of(steps))
-    answer = Answer(wanted.field, "", {"cut": look.cut, "spacing": steps_given})
+        case.fill_in()
+        return _of_sides(case)
+    h = None if steps is None else np.array(steps_of(steps))
+    answer = Answer(wanted.field, "", {"cut": look.cut, "spacing": h})
     if wanted.field == "auto":
-        answer = recognise(samples, look, steps_given, hint)
+        answer = recognise(samples, look, h, hint)
     elif look.is_two:
         answer = Answer("mask", "there are two values", answer.facts)
-    if answer.refusal and not (
-        answer.kind == "distance" and wanted.inside != "auto" and look.is_one_sided
-    ):
-        raise _refused(answer, look, given if wanted.scale else None)
-    return _as_recognised(case, answer, given)
+    is_shell = answer.kind == "distance" and look.is_one_sided and wanted.inside != "auto"
+    if answer.refusal and not is_shell:
+        raise _refused(case, answer)
+    return _as_recognised(case, answer)
 
 
 def _check_size(look: Look) -> None:
@@ -186,127 +214,102 @@ def _check_size(look: Look) -> None:
     if look.low == look.high:
         only = look.low if isinstance(look.low, bool) else f"{look.low:.6g}"
         raise GridError(f"every value is {only}: a constant field has no surface")
-    largest = max(abs(look.low), abs(look.high))
-    if not ORDINARY[0] < largest < ORDINARY[1]:
-        end = look.high if look.high == largest else look.low
+    end = max(look.high, look.low, key=abs)
+    if not ORDINARY[0] < abs(end) < ORDINARY[1]:
         said = f"if it stands for unknown ones, --unknown {end:.17g}, else multiply them, --scale"
         raise GridError(f"the largest value is {end:.6g}: {said}")
 
 
-def _refused(answer: Answer, look: Look, given: SampleArray | None) -> GridError:
-    """Return the error for values that cannot be meshed; they were ``given`` with another scale."""
-    said, side = answer.refusal, ""
-    if answer.kind == DENSITY and given is not None:  # a level is one of these values
-        said = which_level(look_at(given), signed=not look.is_one_sided)
-    if look.is_one_sided:
-        which = (
-            ("below", "smallest", look.low) if look.low >= 0 else ("above", "largest", look.high)
-        )
-        side = "no value is {} 0 (the {} is {:.6g}): ".format(*which)
-    return GridError(("no solid is chosen: " if answer.kind == "labels" else side) + said)
+def _refused(case: Case, answer: Answer) -> GridError:
+    """Return the error for values that cannot be meshed."""
+    said, side, look = answer.refusal, "", case.look
+    if answer.kind == "density" and case.wanted.scale:  # a level is a value without the scale
+        said = which_level(look_at(case.given), signed=not look.is_one_sided)
+    if answer.kind == "labels":
+        side = "no solid is chosen: "
+    elif look.low >= 0:
+        side = f"no value is below 0 (the smallest is {look.low:.6g}): "
+    elif look.high <= 0:
+        side = f"no value is above 0 (the largest is {look.high:.6g}): "
+    return GridError(side + said)
 
 
-def _as_recognised(case: Case, answer: Answer, given: SampleArray) -> dict[str, Any]:
-    wanted, facts = case.wanted, answer.facts
-    if not case.look.is_finite or "unknown_values" in facts:
-        case = _with_known(case, facts.get("unknown_values", ()))
+def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
+    """Return values that are taken as what they were recognised as."""
+    case.facts = facts = answer.facts
+    case.fill_in(facts.get("unknown_values", ()))
     if answer.kind == "mask":
         if "two values" not in answer.why:
             case.notes.append(f"the values are {answer.why}")
-        return _of_sides(case, facts, given)
+        return _of_sides(case)
     if answer.kind == "smooth":
         if answer.why:
             case.notes.append(
                 f"values taken as smooth (--field smooth), since {answer.why}: the surface is that "
                 "of their cubic spline"
             )
-        return _of_spline(case, facts, given)
+        return _of_spline(case)
     if case.spacing is None:
-        case = replace(case, spacing=_estimated(case, facts))
-    assert case.spacing is not None
+        case.spacing = _estimated(case)
     if answer.kind == "noisy":
         said = f", of about {facts['noise']:.2g} voxels" if "noise" in facts else ""
-        if wanted.field != "noisy":
+        if case.wanted.field != "noisy":
             case.notes.append(f"values taken as noisy (--field noisy): {answer.why}{said}")
-        return case.taken(case.spacing, Field("noisy", exact=NONE_EXACT, network="noisy"), facts)
+        return case.taken(Field("noisy", exact=NONE_EXACT, network="noisy"))
     if slope := facts.get("slope"):
         case.notes.append(
             f"the values change by {slope:.4g} of a spacing from sample to sample, distances by 1: "
             f"they are divided by that (if the spacing is wrong, give --spacing)"
         )
-        samples, look = changed(case.samples, lambda values: values / slope), case.look
-        look = replace(look, low=look.low / slope, high=look.high / slope)
-        case = replace(case, samples=samples, look=look)
-        facts = facts | {"cut": [x / slope for x in facts["cut"]]}
-    return _of_distances(case, facts)
-
-
-def _with_known(case: Case, values: Sequence[float] = ()) -> Case:
-    """Return samples of which unknown ones are filled in."""
-    from .unknown import with_known
-
-    known = with_known(case.samples, case.look, values, case.notes)
-    look = replace(look_at(known.samples), low=known.extremes[0], high=known.extremes[1])
-    return replace(case, samples=known.samples, look=look, known=known)
+        case.scaled(slope)
+        case.facts = facts | {"cut": [x / slope for x in facts["cut"]]}
+    return _of_distances(case, case.spacing)
 
 
 def labelled(samples: SampleArray, label: int) -> SampleArray:
     """Return which samples have a label; GridError if none or all have."""
-    value = as_sample(label, samples.dtype)
-    found, others = False, False
-    labels: set[Any] = set()
-    for plane in samples:
-        has = np.asarray(plane == value if value is not None else np.zeros(plane.shape, bool))
-        found, others = found or bool(has.any()), others or not has.all()
-        if not (found and others):
-            labels |= {x.item() for x in np.unique(plane)[:9]}
-    if found and others:
-        return changed(samples, partial(np.equal, value), np.bool_)
-    raise GridError(
-        f"{'every' if found else 'no'} sample has the label {label}: the labels are {named(labels)}"
-    )
-
-
-def as_sample(label: int, dtype: np.dtype[Any]) -> Any:
-    """Return the sample that is exactly a label, None if the type has none."""
-    if dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            value = dtype.type(label)
-        return value if np.isfinite(value) and int(value) == label else None
-    low, high = (0, 1) if dtype.kind == "b" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
-    return dtype.type(label) if low <= label <= high else None
+    value: Any = np.nan  # equals no sample: a label that the type does not hold is not rounded
+    with np.errstate(over="ignore"), suppress(OverflowError):
+        nearest = np.array(label, object).astype(samples.dtype)
+        value = nearest if int(nearest) == label else value
+    mask = changed(samples, lambda planes: planes == value, np.bool_)
+    count = sum(int(np.count_nonzero(plane)) for plane in mask)
+    if 0 < count < prod(samples.shape):
+        return mask
+    labels = {x.item() for plane in samples for x in np.unique(plane)[:9]}
+    which = "every" if count else "no"
+    raise GridError(f"{which} sample has the label {label}: the labels are {named(labels)}")
 
 
 # Masks
 
 
-def _of_sides(case: Case, facts: dict[str, Any], given: SampleArray) -> dict[str, Any]:
+def _of_sides(case: Case) -> dict[str, Any]:
     """Return the mask that the sides of values make; 0 is on the side ``zeros``, else inside."""
-    look, wanted, samples = case.look, case.wanted, case.samples
-    if look.is_two and 0 in (look.low, look.high) and wanted.inside == "auto":
+    look, inside, facts = case.look, case.wanted.inside, case.facts
+    if look.is_two and 0 in (look.low, look.high) and inside == "auto":
         # the other value is inside, wherever it is
-        case = replace(case, wanted=replace(wanted, inside="positive"))
-        return _of_mask(case, changed(samples, partial(np.not_equal, 0), np.bool_), facts)
+        case.wanted = replace(case.wanted, inside="positive")
+        return _of_mask(case, changed(case.samples, partial(np.not_equal, 0), np.bool_))
     if look.is_two:
-        return _of_mask(case, changed(samples, partial(np.less, look.low), np.bool_), facts)
+        return _of_mask(case, changed(case.samples, partial(np.less, look.low), np.bool_))
     if look.low > 0 or look.high < 0:
         raise GridError(
             f"every value is {'above' if look.low > 0 else 'below'} 0 (they go from {look.low:.6g} "
-            f"to {look.high:.6g}), so their signs make no mask: {which_level(look_at(given))}"
+            f"to {look.high:.6g}), so their signs make no mask: {which_level(look_at(case.given))}"
         )
     if "step" in facts:
-        spacing = case.spacing_or(facts["step"], "the step of the transform")
-        case = replace(case, spacing=spacing)
+        case.set_spacing(facts["step"], "the step of the transform")
     below, zeros = border_share(look, lambda x: x < 0), facts.get("zeros", 0)
-    is_positive = below > 0.5 if wanted.inside == "auto" else wanted.inside == "positive"
+    is_positive = below > 0.5 if inside == "auto" else inside == "positive"
     with_zeros = look.high == 0 or zeros > 0 or (look.low < 0 and zeros == 0 and is_positive)
     above = partial(np.less_equal if with_zeros else np.less, 0)
-    return _of_mask(case, changed(samples, above, np.bool_), facts)
+    return _of_mask(case, changed(case.samples, above, np.bool_))
 
 
-def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None) -> dict[str, Any]:
+def _of_mask(case: Case, mask: SampleArray) -> dict[str, Any]:
     """Return the distances of the samples that are true to those that are not, on the lattice."""
-    from .derived import extremes_of_masks, mask_planes
+    from .derived import REACH, extremes_of_masks, mask_distances
 
     positive = case.wanted.inside == "positive"
     if case.wanted.inside == "auto":  # the border is outside
@@ -317,109 +320,86 @@ def _of_mask(case: Case, mask: SampleArray, facts: dict[str, Any] | None = None)
                 f"the {'larger' if positive else 'smaller'} value is taken as inside: {share:.0%} "
                 "of the grid's border has the other one (if that is wrong, use --inside)"
             )
-    if not positive:
-        mask = changed(mask, np.logical_not, np.bool_)
-    spacing = case.spacing_or(1, "since a mask shows none (give --spacing)")
+    case.set_spacing(1, "since a mask shows none (give --spacing)")
     case.notes.append(
         "values taken as a mask (--field mask): they show the surface to half a voxel only"
     )
-    h = min(steps_of(spacing))
-    more = {"extremes": extremes_of_masks(h), "positive_inside": False}
-    values = mask_planes(mask, h)
-    return case.taken(spacing, mask_field(spacing), facts or {}, values=values, **more)
-
-
-def mask_field(spacing: Triple) -> Field:
-    """Return what a mask is taken as."""
-    own = not is_cubic(spacing)
-    return Field("mask", exact=NONE_EXACT, network="mask", sides_only=True, own_lattice=own)
+    assert case.spacing is not None
+    h = min(steps_of(case.spacing))
+    case.samples = MadePlanes(
+        mask, lambda planes: mask_distances(planes == positive).astype(float) * h, REACH
+    )
+    return case.taken(MASK, positive_inside=False, extremes=extremes_of_masks(h))
 
 
 # Densities, and fields with the surface of their spline
 
 
-def _of_level(case: Case, given: SampleArray) -> dict[str, Any]:
+def _of_level(case: Case) -> dict[str, Any]:
     """Return values from which a level was taken, above it positive."""
     look, wanted = case.look, case.wanted
     if look.low >= 0 or look.high <= 0:
-        before = look_at(given)
+        before = look_at(case.given)
         raise GridError(
             f"no value is {'above' if look.high <= 0 else 'below'} the level {wanted.level:g} "
             f"(they go from {before.low:.6g} to {before.high:.6g}): {which_level(before)}"
         )
     if look.is_two or wanted.field == "mask":
         return _of_mask(case, changed(case.samples, partial(np.less, 0), np.bool_))
-    if not look.is_finite:
-        case = _with_known(case)
-    spacing = case.spacing_or(1, "since densities show none (give --spacing)")
-    return _of_spline(replace(case, spacing=spacing), {}, given, DENSITY)
+    case.fill_in()
+    case.set_spacing(1, "since densities show none (give --spacing)")
+    return _of_spline(case, "density")
 
 
-def _of_spline(
-    case: Case, facts: dict[str, Any], given: SampleArray, kind: str = "smooth"
-) -> dict[str, Any]:
+def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     """Return values in steps of their slope beside the surface, to be meshed by their spline."""
     if case.look.is_one_sided:
-        raise GridError(f"no value is on the other side of 0: {which_level(look_at(given))}")
-    spacing, slope = case.spacing or _estimated(case, facts), 1.0
-    if case.wanted.scale is None:
-        slope = _slope_at_surface(case.look, np.array(steps_of(spacing)))
-    own = Field(
-        kind,
-        exact=NONE_EXACT,
-        network=None,
-        own_lattice=not is_cubic(spacing),
-        has_jumps=bool(facts.get("cut")) and kind == "smooth",
-    )
-    extremes = case.look.low / slope, case.look.high / slope
-    values: SampleArray = changed(case.samples, lambda planes: planes / slope)
-    if "inside" in facts:
+        raise GridError(f"no value is on the other side of 0: {which_level(look_at(case.given))}")
+    case.spacing = spacing = case.spacing or _estimated(case)
+    case.scaled(1.0 if case.wanted.scale else _slope_at_surface(case.look, steps_of(spacing)))
+    if "inside" in case.facts:
         from .derived import without_inner_faces
 
         deep = INNER * min(steps_of(spacing))
-        values = without_inner_faces(values, facts["inside"], deep)
-    return case.taken(spacing, own, facts, values=values, extremes=extremes)
+        case.samples = without_inner_faces(case.samples, case.facts["inside"], deep)
+    has_jumps = bool(case.facts.get("cut")) and kind == "smooth"
+    return case.taken(Field(kind, exact=NONE_EXACT, network=None, has_jumps=has_jumps))
 
 
-def _slope_at_surface(look: Look, steps: Floats) -> float:
+def _slope_at_surface(look: Look, steps: ArrayLike) -> float:
     """Return the typical slope beside the surface, in world units; of steps over 0 if unknown."""
-    slope = typical_slope(look, steps, look.cut)
+    slope = typical_slope(look, np.array(steps), look.cut)
     if not np.isfinite(slope):
-        slope = float(np.abs(look.pairs[0] - look.pairs[1]).max(initial=0)) / float(steps.min())
+        slope = float(np.abs(look.pairs[0] - look.pairs[1]).max(initial=0) / np.min(steps))
     return slope or 1.0
 
 
 # Distances
 
 
-def _of_distances(case: Case, facts: dict[str, Any]) -> dict[str, Any]:
+def _of_distances(case: Case, spacing: Triple) -> dict[str, Any]:
     """Return distances, of which some may be cut off; what is missing is filled in if it helps."""
-    spacing, look, cut = case.spacing, case.look, facts["cut"]
-    if case.known is not None:  # unknown samples are taken as cut off
+    look, cut, steps = case.look, case.facts["cut"], steps_of(spacing)
+    if case.was_unknown:  # unknown samples are taken as cut off
         cut = [look.low, look.high]
-    assert spacing is not None
     positive = case.choose_side()
     low = look.low if look.low in cut and look.low < 0 else -np.inf
     high = look.high if look.high in cut and look.high > 0 else np.inf
-    exact = (-high, -low) if positive else (low, high)
-    steps = steps_of(spacing)
     at = min(-low, high) / max(steps)
-    own, values = Field(exact=exact), case.samples
     if at < FILLED:
         case.notes.append(f"distances that are cut off {at:.3g} voxels from the surface")
-    if at < TOO_NEAR:
-        cubic = is_cubic(spacing)
-        own = Field(exact=exact if cubic else NONE_EXACT, network=None, own_lattice=not cubic)
-    elif at < FILLED:
+    if TOO_NEAR <= at < FILLED:
         from .derived import filled_planes
 
-        values = filled_planes(values, steps, (look.low, look.high))
-    return case.taken(spacing, own, facts, values=values, positive_inside=positive)
+        case.samples = filled_planes(case.samples, steps, (look.low, look.high))
+    exact, network = (-high, -low) if positive else (low, high), "distance"
+    kind = Field(exact=exact, network=None if at < TOO_NEAR else network)
+    return case.taken(kind, positive)
 
 
-def _estimated(case: Case, facts: dict[str, Any]) -> Triple:
+def _estimated(case: Case) -> Triple:
     """Return the spacing that the values show, with a note; GridError if they show none."""
-    look = case.look
+    look, facts = case.look, case.facts
     if facts.get("spacing") is None and "unit" not in facts:
         facts = recognise(case.samples, look).facts
     found = facts.get("spacing")

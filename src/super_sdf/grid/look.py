@@ -354,7 +354,7 @@ def last_digit(look: Look) -> float:
     largest = max(abs(look.low), abs(look.high))
     values = (look.boxes[:, 2, 2, 2] / largest).astype(np.float32)
     values = np.unique(values[np.isfinite(values)])
-    return float(np.median(np.diff(values))) * largest if len(values) > 1 else 0.0
+    return float(np.quantile(np.diff(values), 0.5)) * largest if len(values) > 1 else 0.0
 
 
 def smooth_gradients(lines: Floats) -> tuple[Floats, int]:

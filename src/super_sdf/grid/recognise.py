@@ -200,9 +200,9 @@ def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) 
         ring = whole & along.any(1)
         free = ring & ~np.isin(boxes[:, 1, 1, 1], cut)
         x = boxes[free, 1, 1, 1]
-        if len(x) < max(ENOUGH, ring.sum() / 2) or np.median(np.abs(x)) < NOTHING * largest:
+        typical = float(np.quantile(np.abs(x), 0.5)) if len(x) else 0.0
+        if len(x) < max(ENOUGH, ring.sum() / 2) or typical < NOTHING * largest:
             continue
-        typical = float(np.median(np.abs(x)))
         alike = np.abs(np.abs(x) - typical) <= 0.01 * typical
         shape = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
         bits = np.packbits(signs[free].reshape(-1, 27), axis=1)
@@ -308,7 +308,7 @@ def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> An
     slope = np.sort(np.sqrt((gradients**2).sum(1)))
     third = max(len(slope) // 3, 1)  # the narrowest range that holds a third of them
     at = int(np.argmin(slope[third:] / slope[:-third]))
-    facts["unit"] = unit = float(np.median(slope[at : at + third + 1]))
+    facts["unit"] = unit = float(np.quantile(slope[at : at + third + 1], 0.5))
     facts["error"] = SAME_UNIT if fourth >= ENOUGH else 3 * SAME_UNIT
     error = EXACT + min(facts["digit"] / unit / h, MOST_DIGIT) / 2
     facts["slopes"] = float((np.abs(slope / unit - 1) < error).mean())

@@ -22,7 +22,6 @@ from ..threads import check_fits
 
 FAR = 1e6  # spacings
 BLOCK_BYTES = 1 << 20  # read at a time when iterating over all planes
-LEAST_AT_ONCE = 4  # planes
 LARGE_FILE = 1 << 27  # bytes
 
 # Spacings that differ by less than this ratio count as equal. Coarser axes are resampled to the
@@ -62,9 +61,9 @@ class SamplePlanes(ABC):
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive), (last - first, ny, nz)."""
 
-    def crop(self, low: Index, high: Index) -> SampleArray:
-        """Return the samples from index ``low`` to before ``high``, read when they are needed."""
-        return MadePlanes(self, _same, dtype=self.dtype, box=(low, high))
+    def read_box(self, low: Index, high: Index) -> NDArray[Any]:
+        """Return the samples from index ``low`` to before ``high``."""
+        return self.read(low[0], high[0])[:, low[1] : high[1], low[2] : high[2]]
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -80,8 +79,9 @@ class SamplePlanes(ABC):
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
         plane = self.shape[1] * self.shape[2] * self.dtype.itemsize
-        for block in in_blocks(self, max(BLOCK_BYTES // plane, 2 * self.beside, 1)):
-            yield from self[block]
+        step = max(BLOCK_BYTES // plane, 2 * self.beside, 1)
+        for first in range(0, len(self), step):
+            yield from self[first : first + step]
 
     @cached_property
     def loaded(self) -> NDArray[Any]:
@@ -103,52 +103,55 @@ SampleArray: TypeAlias = NDArray[Any] | SamplePlanes
 
 
 class MadePlanes(SamplePlanes):
-    """Planes that are made of those of another array, and of some beside them.
+    """Samples made of those of another array, anything that is sliced, in a box of it.
 
-    ``make`` takes some planes of ``source``, anything that is sliced, and returns as many. Values
-    depend on ``beside`` samples to either side along each axis. Of what is made, a ``box`` is kept.
+    ``make`` takes an array of samples and returns one of that shape. Each depends on ``beside``
+    samples to either side along each axis.
     """
 
     def __init__(
         self,
         source: Any,
-        make: Callable[[NDArray[Any]], NDArray[Any]],
+        make: Callable[[NDArray[Any]], NDArray[Any]] = np.asarray,
         beside: int = 0,
         dtype: DTypeLike = np.float64,
         box: tuple[Index, Index] | None = None,
     ) -> None:
-        self.source, self.make, self.beside = source, make, beside
+        self.source, self.make, self.margin, self.dtype = source, make, beside, np.dtype(dtype)
+        self.beside = beside + getattr(source, "beside", 0)
         low, high = box or ((0, 0, 0), source.shape)
-        self.low, self.dtype = tuple(map(int, low)), np.dtype(dtype)
-        self.shape = tuple(int(b) - a for a, b in zip(self.low, high))
+        self.low, self.shape = np.array(low), tuple(np.subtract(high, low).tolist())
 
     def read(self, first: int, last: int) -> NDArray[Any]:
         """Return planes ``first`` to ``last`` (exclusive)."""
-        first, last = first + self.low[0], last + self.low[0]
-        start, stop = max(first - self.beside, 0), min(last + self.beside, self.source.shape[0])
-        made = self.make(np.asarray(self.source[start:stop]))[first - start : last - start]
-        rows, row = (slice(a, a + n) for a, n in zip(self.low[1:], self.shape[1:]))
-        return made[:, rows, row].astype(self.dtype, copy=False)
+        return self.read_box((first, 0, 0), (last, *self.shape[1:]))
 
-    def crop(self, low: Index, high: Index) -> SampleArray:
-        """Return the samples in a box, made of those of the source in a box around it."""
-        low, high = np.add(low, self.low), np.add(high, self.low)
-        around = np.maximum(low - self.beside, 0)
-        source = cropped(self.source, around, np.minimum(high + self.beside, self.source.shape))
-        box = low - around, high - around
-        return MadePlanes(source, self.make, self.beside, self.dtype, box)
+    def read_box(self, low: Index, high: Index) -> NDArray[Any]:
+        """Return the samples in a box, made of those in a box around it."""
+        low, high = self.low + low, self.low + high
+        start = np.maximum(low - self.margin, 0)
+        stop = np.minimum(high + self.margin, self.source.shape)
+        made = self.make(read_box(self.source, start, stop))
+        return made[slices(low - start, high - start)].astype(self.dtype, copy=False)
 
 
-def _same(planes: NDArray[Any]) -> NDArray[Any]:
-    return planes
+def slices(low: Index, high: Index) -> tuple[slice, ...]:
+    """Return what indexes an array from index ``low`` (3,) to before ``high``."""
+    return tuple(map(slice, map(int, low), map(int, high)))
 
 
-def cropped(samples: Any, low: Index, high: Index) -> SampleArray:
-    """Return the samples from index ``low`` (3,) to before ``high``."""
+def read_box(samples: Any, low: Index, high: Index) -> NDArray[Any]:
+    """Return the samples from index ``low`` (3,) to before ``high`` as an array."""
     if isinstance(samples, SamplePlanes):
-        return samples.crop(low, high)
-    part: NDArray[Any] = np.asanyarray(samples[tuple(map(slice, map(int, low), map(int, high)))])
-    return part
+        return samples.read_box(low, high)
+    return np.asanyarray(samples[slices(low, high)])
+
+
+def cropped(samples: SampleArray, low: Index, high: Index) -> SampleArray:
+    """Return the samples from index ``low`` (3,) to before ``high``, read when they are needed."""
+    if isinstance(samples, SamplePlanes):
+        return MadePlanes(samples, dtype=samples.dtype, box=(low, high))
+    return samples[slices(low, high)]
 
 
 def changed(
@@ -169,16 +172,6 @@ def let_go(samples: SampleArray) -> None:
     mapped: Any = getattr(samples, "_mmap", None)
     if hasattr(mapped, "madvise") and len(mapped) > LARGE_FILE:
         mapped.madvise(mmap.MADV_DONTNEED)
-
-
-def in_blocks(samples: SampleArray, step: int) -> list[slice]:
-    """Return ranges of ``step`` planes, the last one of what is left."""
-    return [slice(i, min(i + step, len(samples))) for i in range(0, len(samples), step)]
-
-
-def planes_at_once(samples: SampleArray) -> int:
-    """Return how many planes are best made at a time: not few, if each needs many beside it."""
-    return max(2 * getattr(samples, "beside", 0), LEAST_AT_ONCE)
 
 
 def in_spacings(values: NDArray[Any], unit: float) -> FloatArray:
@@ -202,7 +195,7 @@ def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
         return values
     stored: Any = values
     if hasattr(stored, "chunks") and isinstance(getattr(stored, "dtype", None), np.dtype):
-        return MadePlanes(stored, _same, dtype=stored.dtype)  # of h5py, Zarr or Dask
+        return MadePlanes(stored, dtype=stored.dtype)  # of h5py, Zarr or Dask
     try:
         samples: NDArray[Any] = np.asanyarray(without_device(values))
     except (TypeError, ValueError, RuntimeError):  # ragged lists
@@ -227,14 +220,16 @@ def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
 # Where samples lie
 
 
-def as_numbers(given: ArrayLike, name: str, count: int, what: str) -> NDArray[np.float64]:
-    """Return finite numbers, (count,), of as many or of one; GridError, by a name, otherwise."""
+def as_numbers(
+    given: ArrayLike, name: str, what: str = "one number or three", sizes: Index = (1, 3)
+) -> NDArray[np.float64]:
+    """Return finite numbers, (n,), as many as one of the sizes; ``name`` is that in messages."""
     try:
         array = np.asarray(given)
-        if array.dtype.kind not in "fiu":  # booleans and strings are refused
+        if array.dtype.kind not in "fiu" or array.size not in sizes:  # nor booleans, nor strings
             raise TypeError
         with np.errstate(over="ignore"):  # of long doubles, which are found to be infinite below
-            numbers = np.broadcast_to(array.astype(np.float64).ravel(), (count,))
+            numbers = array.astype(np.float64).ravel()
     except (TypeError, ValueError, RuntimeError):
         raise GridError(f"{name} is {seen(given)}: give {what}") from None
     if not np.isfinite(numbers).all():
@@ -244,26 +239,23 @@ def as_numbers(given: ArrayLike, name: str, count: int, what: str) -> NDArray[np
 
 def as_triple(number: ArrayLike, name: str) -> Triple:
     """Return one number or three as three finite floats; ``name`` is that in messages."""
-    x, y, z = as_numbers(number, name, 3, "one number or three").tolist()
+    x, y, z = np.broadcast_to(as_numbers(number, name), (3,)).tolist()
     return x, y, z
 
 
 def check_spacing(spacing: ArrayLike) -> Triple:
     """Return the spacing as three floats; GridError unless they are positive and within range."""
-    triple = as_triple(spacing, "spacing")
-    said = f"spacing is {', '.join(f'{number:g}' for number in triple)}"
+    triple, fault = as_triple(spacing, "spacing"), ""
     if min(triple) <= 0:
-        raise GridError(f"{said}: it must be greater than 0")
-    if not LEAST_SPACING <= min(triple) <= max(triple) <= MOST_SPACING:
-        raise GridError(
-            f"{said}: give lengths in a unit in which it is between "
-            f"{LEAST_SPACING:g} and {MOST_SPACING:g}"
-        )
-    if max(triple) > min(triple) * MOST_UNEQUAL:
-        raise GridError(
-            f"{said}: the largest may be {MOST_UNEQUAL:g} times the smallest; "
-            "leave out samples along the finer axes"
-        )
+        fault = "it must be greater than 0"
+    elif not LEAST_SPACING <= min(triple) <= max(triple) <= MOST_SPACING:
+        between = f"between {LEAST_SPACING:g} and {MOST_SPACING:g}"
+        fault = f"give lengths in a unit in which it is {between}"
+    elif max(triple) > min(triple) * MOST_UNEQUAL:
+        most = f"the largest may be {MOST_UNEQUAL:g} times the smallest"
+        fault = f"{most}; leave out samples along the finer axes"
+    if fault:
+        raise GridError(f"spacing is {', '.join(f'{number:g}' for number in triple)}: {fault}")
     return triple
 
 
@@ -282,9 +274,7 @@ def check_direction(direction: ArrayLike | None) -> Direction:
     if direction is None:
         return STRAIGHT
     what = "nine numbers, row by row, or a 3 x 3 matrix"
-    if np.size(np.asarray(direction, object)) == 1:
-        raise GridError(f"direction is {seen(direction)}: give {what}")
-    matrix = as_numbers(direction, "direction", 9, what).reshape(3, 3)
+    matrix = as_numbers(direction, "direction", what, (9,)).reshape(3, 3)
     lengths = np.sqrt((matrix**2).sum(0))
     fault = f"its columns have the lengths {', '.join(f'{x:.4g}' for x in lengths)}, not 1"
     if np.abs(lengths - 1).max() <= SKEW:
@@ -292,12 +282,6 @@ def check_direction(direction: ArrayLike | None) -> Direction:
     if fault:
         raise GridError(f"direction is {in_rows(matrix)}: {fault}; give a unit vector of each axis")
     return STRAIGHT if np.abs(matrix - np.eye(3)).max() <= DIGITS else as_direction(matrix)
-
-
-def is_sheared(direction: Direction) -> bool:
-    """Return whether axes are not at right angles, as of a scanner whose gantry is tilted."""
-    products = np.transpose(direction) @ np.array(direction)
-    return bool(np.abs(products - np.eye(3)).max() > 2 * SKEW)
 
 
 def as_direction(matrix: Any) -> Direction:
@@ -326,25 +310,21 @@ def placed(
         names = ", ".join(map(str, values.data_vars)) or "none"
         raise GridError(f"values are a Dataset: give one of its arrays ({names})")
     array: Any = values.squeeze(drop=True) if values.ndim > len(AXES) else values
+    check_kind(array.dtype, array.shape)
     wanted = UNNAMED if set(array.dims) == set(UNNAMED) else AXES
     if set(array.dims) != set(wanted):
-        check_kind(array.dtype, array.shape)
-        raise GridError(
-            f"dimensions are {', '.join(map(repr, array.dims)) or 'none'}: name those of the axes "
-            "'x', 'y' and 'z', with array.rename(...)"
-        )
-    array = array.transpose(*wanted)
-    check_kind(array.dtype, array.shape)
+        named = ", ".join(map(repr, array.dims))
+        how = "name those of the axes 'x', 'y' and 'z', with array.rename(...)"
+        raise GridError(f"dimensions are {named}: {how}")
     if array.chunks is not None:
         check_fits(array.nbytes, "the array of Dask, whole,", "save it as .npy and give its path")
-    samples, steps, lowest = np.asanyarray(array.values), list[float](), list[float]()
-    named = [x for x in wanted if x in array.coords and array.coords[x].dims == (x,)]
-    if 0 < len(named) < len(AXES):
-        raise GridError(
-            f"only {', '.join(map(repr, named))} has coordinates: give those of all axes, or of "
-            "none (array.drop_vars(...))"
-        )
-    for axis, name in enumerate(named):
+    samples: Any = np.asanyarray(array.transpose(*wanted).values)
+    found = [x for x in wanted if x in array.coords and array.coords[x].dims == (x,)]
+    if len(found) not in (0, len(AXES)):
+        how = "give those of all axes, or of none (array.drop_vars(...))"
+        raise GridError(f"only {', '.join(map(repr, found))} has coordinates: {how}")
+    steps, lowest = list[float](), list[float]()
+    for axis, name in enumerate(found):
         first, step = even_steps(name, array.coords[name].values)
         lowest.append(first + min(step, 0) * (samples.shape[axis] - 1))
         steps.append(abs(step))
@@ -355,22 +335,19 @@ def placed(
 
 def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
     """Return the first of some coordinates, and the step; GridError unless they are even."""
+    said = f"coordinates of {name!r}"
     if coordinates.dtype.kind not in "fiu":
-        raise GridError(
-            f"coordinates of {name!r} have dtype {coordinates.dtype}: give numbers, in the unit of "
-            "the distances"
-        )
+        how = "give numbers, in the unit of the distances"
+        raise GridError(f"{said} have dtype {coordinates.dtype}: {how}")
     places = coordinates.astype(np.float64)
     first, steps = float(places[0]), np.diff(places)
     step = float(places[-1] - first) / len(steps)
-    is_float = coordinates.dtype.kind == "f"
-    rounding = np.finfo(coordinates.dtype).eps * np.abs(places).max() if is_float else 0.0
     off = np.abs(places - (first + step * np.arange(len(places)))).max()
-    if step == 0 or not off <= EVEN * abs(step) + rounding:
+    if step == 0 or not off <= EVEN * abs(step) + np.spacing(np.abs(coordinates).max()):
         usual = float(np.nanmedian(steps))
         worst = int(np.nan_to_num(np.abs(steps - usual), nan=np.inf).argmax())
         raise GridError(
-            f"coordinates of {name!r} are not evenly spaced: {places[worst]:.6g} is followed by "
+            f"{said} are not evenly spaced: {places[worst]:.6g} is followed by "
             f"{places[worst + 1]:.6g}, a step of {steps[worst]:.6g} among steps of {usual:.6g}; "
             f"resample the array (array.interp({name}=...))"
         )

@@ -13,9 +13,11 @@ from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
 from ..options import FieldKind, Inside, Options
 from .interpret import NONE_EXACT, Field, interpret
-from .look import Extremes, Look, border_share, look_at, typical_slope
+from .look import Extremes, border_share, look_at, typical_slope
 from .samples import (
+    AXES,
     EQUAL_SPACING,
+    SKEW,
     STRAIGHT,
     Direction,
     Index,
@@ -29,12 +31,11 @@ from .samples import (
     cropped,
     in_rows,
     is_cubic,
-    is_sheared,
     placed,
+    steps_of,
 )
 
 MOST_RISE = 1.25  # spacings by which distances change from sample to sample; at most 1
-MASK_HINT = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
@@ -62,8 +63,8 @@ class SdfGrid:
     Attributes
     ----------
     values : (nx, ny, nz) array
-        All samples, negative inside. Samples in a file are loaded on first use and stay in memory;
-        ``planes`` reads some of them without that.
+        All samples, negative inside. Those of a file, or made of others, are loaded on first use
+        and stay in memory; ``planes`` reads some of them without that.
     low, high : float
         The smallest and the largest sample, negative inside.
     notes : tuple of str
@@ -86,7 +87,6 @@ class SdfGrid:
     origin: Triple
     direction: Direction
     notes: tuple[str, ...]
-    positive_inside: bool
     low: float
     high: float
     field: Field
@@ -101,13 +101,23 @@ class SdfGrid:
         direction: ArrayLike | None = None,
     ) -> None:
         values, _, origin = placed(values, spacing, origin)
-        samples, steps = as_samples(values), check_spacing(spacing)
-        look = _checked(samples)
+        samples, h = as_samples(values), max(check_spacing(spacing))
+        check_kind(samples.dtype, samples.shape)
+        look = look_at(samples)
+        if not look.is_finite:
+            bad = (np.argwhere(~np.isfinite(plane)) for plane in samples)
+            i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
+            raise GridError(
+                f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}: every sample must be finite; "
+                "replace unknown far samples by a large distance of the right sign"
+            )
         if look.low == look.high:
             raise GridError(f"every value is {look.low:.6g}: a constant field has no surface")
-        if look.is_two and min(look.shape) > 2:
-            both = f"{look.low:.6g} and {look.high:.6g}"
-            raise GridError(f"the only values are {both}: {MASK_HINT}")
+        if look.is_two and (min(look.shape) > 2 or samples.dtype == np.bool_):
+            raise GridError(
+                f"the only values are {look.low:.6g} and {look.high:.6g}: a mask holds no "
+                "distances; make a grid of it with make_grid or read_grid"
+            )
         below = border_share(look, lambda x: x < 0)
         if below > 0.5:
             raise GridError(
@@ -115,58 +125,52 @@ class SdfGrid:
                 "with make_grid(values, spacing=..., inside='positive'), or inside='negative' if "
                 "the solid does run out of the grid there"
             )
-        rise, h = typical_slope(look, np.ones(3)), max(steps)
+        rise = typical_slope(look, np.ones(3))
         if rise > MOST_RISE * h:
             said = f"the values change by {rise:.6g} from sample to sample, but spacing is {h:.6g}"
             raise GridError(f"{said}: give distances in its unit, or use make_grid")
         extremes = look.low, look.high
-        grid = self.trusted(samples, steps, origin, direction=direction, extremes=extremes)
+        grid = self.trusted(samples, spacing, origin, extremes=extremes, direction=direction)
         vars(self).update(vars(grid))
 
     @classmethod
     def trusted(
         cls,
-        values: ArrayLike | SamplePlanes,
+        samples: SampleArray,
         spacing: ArrayLike,
         origin: ArrayLike | None = None,
         notes: tuple[str, ...] = (),
         *,
-        direction: ArrayLike | None = None,
-        positive_inside: bool = False,
         extremes: Extremes | None = None,
+        direction: ArrayLike | None = None,
         field: Field | None = None,
     ) -> SdfGrid:
         """Return a grid whose sign and spacing are known and not checked against the values.
 
-        With ``positive_inside`` the sign of the values is flipped. With ``extremes``, their minimum
-        and maximum, they are not searched for NaN and infinity. Values are taken as exact distances
-        unless ``field`` says what they are.
+        With ``extremes``, the smallest and the largest sample, they are not searched for. Values
+        are taken as exact distances unless ``field`` says what they are.
         """
-        values, _, origin = placed(values, spacing, origin)
-        samples = as_samples(values)
-        if extremes is None:
-            look = _checked(samples)
-            extremes = look.low, look.high
-        low, high = extremes
-        axes, field = check_direction(direction), field or Field()
-        if is_sheared(axes) and not field.own_lattice:
-            if field.network in ("distance", "noisy"):
-                raise GridError(
-                    f"direction is {in_rows(axes)}: its axes are not at right angles, and there "
-                    "distances are not refined; resample the grid, or mesh the spline of the "
-                    "values (--field smooth)"
-                )
+        steps, axes, field = check_spacing(spacing), check_direction(direction), field or Field()
+        is_sheared = np.abs(np.transpose(axes) @ np.array(axes) - np.eye(3)).max() > 2 * SKEW
+        are_distances = field.network in ("distance", "noisy")
+        if is_sheared and are_distances and not field.own_lattice:
+            raise GridError(
+                f"direction is {in_rows(axes)}: its axes are not at right angles, and there "
+                "distances are not refined; resample the grid, or mesh the spline of the "
+                "values (--field smooth)"
+            )
+        if (is_sheared or not is_cubic(steps)) and not are_distances:
             field = replace(field, own_lattice=True, exact=NONE_EXACT)
+        low, high = extremes or (float(np.min(samples)), float(np.max(samples)))
         grid = object.__new__(cls)
         vars(grid).update(
             samples=samples,
-            spacing=check_spacing(spacing),
+            spacing=steps,
             origin=as_triple(0.0 if origin is None else origin, "origin"),
             direction=axes,
             notes=notes,
-            positive_inside=positive_inside,
-            low=-high if positive_inside else low,
-            high=-low if positive_inside else high,
+            low=low,
+            high=high,
             field=field,
             space=None,
             on_sample=None,
@@ -186,13 +190,11 @@ class SdfGrid:
     def values(self) -> NDArray[Any]:
         """All samples, negative inside."""
         samples = self.samples
-        whole = samples.loaded if isinstance(samples, SamplePlanes) else samples
-        return negated(whole) if self.positive_inside else whole
+        return samples.loaded if isinstance(samples, SamplePlanes) else samples
 
     def planes(self, first: int, last: int) -> NDArray[Any]:
         """Return the samples with first <= i < last, negative inside, (last - first, ny, nz)."""
-        samples = self.samples[first:last]
-        return negated(samples) if self.positive_inside else samples
+        return self.samples[first:last]
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -203,7 +205,7 @@ class SdfGrid:
     @property
     def voxel_size(self) -> float:
         """The spacing h of the lattice that is refined, in world units: the finest one."""
-        return sum(self.spacing) / 3 if self.is_cubic else min(self.spacing)
+        return min(steps_of(self.spacing))
 
     @property
     def is_cubic(self) -> bool:
@@ -223,9 +225,6 @@ class SdfGrid:
     @property
     def reach(self) -> float:
         """The largest coordinate of the grid in the world, about."""
-        if self.is_straight:
-            axes = zip(self.origin, self.spacing, self.shape)
-            return max(abs(x) + h * n for x, h, n in axes)
         sides = np.array(self.spacing) * self.shape
         return float((np.abs(self.origin) + np.abs(self.direction) @ sides).max())
 
@@ -327,22 +326,6 @@ def check_grid(grid: Any) -> SdfGrid:
     return grid
 
 
-def _checked(samples: SampleArray) -> Look:
-    """Look at samples; GridError unless they are finite numbers along three axes."""
-    check_kind(samples.dtype, samples.shape)
-    if samples.dtype == np.bool_:
-        raise GridError(f"values are true or false: {MASK_HINT}")
-    look = look_at(samples)
-    if look.is_finite:
-        return look
-    bad = (np.argwhere(~np.isfinite(plane)) for plane in samples)
-    i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
-    raise GridError(
-        f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}: every sample must be finite; "
-        "replace unknown far samples by a large distance of the right sign"
-    )
-
-
 def with_fields(grid: SdfGrid, **fields: Any) -> SdfGrid:
     """Return a grid with other fields, taken as they are."""
     other = copy(grid)
@@ -367,13 +350,6 @@ def crop(grid: SdfGrid, low: Index, high: Index) -> SdfGrid:
     )
 
 
-def negated(values: NDArray[Any]) -> NDArray[Any]:
-    """Return the negated values, as floats so that unsigned integers work."""
-    floats: NDArray[Any] = values.astype(np.promote_types(values.dtype, np.float32))
-    np.negative(floats, out=floats)
-    return floats
-
-
 def describe_place(grid: SdfGrid) -> dict[str, Any]:
     """Return where the samples of a grid lie, for JSON."""
     return {
@@ -387,8 +363,7 @@ def describe_place(grid: SdfGrid) -> dict[str, Any]:
 
 def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
     """Return the volume of the samples inside, each of which counts as a box."""
-    planes = (grid.planes(nth, nth + 1) for nth in range(grid.shape[0]))
-    inside = sum(int(np.count_nonzero(plane <= offset)) for plane in planes)
+    inside = sum(int(np.count_nonzero(plane <= offset)) for plane in grid.samples)
     return inside * mean_spacing(grid) ** 3
 
 
@@ -426,38 +401,29 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         )
     from .derived import Resampled  # imported here, as few need it
 
-    samples, h = grid.samples, grid.voxel_size
-    steps, known = list(grid.spacing), [np.ones(count, bool) for count in grid.shape]
+    samples, h, steps, coarser = grid.samples, grid.voxel_size, list(grid.spacing), list[str]()
+    known = [np.ones(count, bool) for count in grid.shape]
     for axis in np.argsort(grid.spacing, kind="stable").tolist():
         if steps[axis] > h * (1 + EQUAL_SPACING):
-            level = -offset if grid.positive_inside else offset
-            samples = Resampled(samples, (steps[0], steps[1], steps[2]), axis, h, level)
+            coarser.append(f"{AXES[axis]} from {steps[axis]:.6g}")
+            samples = Resampled(samples, (steps[0], steps[1], steps[2]), axis, h, offset)
             steps[axis], known[axis] = h, samples.on_sample
-    coarser = " and ".join(
-        f"{name} from {step:.6g}"
-        for name, step in zip("xyz", grid.spacing)
-        if step > h * (1 + EQUAL_SPACING)
-    )
     note = (
-        f"the spacing differs between axes: the values are resampled along {coarser} to "
-        f"{h:.6g}, the finest, to {' x '.join(map(str, samples.shape))} samples"
+        "the spacing differs between axes: the values are resampled along "
+        f"{' and '.join(sorted(coarser))} to {h:.6g}, the finest, to "
+        f"{' x '.join(map(str, samples.shape))} samples"
     )
     more = {"notes": (*grid.notes, note), "on_sample": tuple(known)}
     return with_fields(grid, samples=samples, spacing=(steps[0], steps[1], steps[2]), **more)
 
 
-def sampled_places(grid: SdfGrid) -> NDArray[np.intp]:
-    """Return the places of ``NEIGHBOURHOOD`` that hold samples, too: across resampled axes."""
-    across = np.ones(27, bool)
-    for axis, known in enumerate(grid.on_sample or ()):
-        if not known.all():
-            across &= NEIGHBOURHOOD[:, axis] == 0
-    return np.flatnonzero(across)
+def which_sampled(grid: SdfGrid, voxel_ijk: IntArray) -> tuple[BoolArray, NDArray[np.intp]]:
+    """Return which values of a cubic grid, at (n, 3) indices, are samples, not interpolated.
 
-
-def on_samples(grid: SdfGrid, voxel_ijk: IntArray) -> BoolArray:
-    """Return which values of a cubic grid, at (n, 3) indices, are samples, not interpolated."""
-    known = np.ones(len(voxel_ijk), bool)
-    for axis, sampled in enumerate(grid.on_sample or ()):
-        known &= sampled[voxel_ijk[:, axis]]
-    return known
+    And the places of ``NEIGHBOURHOOD`` round these that hold samples, too: across resampled axes.
+    """
+    known, across = np.ones(len(voxel_ijk), bool), np.ones(27, bool)
+    for axis, is_sample in enumerate(grid.on_sample or ()):
+        known &= is_sample[voxel_ijk[:, axis]]
+        across &= is_sample.all() | (NEIGHBOURHOOD[:, axis] == 0)
+    return known, np.flatnonzero(across)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..arrays import BoolArray
 from ..errors import GridError
 from ..threads import check_fits
-from .look import Extremes, Look, border_share
+from .look import Extremes, Look, beside_surface, border_share
 from .samples import SampleArray
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
@@ -27,24 +27,15 @@ MOST_KNOWN = 1e-3  # of all samples: more in small regions are a pattern, and st
 BYTES = 24  # of memory per sample
 
 
-class Known(NamedTuple):
-    """Samples whose unknown ones are replaced, and their extremes.
-
-    Where both sides are near, they are continued linearly over ``LAYERS`` unknown ones; farther
-    away they are outside. ``unseen`` is which of them are unknown and in large regions with both
-    sides, or none, beside them; None if none are.
-    """
-
-    samples: NDArray[Any]
-    extremes: Extremes
-    unseen: BoolArray | None
-    why_open: str
-
-
 def with_known(
     samples: SampleArray, look: Look, values: Sequence[float], notes: list[str]
-) -> Known:
-    """Return samples without unknown ones; some ``values`` stand for these, too."""
+) -> tuple[NDArray[Any], BoolArray | None, str]:
+    """Return samples without unknown ones, for which some ``values`` stand, too.
+
+    Where both sides are near, they are continued linearly over ``LAYERS`` unknown samples; farther
+    away these are outside. Also returned are which samples lie in large unknown regions with both
+    sides, or none, beside them, None if none do, and a sentence on these.
+    """
     from scipy import ndimage
 
     check_fits(BYTES * prod(samples.shape), "the grid with unknown samples", "crop it")
@@ -53,11 +44,14 @@ def with_known(
         whole[np.isin(whole, values)] = np.nan
     finite = whole[np.isfinite(whole)]
     low, high = float(finite.min()), float(finite.max())
-    regions, _ = ndimage.label(unknown := np.isnan(whole))
+    regions, number = ndimage.label(unknown := np.isnan(whole))
     size = np.bincount(regions.ravel())
-    positive, negative = _sides_beside(regions, whole, len(size))
-    unsure = positive == negative
-    size[0], unsure[0] = 0, False
+    size[0] = 0
+    positive, negative = (
+        np.isin(np.arange(number + 1), regions[ndimage.binary_dilation(side)])
+        for side in (whole > 0, whole <= 0)
+    )
+    unsure = (positive == negative) & (size > 0)
     count, outer = int(size.sum()), int(size[positive & ~unsure].sum())
     if values:
         notes.append(
@@ -72,41 +66,26 @@ def with_known(
     is_open = unsure & (size > SMALL)
     if size[unsure & ~is_open].sum() > MOST_KNOWN * whole.size:
         is_open = unsure
-    of_side = np.where(positive, high, low).astype(whole.dtype)
-    of_side[unsure] = np.nan
+    of_side = np.where(unsure, np.nan, np.where(positive, high, low)).astype(whole.dtype)
     whole[unknown] = of_side[regions[unknown]]
     whole = np.clip(whole, low, high)
     _continue(whole, (low, high))
     below = border_share(look, lambda x: (x < 0) & ~np.isin(x, values))
     whole[np.isnan(whole)] = low if below > 0.5 else high
     if not is_open.any():
-        return Known(whole, (low, high), None, "")
+        return whole, None, ""
     unseen, count = is_open[regions], int(size[is_open].sum())
     notes.append(
         f"{count:,} of the unknown samples are in regions that touch both sides of the surface: "
         "it is open there"
     )
     which = f" (those that are exactly {named} are taken as such)" if values else ""
-    return Known(whole, (low, high), unseen, _why_open(unseen, count, which))
-
-
-def _why_open(unseen: BoolArray, count: int, which: str) -> str:
-    first = ", ".join(map(str, np.unravel_index(int(unseen.argmax()), unseen.shape)))
-    return (
+    first = ", ".join(map(str, np.argwhere(unseen)[0]))
+    why_open = (
         f"{count:,} samples are unknown{which}, values[{first}] the first, in regions that touch "
         "samples on both sides of the surface, so whether they are inside is unknown"
     )
-
-
-def _sides_beside(regions: NDArray[np.int32], values: NDArray[Any], count: int) -> BoolArray:
-    """Return which regions have positive samples beside them, and which have others, (2, n)."""
-    has = np.zeros((2, count), bool)
-    for axis in range(3):
-        r, v = np.moveaxis(regions, axis, 0), np.moveaxis(values, axis, 0)
-        for region, beside in ((r[1:], v[:-1]), (r[:-1], v[1:])):
-            at = np.nonzero((region > 0) & ~np.isnan(beside))
-            has[(beside[at] <= 0).astype(int), region[at]] = True
-    return has
+    return whole, unseen, why_open
 
 
 def _continue(values: NDArray[Any], limits: Extremes) -> None:
@@ -127,17 +106,12 @@ def _continue(values: NDArray[Any], limits: Extremes) -> None:
 def check_infinite(samples: SampleArray) -> None:
     """Raise GridError if infinite samples are beside the surface."""
     values = np.asarray(samples[:])
-    bad, is_infinite = np.zeros(values.shape, bool), np.isinf(values)
-    for axis in range(3):
-        v, marked, b = (np.moveaxis(x, axis, 0) for x in (values, is_infinite, bad))
-        crossed = (np.sign(v[1:]) * np.sign(v[:-1])) <= 0  # not where one is NaN
-        b[1:] |= crossed & marked[1:]
-        b[:-1] |= crossed & marked[:-1]
-    if bad.any():
-        i, j, k = np.argwhere(bad)[0].tolist()
+    bad = np.argwhere(np.isinf(values) & beside_surface(values))
+    if len(bad):
+        i, j, k = bad[0].tolist()
         raise GridError(
             f"values[{i}, {j}, {k}] is {values[i, j, k]!s}, and a sample beside it has the other "
-            f"sign, as at {np.count_nonzero(bad):,} infinite samples: where the surface passes "
-            "between them is unknown; replace each by a distance of the right sign (the cut-off "
-            "value of its side), or by NaN where nothing was seen"
+            f"sign, as at {len(bad):,} infinite samples: where the surface passes between them is "
+            "unknown; replace each by a distance of the right sign (the cut-off value of its "
+            "side), or by NaN where nothing was seen"
         )

@@ -48,6 +48,7 @@ def label_fields(
     check_fits(need, what, way_out, memory_bound(bound))
     holder, times = np.repeat(own[None], (factor + 1) ** 3, axis=0), np.zeros(len(own), np.int16)
     found = Labelled(grid.shape, factor, index, voxel_ijk, holder, {})
+    steps = Steps(progress, ("network", "nodes") * (count + 1))
     for turn, label in enumerate((*range(1, count + 1), 0)):
         ijk = voxel_ijk[own == label] if label else voxel_ijk[own > 0]
         start = np.maximum(ijk.min(0) - MARGIN, 0)
@@ -57,8 +58,7 @@ def label_fields(
         if not len(ijk):
             continue
         rows = index.find(ijk + start + 1)
-        begin, end = turn / (count + 1), (turn + 1) / (count + 1)
-        steps = Steps(progress, ["network", "nodes"], begin, end)
+        steps.done = turn / (count + 1)  # some are left out
         more: dict[str, Any] = {"extremes": extremes_of_masks(1.0), "field": grid.field}
         band = survey(SdfGrid.trusted(mask_distances(mask), 1.0, **more), threads=threads)
         at = VoxelIndex(ijk, mask.shape).find(band.voxel_ijk)

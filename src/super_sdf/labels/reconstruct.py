@@ -21,7 +21,7 @@ from ..errors import GridError, OptionError, check_modules, seen
 from ..files.grids import read_array
 from ..files.readers import PLACE
 from ..grid.derived import extremes_of_masks
-from ..grid.interpret import mask_field
+from ..grid.interpret import MASK
 from ..grid.look import MOST_LABELS, as_labels, named
 from ..grid.samples import as_samples, check_kind, check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
@@ -126,7 +126,7 @@ def find_image(
         notes.append(f"{said} ({named(cut)})")
     steps = check_spacing(1.0 if spacing is None else spacing)
     more = {"direction": place["direction"], "extremes": extremes_of_masks(min(steps))}
-    grid = SdfGrid.trusted(samples, steps, origin, tuple(notes), **more, field=mask_field(steps))
+    grid = SdfGrid.trusted(samples, steps, origin, tuple(notes), **more, field=MASK)
     volumes = {label: mean_spacing(grid) ** 3 * count for label, count in counts.items()}
     return LabelImage(with_fields(grid, space=place.get("space")), volumes, numbers, missing)
 
@@ -215,7 +215,7 @@ def spared(walls: Walls, distance: float, spacing: float) -> Walls:
 
     held, vertices = np.zeros(len(walls.vertices), bool), walls.vertices
     for turn in range(MOST_REPEATS):
-        made = collapse_edges(walls, held, distance=distance)[0]
+        made = collapse_edges(walls, held, distance)[0]
         places = made.vertices[faults(made, spacing)]
         if not len(places):
             return made

@@ -150,7 +150,7 @@ def load_network(
         format; if the device is "cuda" and CUDA cannot run.
     """
     asked, threads = OPTIONS["device"].check(device), OPTIONS["threads"].check(threads)
-    path, symmetries = find_model(options.check_path(model, "model"), precision)
+    path, symmetries = find_model(options.PATH.check(model, "model"), precision)
     if precision == "int8" and asked == "cuda":
         raise DeviceError("int8 is for the CPU: use --precision float32 with --device cuda")
     used, notes, failure = useful_threads(threads), list[str](), None

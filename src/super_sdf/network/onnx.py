@@ -13,8 +13,8 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, redirect_stdout
-from functools import partial
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ import numpy as np
 
 from ..arrays import FloatArray
 from ..errors import DeviceError, ModelError
-from ..threads import call_beside, count_cores
+from ..threads import count_cores
 
 
 def first_line(error: Exception) -> str:
@@ -86,7 +86,10 @@ def open_session(path: Path, device: str, threads: int) -> ort.InferenceSession:
             raise DeviceError(f"{VERSION} could not start its CUDA provider")
         return session
     try:
-        if OPTIMISED.encode() in path.read_bytes()[-8192:]:  # opens in half the time
+        with path.open("rb") as file:
+            file.seek(-min(path.stat().st_size, 8192), os.SEEK_END)
+            optimised = OPTIMISED.encode() in file.read()
+        if optimised:  # opens in half the time
             options.graph_optimization_level = ort.GraphOptimizationLevel.ORT_DISABLE_ALL
         return ort.InferenceSession(str(path), options, providers=[CPU])
     except Exception as error:  # onnxruntime's errors have no other common base class
@@ -106,7 +109,7 @@ def run(session: ort.InferenceSession, feeds: Mapping[str, Any], device: str = "
     values = np.empty(shape if on_cpu else 0, np.float32)  # in the arena it could not be shrunk
     if not on_cpu or voxels > SMALL or values.size > SMALL_OUTPUT:
         options.add_run_config_entry(SHRINK, "cpu:0" if on_cpu else "gpu:0")
-    with failures_on(device):
+    with failures_on(device), ThreadPoolExecutor(1) as pool:
         binding, output, rows = session.io_binding(), session.get_outputs()[0].name, CUDA_CHUNK
         if on_cpu:
             threads = session.get_session_options().intra_op_num_threads or count_cores()
@@ -123,10 +126,10 @@ def run(session: ort.InferenceSession, feeds: Mapping[str, Any], device: str = "
         chunk = ort.OrtValue.ortvalue_from_numpy(np.array([rows]), "cpu", 0)
         if any(given.name == CHUNK_INPUT for given in session.get_overridable_initializers()):
             binding.bind_ortvalue_input(CHUNK_INPUT, chunk)
-        call_beside(
-            partial(session.run_with_iobinding, binding, options),
-            stop=lambda: setattr(options, "terminate", True),
-        )
+        try:
+            pool.submit(session.run_with_iobinding, binding, options).result()
+        finally:
+            options.terminate = True
         return values if on_cpu else binding.copy_outputs_to_cpu()[0]
 
 

@@ -102,8 +102,8 @@ def packed_mesh(title: str, mesh: Mesh, certificate: Certificate | None = None) 
         from ..simplify.collapsing import collapse_edges
         from ..simplify.walls import Walls
 
-        held = np.zeros(len(mesh.vertices), bool)
-        mesh = collapse_edges(Walls.of(mesh), held, triangles=MOST_TRIANGLES)[0]
+        held, side = np.zeros(len(mesh.vertices), bool), (mesh.area() / len(mesh.faces)) ** 0.5
+        mesh = collapse_edges(Walls.of(mesh), held, side, MOST_TRIANGLES)[0]
         caption += f", shown simplified to {len(mesh.faces):,}"
     vertices = mesh.vertices.astype(np.float64)
     low, high = (vertices.min(0), vertices.max(0)) if len(vertices) else np.zeros((2, 3))

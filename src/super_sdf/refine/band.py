@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError, NoSurfaceError
-from ..grid.samples import let_go, over_three, planes_at_once
-from ..grid.sdf_grid import SdfGrid, on_samples, sampled_places
+from ..grid.samples import let_go, over_three
+from ..grid.sdf_grid import SdfGrid, which_sampled
 from ..threads import over_threads, worthwhile_threads
 from .bounds import FARTHEST, SampleSpheres
 
@@ -110,7 +110,7 @@ def survey(
     low, high, lowest, highest = ends.tolist()
     if grid.on_sample is None:  # what is interpolated beyond the band promises little
         limits = max(low, lowest), min(high, highest)  # at its ends a field may be cut off
-    step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), planes_at_once(grid.samples))
+    step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), 4, 2 * getattr(grid.samples, "beside", 0))
     blocks = [(at, min(at + step, grid.shape[0])) for at in range(0, grid.shape[0], step)]
     for found in over_threads(partial(_find, grid, offset, limits), blocks, threads):
         if offset and not whole:  # distances must not be cut off near it; at 0 none is better
@@ -161,9 +161,9 @@ def _find(
 
     # Samples of a resampled grid are judged by samples alone. Interpolated values that contradict
     # no others count as exact, since thin parts need them (docs/guides/formats.md).
-    lipschitz, sampled = is_lipschitz(patches), on_samples(grid, ijk)
+    lipschitz, (sampled, places) = is_lipschitz(patches), which_sampled(grid, ijk)
     if grid.on_sample is not None:
-        lipschitz[sampled] = is_lipschitz(patches[sampled], sampled_places(grid))
+        lipschitz[sampled] = is_lipschitz(patches[sampled], places)
     # Only a patch that can be distances proves, by a sample far from the surface, that the
     # voxel holds none.
     decoded: BoolArray = (np.abs(patches[:, CENTRE]) <= DECODE_LIMIT) | ~lipschitz | is_spline

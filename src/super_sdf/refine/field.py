@@ -85,14 +85,14 @@ class FineField:
     @cached_property
     def values(self) -> FloatArray:
         """The values of all nodes, each once, (n,) float32 in half voxels; computed when read."""
-        values = np.empty(self.parts.count_nodes(self.factor), np.float32)
+        values = np.empty(self.numbers.max(initial=-1) + 1, np.float32)
         values[self.numbers] = self.blocks.T
         return values
 
     @cached_property
     def node_ijk(self) -> IntArray:
         """The indices of all nodes in the fine lattice, in the order of ``values``, (n, 3)."""
-        ijk = np.empty((self.parts.count_nodes(self.factor), 3), np.int32)
+        ijk = np.empty((self.numbers.max(initial=-1) + 1, 3), np.int32)
         ijk[self.numbers] = self.factor * self.voxel_ijk[:, None] + block_ijk(self.factor)
         return ijk
 

@@ -91,11 +91,6 @@ class SharedParts:
     table: IntArray  # (27, D), neighbour table of the D voxels, -1 where there is no neighbour
     owner: NDArray[np.int8]  # (27, D), of each part, as a place: ``CENTRE`` is the voxel itself
 
-    def count_nodes(self, factor: int) -> int:
-        """Return the number of nodes of all blocks, each once."""
-        owned = np.count_nonzero(self.owner == CENTRE, axis=1).tolist()
-        return sum(count * len(nodes) for count, nodes in zip(owned, nodes_of_part(factor)))
-
 
 def share_parts(table: IntArray) -> SharedParts:
     """Return the owners of all parts, given the voxels' neighbour table, (D, 27) int32."""
@@ -110,12 +105,12 @@ def share_parts(table: IntArray) -> SharedParts:
 def number_parts(parts: SharedParts, factor: int) -> tuple[IntArray, int]:
     """Return the number of the first node of each part, (27, D) int32, and the number of nodes.
 
-    They come in the order of the voxels that own them. OptionError if there are more nodes than
-    32-bit numbers.
+    They come in the order of the voxels that own them. OptionError if 32-bit numbers are too few.
     """
-    count = check_count(parts.count_nodes(factor), "nodes")
+    owned = parts.owner == CENTRE
     size = np.array([[len(nodes)] for nodes in nodes_of_part(factor)], np.int32)
-    ends = np.cumsum((parts.owner == CENTRE) * size, axis=0, dtype=np.int32)
+    count = check_count(int(size[:, 0] @ np.count_nonzero(owned, axis=1)), "nodes")
+    ends = np.cumsum(owned * size, axis=0, dtype=np.int32)
     starts = ends - size + (np.cumsum(ends[-1], dtype=np.int32) - ends[-1])  # after earlier voxels
     for part, sharing in enumerate(SHARING):
         for place in sharing[sharing < CENTRE]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import FloatArray, IntArray
-from ..grid.samples import cropped, in_spacings, over_three
+from ..grid.samples import in_spacings, over_three, read_box
 from ..network.contract import Adapter, decode
 from ..threads import chunks_of
 from .band import Band
@@ -71,7 +71,7 @@ def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
     swing, and nodes are interpolated linearly.
     """
     grid, voxel_ijk, unit = band.grid, band.voxel_ijk[voxels], band.grid.voxel_size / 2
-    samples, shape, sign = grid.samples, np.array(grid.shape), -1 if grid.positive_inside else 1
+    shape = np.array(grid.shape)
     # the weights of samples -2 to 2 for the nodes along an axis, (K + 1, 5)
     far = np.abs(np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3))
     linear = np.clip(1 - far, 0, None).astype(np.float32)
@@ -84,8 +84,7 @@ def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
         ijk = voxel_ijk[rows]
         low, high = np.maximum(ijk.min(0) - BEYOND, 0), np.minimum(ijk.max(0) + BEYOND + 1, shape)
         ijk = ijk - low
-        planes = cropped(samples, low, high)
-        values = np.stack([in_spacings(plane, sign * unit) for plane in planes])
+        values = in_spacings(read_box(grid.samples, low, high), unit)
         found = _evaluate(prefilter(values), ijk + 2, cubic)
         if grid.field.has_jumps:
             rough = roughness(values * np.float32(0.5))[tuple(ijk.T)]

@@ -119,15 +119,18 @@ def spheres_of_band(band: Band, threads: int = 1) -> Spheres:
         slope = (np.copysign(np.float32(1), sample) * patch - np.abs(sample)) / APART
         found = (size >= MAX_DISTANCE) & (size < MAX_DISTANCE + BEYOND) & (slope >= MIN_SLOPE)
         found &= (patch > low) & (patch < high)
-        found &= within(centre[rows, None] + NEIGHBOURHOOD, band.grid.shape)
         row, place = np.nonzero(found)
-        return rows.start + row, place, slope[row, place]
+        kept = within(centre[rows][row] + NEIGHBOURHOOD[place], band.grid.shape)
+        return rows.start + row[kept], place[kept], slope[row, place][kept]
 
     parts = map_chunks(find_beyond, len(exact), 4 * TEMPORARIES, threads)
     row, place, slope = map(np.concatenate, zip(*parts))
     keys = np.ravel_multi_index(tuple((centre[row] + NEIGHBOURHOOD[place]).T), band.grid.shape)
-    order = np.lexsort((-slope, keys))
-    steepest = order[np.diff(keys[order], prepend=-1) > 0]  # of those of the same sample
+    order = np.argsort(keys, kind="stable")  # they are nearly so
+    first = np.flatnonzero(np.diff(keys[order], prepend=-1))  # of those of the same sample
+    most = np.maximum.reduceat(slope[order], first).repeat(np.diff(first, append=len(order)))
+    order = order[slope[order] == most]
+    steepest = order[np.diff(keys[order], prepend=-1) > 0]
     row, place = row[steepest], place[steepest]
     beside = band.patches[exact[:, None], CENTRE + STRIDES * np.array([[[1]], [[-1]]])]
     direction = _unit((beside[0] - beside[1]).T)
@@ -194,7 +197,8 @@ def _turned(look: Callable[..., Look], distance: FloatArray, direction: FloatArr
         turn[rest] = np.where(better, nearer, farther)
         at, gained = rest[better], np.flatnonzero(better)
         for mine, its in zip(found, new):
-            mine[..., at] = its[..., gained]
+            for line, new_line in zip(np.atleast_2d(mine), np.atleast_2d(its)):  # fast
+                line[at] = new_line[gained]
     return found
 
 
@@ -291,7 +295,8 @@ def prolong(values: FloatArray, cells: int, finer: int) -> FloatArray:
     low, rest = np.divmod(np.arange(finer + 1) * cells, finer)
     block = values.reshape(*(cells + 1,) * 3, -1)
     for axis in range(3):
-        share = (rest / finer).astype(np.float32).reshape(-1, *(1,) * (3 - axis))
-        below = block.take(low, axis)
-        block = below + (block.take(np.minimum(low + 1, cells), axis) - below) * share
+        lines = np.moveaxis(block, axis, 0)
+        steps, shares = np.diff(lines, axis=0), (rest / finer).astype(np.float32)
+        nodes = (lines[i] + steps[i] * x if x else lines[i] for i, x in zip(low, shares))
+        block = np.stack(list(nodes), axis)
     return block.reshape(len(block) ** 3, -1)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from itertools import product
 from threading import Lock
 from typing import Any
@@ -24,7 +25,7 @@ import numpy as np
 from ..arrays import BoolArray, face_normals, length
 from ..surface.mesh import Mesh, row_keys
 from ..truth.solid import Points, Solid, smallest_angles
-from .measuring import Original, mean_side
+from .measuring import Original, find
 from .walls import Walls, irregular, labels_apart
 
 ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
@@ -32,8 +33,7 @@ ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
 # the error, those of the second do at some places, and leave a fifth fewer triangles.
 PLANE_DISTANCES = (1.0,), (1.4, 1.4, 1.4), (1.7, 1.7)
-ROUNDS = 30, 3.0  # of the threshold, and its rise; from more rounds, meshes get no smaller
-FEW_ROUNDS, LARGE = (8, 5.0), 1 << 12  # nearly as well, from this many triangles on
+ROUNDS, RISE = 15, 4.0  # of the threshold; fewer leave exact planes in pieces
 FEW_SLIVERS = 0.002  # of the triangles, which stay
 THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
 MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
@@ -52,7 +52,8 @@ class Unsimplified:
         self.walls, self.originals = walls, [Original(mesh) for mesh, _ in labels_apart(walls)]
         alone = len(self.originals) == 1
         self.solid = self.originals[0].solid if alone else Solid(walls)
-        self.irregular = irregular(walls)[0]
+
+    irregular = cached_property(lambda self: irregular(self.walls)[0])
 
 
 def within(of: Unsimplified, error: float) -> Walls | None:
@@ -111,7 +112,7 @@ def collapsed(
             held[result.faces[held[result.faces].any(1)]] = True
             kept.append(np.asarray(held[result.faces].all(1)))
             for distance in steps:
-                result, held = collapse_edges(result, held, distance=distance * unit)
+                result, held = collapse_edges(result, held, distance * unit)
             if number == len(passes) - 1:
                 result = turn_edges(result, held, LOW * error)
             stages.append((result, Solid(result)))
@@ -143,47 +144,43 @@ def examine(of: Unsimplified, result: Walls, solid: Solid, error: float) -> Poin
         labels = [Solid(mesh) for mesh, _ in labels_apart(result)]
     if len(labels) < len(of.originals) or not all(len(label.mesh.faces) for label in labels):
         return None
-    found = irregular(result)[0]
-    made = found[~np.isin(row_keys(found), row_keys(of.irregular))]
-    lost = of.irregular[~np.isin(row_keys(of.irregular), row_keys(found))]
-    lost = lost[(lost[:, :3] != lost[:, 3:]).any(1)]  # open edges that are none any more
-    wrong = [made.reshape(-1, 3), lost.reshape(-1, 3)]
-    if len(pairs := solid.intersecting()):
+    wrong = [one.compare(label, error)[0] for one, label in zip(of.originals, labels)]
+    if len(found := irregular(result)[0]):
+        wrong.append(found[~np.isin(row_keys(found), row_keys(of.irregular))].reshape(-1, 3))
+    if not any(map(len, wrong)) and len(pairs := solid.intersecting()):  # these take long to find
         corners = solid.mesh.vertices[solid.mesh.faces[pairs]].reshape(-1, 9)
         old = of.solid.mesh.vertices[of.solid.mesh.faces].reshape(-1, 9)
         is_new = ~np.isin(row_keys(corners), row_keys(old)).reshape(-1, 2).all(1)
         corners = corners.reshape(-1, 2, 3, 3)[is_new]
         wrong += [corners.reshape(-1, 3), corners.mean(2).reshape(-1, 3)]
-    wrong += [one.compare(label, error)[0] for one, label in zip(of.originals, labels)]
     if len(far := np.concatenate(wrong)):
         return far
-    both = [(one.solid, label.mesh) for one, label in zip(of.originals, labels)]
-    others = [each for each in both if topology(each[0].mesh) != topology(each[1])]
-    gone = np.concatenate([far, *(lost_places(*each) for each in others)])
-    return gone if len(gone) or not others else None
+    lost = [lost_places(one.solid, label.mesh) for one, label in zip(of.originals, labels)]
+    gone = np.concatenate([far, *(places for places in lost if places is not None)])
+    return gone if len(gone) or all(places is None for places in lost) else None
 
 
-def topology(mesh: Mesh) -> tuple[int, int]:
-    """Return the number of components, and twice the Euler characteristic of a closed mesh."""
-    return mesh.components()[0], 2 * len(np.unique(mesh.faces)) - len(mesh.faces)
-
-
-def lost_places(original: Solid, mesh: Mesh) -> Points:
-    """Return the vertices of those components of a mesh of which nothing is left."""
-    component = original.mesh.components()[1][original.mesh.faces[:, 0]]
-    roots = np.unique(mesh.components()[1][mesh.faces[:, 0]])
-    found = component[original.nearest(mesh.vertices[roots])[1]]
-    return original.mesh.vertices[original.mesh.faces[~np.isin(component, found)]].reshape(-1, 3)
+def lost_places(original: Solid, after: Mesh) -> Points | None:
+    """Return the vertices of components of which nothing is left; None if the topology is equal."""
+    before = original.mesh
+    (count, root), (left, roots) = before.components(), after.components()
+    euler = [2 * len(np.unique(each.faces)) - len(each.faces) for each in (before, after)]
+    if count == left and euler[0] == euler[1]:
+        return None
+    component = root[before.faces[:, 0]]
+    some = np.unique(roots[after.faces[:, 0]])
+    found = component[original.nearest(after.vertices[some])[1]]
+    return before.vertices[before.faces[~np.isin(component, found)]].reshape(-1, 3)
 
 
 def collapse_edges(
-    walls: Walls, held: BoolArray, *, distance: float = 0.0, triangles: float = 0
+    walls: Walls, held: BoolArray, distance: float, triangles: int = 0
 ) -> tuple[Walls, BoolArray]:
     """Collapse the edges whose new vertex is within a distance of the planes around it.
 
-    That is the root of the sum of squared distances, in world units. Or, without a distance, those
-    until no more than a number of triangles is left, unless the shape does not allow it. The
-    vertices ``held``, (n,), stay where they are, and open edges; also returned is which are held.
+    That is the root of the sum of squared distances. With a number of triangles, edges are
+    collapsed until no more are left; the distance is then about a side of them. The vertices
+    ``held``, (n,), stay where they are, and open edges; also returned is which are held.
 
     pyfqmr keeps open edges and the order of triangles. So a vertex is held by a triangle of its
     own, and after the triangles of each pair of labels comes one at a vertex apart from all others.
@@ -195,9 +192,8 @@ def collapse_edges(
     pair = walls.sides @ np.array([1 << 16, 1])
     order = np.argsort(pair, kind="stable")
     last = np.flatnonzero(np.diff(pair[order], append=-1))
-    unit = distance or mean_side(walls)  # which pyfqmr's thresholds are in
     middle = walls.vertices.mean(0, dtype=np.float64)
-    scaled = (walls.vertices - middle) / unit
+    scaled = (walls.vertices - middle) / distance  # which pyfqmr's thresholds are in
     scaled = np.append(scaled, [scaled.max(0) + 2], axis=0)
     pins = np.flatnonzero(held)
     corner = np.append(np.full(len(last), len(held)), pins)
@@ -205,11 +201,10 @@ def collapse_edges(
     lone = np.stack([corner, *(len(scaled) + np.arange(len(tips)).reshape(2, -1))], 1)
     faces = np.insert(walls.faces[order], last + 1, lone[: len(last)], axis=0)
     faces = np.concatenate([faces, lone[len(last) :]]).astype(np.int32)
-    options: dict[str, Any] = {"target_count": int(triangles) + len(lone)}
-    if distance:
-        rounds, rise = FEW_ROUNDS if len(walls.faces) > LARGE else ROUNDS
-        options = {"target_count": 0, "max_iterations": rounds}
-        options |= {"alpha": rounds**-rise, "K": 1, "aggressiveness": rise}  # to the distance
+    options: dict[str, Any] = {"target_count": triangles + len(lone)}
+    if not triangles:  # but a threshold that rises to the distance
+        options = {"target_count": 0, "max_iterations": ROUNDS}
+        options |= {"alpha": ROUNDS**-RISE, "K": 1, "aggressiveness": RISE}
     with ONE_AT_A_TIME:
         library = Simplify()
         library.setMesh(np.concatenate([scaled, tips]), faces)
@@ -219,9 +214,9 @@ def collapse_edges(
     faces, pinned = np.split(faces.astype(np.int32), [len(faces) - len(pins)])
     is_mark = faces[:, 0] == len(moved)
     sides = walls.sides[order[last]][np.cumsum(is_mark)[~is_mark]]
-    vertices = (moved * unit + middle).astype(walls.vertices.dtype)
-    _, same, old = np.intersect1d(row_keys(moved), row_keys(scaled), return_indices=True)
-    vertices[same] = walls.vertices[old]
+    vertices = (moved * distance + middle).astype(walls.vertices.dtype)
+    old = find(row_keys(moved), row_keys(scaled[:-1]))
+    vertices[old >= 0] = walls.vertices[old[old >= 0]]
     held = np.zeros(len(moved), bool)
     held[pinned[:, 0]] = True
     return Walls(vertices, faces[~is_mark], sides), held
@@ -253,7 +248,7 @@ def turn_edges(walls: Walls, held: BoolArray, distance: float) -> Walls:
         after, before = face_normals(points, new), normals[other].repeat(2, 0)
         steady = (after * before).sum(1) > STEADY * length(after) * length(before)
         edges = start * count + np.roll(faces, -1, axis=1).ravel()
-        free = ~np.isin(c * count + d, edges) & ~np.isin(d * count + c, edges)
+        free = (find(c * count + d, edges) < 0) & (find(d * count + c, edges) < 0)
         taken = np.zeros(count, bool)
         for row in np.flatnonzero(better & steady.reshape(-1, 2).all(1) & free):
             quad = new[2 * row : 2 * row + 2]

@@ -8,7 +8,7 @@ nearest to triangles that meet at an angle. Each distance is exact, from a point
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,8 @@ from ..truth.solid import Points, Solid
 
 Keys = NDArray[np.uint64]
 BETWEEN = 0.97  # of the error, which no measured point exceeds: others may be a little farther away
-SHARES = np.array([[[1]], [[2]], [[4]], [[5]]]) / 6  # where an edge is measured beside its middle,
-SUSPECT = 0.35  # if that is as far away as this share of the limit
-NEAR = 0.6  # of the limit, from which on edges of the simplified mesh get four times the points
+NEAR = 0.6  # of the limit, from which on more is measured round a point on an edge:
+THIRDS = np.array([[-2], [-1], [1], [2]]) / 3  # of the way to the next point
 
 
 class Deviation(NamedTuple):
@@ -41,21 +40,19 @@ class Original:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        self.solid, self.side = Solid(mesh), mean_side(mesh)
+        self.solid = Solid(mesh)
         self.distance = np.full(len(mesh.vertices), np.inf)
         self.near = np.zeros(len(mesh.vertices), np.uint64)  # key of the nearest triangle
         start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
         self.edges = np.stack([start, end])[:, start < end]
+        self.side = float(length(np.subtract(*self.solid.mesh.vertices[[start, end]])).mean())
         # of the edges: keys of what their ends and middles are near, if within the limit; distances
         self.seen = np.zeros((3, self.edges.shape[1]), np.uint64)
         self.off = np.zeros(self.edges.shape[1])
         self.keys, self.back = np.zeros(1, np.uint64), np.full((2, 1), np.inf)  # largest, mean
 
     def compare(self, other: Solid, error: float) -> tuple[Points, Deviation]:
-        """Return points near this mesh, (n, 3), where the two are farther apart than an error.
-
-        Without bounds of the error, the points mean nothing.
-        """
+        """Return points near this mesh, (n, 3), where the two are farther apart than an error."""
         limit, vertices, faces = BETWEEN * error, self.solid.mesh.vertices, self.solid.mesh.faces
         keys = row_keys(other.mesh.vertices[other.mesh.faces].reshape(-1, 9))
         face = find(self.near, keys)
@@ -66,7 +63,7 @@ class Original:
         on_edges = self._bent_edges(other, keys, face, bar)
         feet, *back = self._back(other, keys, limit)
         area = length(face_normals(vertices, faces))
-        mean = float(self.distance[faces].mean(1) @ area / area.sum())
+        mean = float((self.distance[faces].mean(1) * area).sum() / area.sum())
         largest = float(max(self.distance.max(), self.off.max(initial=0)))
         wrong = np.concatenate([vertices[self.distance > limit], on_edges, feet])
         return wrong, Deviation(largest, mean, *back)
@@ -74,29 +71,28 @@ class Original:
     def _bent_edges(self, other: Solid, keys: Keys, face: NDArray[np.intp], limit: float) -> Points:
         """Measure edges that may be farther away than their ends; return points beyond a limit.
 
-        With its ends on two triangles that share an edge, an edge of length L is at most L / 4
-        times the largest angle away that one of these makes with those beside it. ``face`` is the
-        triangle that each vertex is nearest to.
+        With its ends near two triangles that share an edge, an edge of length L is at most L / 4
+        times the angle between these farther away. ``face`` is the triangle nearest to each vertex.
         """
         at_ends = self.near[self.edges]
-        self.off[at_ends[0] == at_ends[1]] = 0
-        is_known = (at_ends == self.seen[:2]).all(0) & np.isin(self.seen[2], keys)
-        some = np.flatnonzero((at_ends[0] != at_ends[1]) & ~is_known)
-        one, next_one = face[self.edges[:, some]]
-        normals = unit(face_normals(other.mesh.vertices / self.side, other.mesh.faces))
-        beside = other.mesh.pair_edges()[0].reshape(-1, 3) // 3
-        angle = length(normals[:, None] - normals[beside]).max(1)
+        apart = at_ends[0] != at_ends[1]
+        self.off[~apart] = 0
+        some = np.flatnonzero(apart)
+        is_known = (at_ends[:, some] == self.seen[:2, some]).all(0)
+        some = some[~is_known | (find(self.seen[2, some], keys) < 0)]
         low, high = self.solid.mesh.vertices[self.edges[:, some]]
-        rise = length(high - low) * np.maximum(angle[one], angle[next_one]) / 4
+        corners = other.mesh.faces[face[self.edges[:, some]]]  # (2, n, 3)
+        normals = unit(face_normals(other.mesh.vertices, corners.reshape(-1, 3))).reshape(2, -1, 3)
+        rise = length(high - low) * length(normals[1] - normals[0]) / 4
         bent = self.distance[self.edges[:, some]].max(0) + rise > limit
-        bent |= (beside[one] != next_one[:, None]).all(1)
+        bent |= (corners[0, :, None] == corners[1, ..., None]).sum((1, 2)) < 2
         self.off[some], self.seen[:, some] = 0, at_ends[[0, 1, 0]][:, some]
         some, low, high = some[bent], low[bent], high[bent]
         middles = (low + high) / 2
         off, nearest, _ = other.nearest(middles)
-        more = (off > SUSPECT * limit) & (off <= limit)
-        points = low[more] + SHARES * (high[more] - low[more])  # (4, n, 3)
-        beside_middle = other.distance(points.reshape(-1, 3)).reshape(len(SHARES), -1)
+        more = (off > NEAR * limit) & (off <= limit)
+        points = middles[more] + THIRDS[..., None] * (middles[more] - low[more])  # (4, n, 3)
+        beside_middle = other.distance(points.reshape(-1, 3)).reshape(len(THIRDS), -1)
         wrong = middles[off > limit], points[beside_middle > limit]
         off[more] = np.maximum(off[more], beside_middle.max(0))
         self.off[some], self.seen[2, some] = off, keys[nearest] * (off <= limit)
@@ -104,46 +100,43 @@ class Original:
 
     def _back(self, other: Solid, keys: Keys, limit: float) -> tuple[Points, float, float]:
         """Return the feet on this mesh of points of the other that are too far, and distances."""
-        vertices, faces, count = other.mesh.vertices, other.mesh.faces, len(keys)
+        vertices, faces = other.mesh.vertices, other.mesh.faces
         sides = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), 1)
-        number = sides.astype(np.int64) @ [len(vertices), 1]
+        number = sides[:, 0].astype(np.int64) * len(vertices) + sides[:, 1]
         _, first, edge = np.unique(number, return_index=True, return_inverse=True)
-        ends = vertices[sides[first]]
-        places = np.concatenate([keys, row_keys(ends.reshape(-1, 6))])  # triangles, then edges
+        low, high = vertices[sides[first].T]
+        kinds = keys, row_keys(vertices), row_keys(np.concatenate([low, high], 1))
+        ends, places = np.cumsum([len(kind) for kind in kinds]), np.concatenate(kinds)
         at = find(places, self.keys)
         is_known = (at >= 0) & (self.back[0, at] <= limit)
         known, new = np.where(is_known, self.back[:, at], 0), np.flatnonzero(~is_known)
-        owner, edges = new[new < count], new[new >= count]
-        points, step = vertices[faces[owner]].mean(1), self.side / 2
-        wrong, sums = [np.zeros((0, 3))], np.zeros((2, len(places)))
-        for _ in range(2):  # both ends, and points between them no farther apart than a step
-            low, high = ends[edges - count].transpose(1, 0, 2)
-            parts = np.maximum(np.ceil(length(high - low) / step).astype(np.int64), 3)
-            row = np.repeat(np.arange(len(edges)), parts + 1)
-            share = (np.arange(len(row)) - np.searchsorted(row, row)) / parts[row]
-            points = np.concatenate([points, low[row] + share[:, None] * (high - low)[row]])
-            owner = np.append(owner, edges[row])
-            found, _, feet = self.solid.nearest(points)
-            wrong.append(feet[found > limit])
-            np.maximum.at(known[0], owner, found)
-            sums += [np.bincount(owner, some, len(places)) for some in (found, None)]
-            edges = edges[(known[0, edges] > NEAR * limit) & (known[0, edges] <= limit)]
-            points, owner, step = points[:0], owner[:0], step / 4
-        known[1, new] = sums[0, new] / sums[1, new]
+        # points: centroids, vertices, and the middles of equal parts of edges
+        triangle, vertex, some = np.split(new, np.searchsorted(new, ends[:2]))
+        low, step = low[some - ends[1]], (high - low)[some - ends[1]]
+        parts = np.maximum(np.ceil(length(step) / (self.side / 2)).astype(np.int64), 3)
+        row, step = np.repeat(np.arange(len(some)), parts), step / parts[:, None]
+        turn = np.arange(len(row)) - np.searchsorted(row, row) + 0.5
+        on_edges = low[row] + turn[:, None] * step[row]
+        points = vertices[faces[triangle]].mean(1), vertices[vertex - ends[0]], on_edges
+        owner = np.concatenate([triangle, vertex, some[row]])
+        off, _, feet = self.solid.nearest(np.concatenate(points))
+        known[1, new] = (np.bincount(owner, off) / np.maximum(np.bincount(owner), 1))[new]
+        near = np.flatnonzero((off > NEAR * limit) & (off <= limit) & (owner >= ends[1]))
+        part = near - len(triangle) - len(vertex)
+        turn = (turn[part] + THIRDS).clip(0, parts[row[part]])  # (4, n)
+        finer = low[row[part]] + turn[..., None] * step[row[part]]
+        more, _, more_feet = self.solid.nearest(finer.reshape(-1, 3))
+        off, feet = np.append(off, more), np.concatenate([feet, more_feet])
+        np.maximum.at(known[0], np.append(owner, np.tile(owner[near], 4)), off)
         self.keys, self.back = places, known
-        mean = known[1, :count] / 2 + known[1, count + edge.reshape(-1, 3)].mean(1) / 2
+        mean = known[1, : len(faces)] / 2 + known[1, ends[1] + edge.reshape(-1, 3)].mean(1) / 2
         area = length(face_normals(vertices, faces))
-        return np.concatenate(wrong), float(known[0].max()), float(mean @ area / area.sum())
+        mean = float((mean * area).sum() / area.sum())
+        return feet[off > limit], float(known[0].max()), mean
 
 
-def find(keys: Keys, among: Keys) -> NDArray[np.intp]:
+def find(keys: NDArray[Any], among: NDArray[Any]) -> NDArray[np.intp]:
     """Return where keys stand among others, (n,); -1 where they do not."""
     order = np.argsort(among)
     at = order[np.searchsorted(among[order], keys).clip(max=len(among) - 1)]
     return np.where(among[at] == keys, at, -1)
-
-
-def mean_side(mesh: Mesh) -> float:
-    """Return the mean length of the first sides of all triangles."""
-    start, end = mesh.vertices.astype(np.float64)[mesh.faces[:, :2].T]
-    return float(length(end - start).mean())

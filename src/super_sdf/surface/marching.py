@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from ..arrays import CENTRE, CORNERS, NEIGHBOURHOOD, STRIDES, BoolArray, FloatArray, IntArray
 from ..refine.field import FineField
 from ..refine.nodes import block_ijk, part_of_node
-from ..threads import map_chunks, over_threads, rows_in_chunk, worthwhile_threads
+from ..threads import chunks_of, map_chunks, over_threads, worthwhile_threads
 from .mesh import CLEARANCE
 
 # Nodes beyond the grid's border (of a cap, see ``cap.close``) are placed this far outside it,
@@ -238,7 +238,7 @@ def connect(field: FineField, crossings: Crossings, threads: int = 1) -> IntArra
     faces = np.empty((int(end[-1]) if len(end) else 0, 3), np.int32)
     plane = field.voxel_ijk[:, 0]
     planes = np.append(np.flatnonzero(np.diff(plane, prepend=plane[:1] - 1)), len(plane))
-    steps = np.arange(0, len(plane), rows_in_chunk(len(field.blocks)))
+    steps = [rows.start for rows in chunks_of(len(plane), len(field.blocks))]
     cuts = np.unique(np.append(np.searchsorted(planes, steps), len(planes) - 1))
 
     def fill(run: tuple[int, int]) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import cross, length
+from ..arrays import length
 from ..errors import FileError, MeshError
 from ..files.formats import check_regular_file
 from ..surface.mesh import Mesh
@@ -147,7 +147,7 @@ def smallest_angles(corners: Points) -> Distances:
     """Return the smallest angle of each triangle, (m,), in degrees; corners are (m, 3, 3)."""
     a, b, c = np.moveaxis(corners, 1, 0)
     sides = np.sort(length(corners - np.roll(corners, 1, axis=1)), axis=1)
-    sine = length(cross(b - a, c - a)) / np.maximum(sides[:, 1] * sides[:, 2], 1e-300)
+    sine = length(np.cross(b - a, c - a)) / np.maximum(sides[:, 1] * sides[:, 2], 1e-300)
     return np.degrees(np.arcsin(np.minimum(sine, 1)))
 
 

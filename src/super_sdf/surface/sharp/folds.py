@@ -23,7 +23,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import NEIGHBOURHOOD, BoolArray, Index, Vectors, cross, dot, length, sums_at, unit
+from ...arrays import NEIGHBOURHOOD, BoolArray, Index, Vectors, dot, length, sums_at, unit
 from .patches import Patches, Placed, nth_of_run, triangles_of
 
 # Vertices of triangles that intersect are in cells at most 3 apart: none is more than half a cell
@@ -96,7 +96,7 @@ def find_suspects(patches: Patches, placed: Placed, lattice: Vectors) -> BoolArr
     changed = np.concatenate([moved, np.ones(len(placed.feature), bool)])
     _, triangles = triangles_of(patches, placed, _having(patches, placed, changed))
     a, b, c = (placed.points.take(corner, 0) for corner in triangles.T)
-    normals = np.tile(unit(cross(b - a, c - a)), (3, 1))
+    normals = np.tile(unit(np.cross(b - a, c - a)), (3, 1))
     suspect = _turns(triangles.T.ravel(), normals, len(changed))
     nodes, node = np.unique(keys_of(np.rint(lattice)), return_inverse=True)
     sheets = _turns(node, placed.normal, len(nodes))[node]
@@ -195,7 +195,7 @@ def intersecting(points: Vectors, first: Index, second: Index) -> tuple[Index, I
 def _heights_over(points: Vectors, first: Index, second: Index) -> Vectors:
     """Return how far over the first triangles the second's corners are, (3, m); NaN if common."""
     a, b, c = (points.take(corner, 0) for corner in first.T)
-    normals = unit(cross(b - a, c - a))
+    normals = unit(np.cross(b - a, c - a))
     heights = np.stack([dot(points.take(corner, 0) - a, normals) for corner in second.T])
     heights[np.any(second.T[:, None] == first.T, axis=1)] = np.nan
     return heights
@@ -212,7 +212,7 @@ def _pierced(points: Vectors, first: Index, second: Index) -> BoolArray:
         start, end = points[second[rows, k]], points[second[rows, k - 1]]
         way, slack = unit(end - start), slack[rows]
         a, b, c = (points[corner] - start for corner in first[rows].T)
-        beyond = [dot(way, cross(p, unit(q - p))) for p, q in ((a, b), (b, c), (c, a))]
+        beyond = [dot(way, np.cross(p, unit(q - p))) for p, q in ((a, b), (b, c), (c, a))]
         found[rows] |= np.minimum.reduce(beyond) > -slack
         found[rows] |= np.maximum.reduce(beyond) < slack
     return found

@@ -32,7 +32,6 @@ from ...arrays import (
     IntArray,
     Numbers,
     Vectors,
-    cross,
     dot,
     unit,
 )
@@ -122,8 +121,8 @@ class Patches:
 
     def having(self, chosen: BoolArray) -> BoolArray:
         """Return which patches have some of the chosen crossings, (P,)."""
-        found = np.append(chosen, False).take(self.crossing, mode="wrap")
-        return cast(BoolArray, found.any(1))
+        found = np.append(chosen, False)  # -1 reads the last; by columns, as rows are short
+        return cast(BoolArray, np.logical_or.reduce([found.take(c) for c in self.crossing.T]))
 
     def dilate(self, chosen: BoolArray | Index, rings: int, count: int) -> BoolArray:
         """Return which of ``count`` crossings are within some rings of patches of chosen ones."""
@@ -131,7 +130,7 @@ class Patches:
         for _ in range(rings):
             near[self.crossing[chosen]] = True
             near[-1] = False
-            chosen = cast(BoolArray, near.take(self.crossing, mode="wrap").any(1))
+            chosen = self.having(near[:-1])
         return near[:-1]
 
 
@@ -192,7 +191,7 @@ class Placed:
     def facing(self, corners: tuple[Index, Index, Index], *crossings: Index) -> Numbers:
         """Return the least cosine between triangles, corners (t,) each, and planes of crossings."""
         a, b, c = (self.points.take(corner, 0) for corner in corners)
-        normal = unit(cross(b - a, c - a))
+        normal = unit(np.cross(b - a, c - a))
         least = [dot(normal, self.normal.take(at, 0)) for at in crossings]
         return least[0] if len(least) == 1 else np.minimum(*least)
 
