@@ -17,24 +17,21 @@ value (McShane, Whitney), unless they contradict each other, as noise does.
 from __future__ import annotations
 
 from itertools import product
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, IntArray, Triple
+from ..arrays import BoolArray, FloatArray, Triple
 from .look import Extremes, Floats
 from .samples import MadePlanes, SampleArray, SamplePlanes, in_spacings, over_three
 
-REACH = (
-    4  # voxels; patches are clipped to 3 (``refine.band.PATCH_LIMIT``), and half of one goes off
-)
+REACH = 4  # voxels; patches are clipped to 3 (``refine.band.PATCH_LIMIT``), half of one goes off
 
 FEET_REACH = 3  # samples from one up to which others are filled in with the help of its foot
 NO_FOOT = 2.6  # voxels: the distance of a sample without a foot point near it
 LEAST_SLOPE = 0.3  # of a sample whose foot point is used
 DISC = 0.2  # voxels
-ROUNDS = 2
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
 
 NEAR = 3.5  # new spacings from the surface, up to which values are kept within their bounds
@@ -46,8 +43,6 @@ EXTRA = 2  # samples beyond a cell, on either side, that its slopes depend on
 ON_SAMPLE = 1e-3  # spacings from a sample, up to which a new sample takes its value
 MOST = 1e12  # spacings: larger values are cut off, so that squares do not overflow
 PLACES = 32  # between samples that are worked on at a time
-
-Steps: TypeAlias = tuple[float, float]
 
 
 def mask_distances(inside: BoolArray) -> FloatArray:
@@ -94,12 +89,11 @@ def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> Mad
     h = min(spacing)
     low, high = (limit / h for limit in limits)
     steps = np.array(spacing) / h
-    beside = ROUNDS * (int(FEET_REACH * steps.max() / steps.min()) + 1)
-
-    def make(planes: NDArray[Any]) -> Floats:
-        return fill_in(in_spacings(planes, h), low, high, steps).astype(float) * h
-
-    return MadePlanes(values, make, beside)
+    return MadePlanes(
+        values,
+        lambda planes: fill_in(in_spacings(planes, h), low, high, steps).astype(float) * h,
+        beside=2 * (int(FEET_REACH * steps.max() / steps.min()) + 1),  # once for each round
+    )
 
 
 def fill_in(values: FloatArray, low: float, high: float, steps: Floats) -> FloatArray:
@@ -111,44 +105,49 @@ def fill_in(values: FloatArray, low: float, high: float, steps: Floats) -> Float
     from scipy.spatial import cKDTree
 
     cut = (values <= low * WITHIN) | (values >= high * WITHIN)
-    known, missing = (np.argwhere(x).astype(np.int32) for x in (~cut, cut))
+    known, missing = (np.argwhere(x) * steps for x in (~cut, cut))
     distances, signed, far = values[~cut], values[cut], NO_FOOT * float(steps.max())
     least = np.where(signed > 0, high, -low)
-    hidden = cut
-    for _ in range(ROUNDS):
-        gradient = _gradient(values, known, steps, hidden)
+    for hidden in (cut, np.zeros_like(cut)):
+        gradient = _gradient(values, steps, hidden)[~cut]
         slope = np.sqrt((gradient**2).sum(1))
         steep = slope > LEAST_SLOPE
         normal = gradient[steep] / slope[steep, None]
-        feet = known[steep] * steps - distances[steep, None] * normal
+        feet = known[steep] - distances[steep, None] * normal
         found = np.full(len(missing), far)
         if len(feet):
-            apart, which = cKDTree(feet).query(missing * steps, distance_upper_bound=far)
+            apart, which = cKDTree(feet).query(missing, distance_upper_bound=far)
             near = np.flatnonzero(np.isfinite(apart))
-            away = missing[near] * steps - feet[which[near]]
-            height = (away * normal[which[near]]).sum(1)
+            height = ((missing[near] - feet[which[near]]) * normal[which[near]]).sum(1)
             aside = np.sqrt(np.maximum(apart[near] ** 2 - height**2, 0))
             found[near] = np.hypot(height, np.maximum(aside - DISC, 0))
-        values, hidden = values.copy(), np.zeros_like(cut)
+        values = values.copy()
         values[cut] = np.copysign(np.maximum(found, least), signed)
     return values
 
 
-def _gradient(values: FloatArray, at: IntArray, steps: Floats, hidden: BoolArray) -> Floats:
-    """Return central differences at samples, (n, 3); one-sided ones beside ``hidden`` samples.
+def _gradient(values: FloatArray, steps: Floats, hidden: BoolArray) -> Floats:
+    """Return central differences, (nx, ny, nz, 3); one-sided ones beside ``hidden`` samples.
 
     Amid two hidden ones, the larger difference is a lower bound.
     """
-    around, unknown = np.pad(values, 1, mode="edge"), np.pad(hidden, 1, constant_values=True)
-    gradient, centre, nth = np.empty((len(at), 3)), values[tuple(at.T)], np.arange(len(at))
-    for axis, step in enumerate(np.eye(3, dtype=int)):
-        before, after = tuple((at + 1 - step).T), tuple((at + 1 + step).T)
-        rises = np.stack([centre - around[before], around[after] - centre])
-        known = ~np.stack([unknown[before], unknown[after]])
-        larger = rises[np.abs(rises).argmax(0), nth]
-        mean = (rises * known).sum(0) / np.maximum(known.sum(0), 1)
-        gradient[:, axis] = np.where(known.any(0), mean, larger) / steps[axis]
+    gradient = np.empty((*values.shape, 3))
+    for axis, step in enumerate(steps):
+        (behind, ahead), numbers = _slopes_beside(values, axis, 1.0), np.arange(values.shape[axis])
+        no_behind = hidden.take(np.abs(numbers - 1), axis)
+        no_ahead = np.flip(np.flip(hidden, axis).take(np.abs(numbers - 1), axis), axis)
+        larger = np.where(np.abs(ahead) > np.abs(behind), ahead, behind)
+        one = np.where(no_ahead, np.where(no_behind, larger, behind), ahead)
+        rise = np.where(no_ahead | no_behind, one, (ahead + behind) / 2)
+        gradient[..., axis] = rise / step
     return gradient
+
+
+def _slopes_beside(values: NDArray[Any], axis: int, step: float) -> tuple[Floats, Floats]:
+    """Return the slopes along an axis before and after each sample; at an end they are equal."""
+    slopes = np.diff(values, axis=axis) / step
+    first, last = slopes.take([0], axis), slopes.take([-1], axis)
+    return np.concatenate([first, slopes], axis), np.concatenate([slopes, last], axis)
 
 
 # Finer planes along an axis
@@ -169,8 +168,7 @@ class Resampled(SamplePlanes):
         self, source: SampleArray, spacing: Triple, axis: int, step: float, level: float = 0.0
     ) -> None:
         self.source, self.axis, self.step, self.level = source, axis, step, level
-        self.h, (a, b) = spacing[axis], np.delete(spacing, axis).tolist()
-        self.across: Steps = (a, b)
+        self.h, self.across = spacing[axis], np.delete(spacing, axis).tolist()
         # The last one lies as near to the last sample as it can, and takes its value beyond.
         count = source.shape[axis]
         places = np.arange(round((count - 1) * self.h / step) + 1) * (step / self.h)
@@ -199,22 +197,18 @@ class Resampled(SamplePlanes):
 
     def _along(self, lines: Floats, places: Floats) -> Floats:
         """Return the values at places, (m, p, q), along lines of samples, (n, p, q)."""
-        first, last = lines[0] - lines[1], lines[-1] - lines[-2]
-        before, after = [lines[0] + 2 * first, lines[0] + first], [lines[-1] + last] * 2
-        after[1] = after[1] + last
-        around = np.concatenate([before, lines, after])  # continued linearly by two
         wide = np.pad(lines, ((0, 0), *((ACROSS, ACROSS),) * 2), constant_values=np.nan)
-        slopes, values = self._slopes(lines, around), np.empty((len(places), *lines.shape[1:]))
+        values, beside = np.empty((len(places), *lines.shape[1:])), _slopes_beside(lines, 0, 1.0)
+        rises = self._rises(lines, *beside)
         for start in range(0, len(places), PLACES):
             some = slice(start, start + PLACES)
             cells = np.minimum(places[some].astype(int), len(lines) - 2)
             share = (places[some] - cells)[:, None, None]
             rest, low, high = 1 - share, lines[cells], lines[cells + 1]
-            rise, rise_after = self.h * slopes[cells], self.h * slopes[cells + 1]
             smooth = low * ((1 + 2 * share) * rest**2) + high * ((1 + 2 * rest) * share**2)
-            smooth = smooth + (rise * rest - rise_after * share) * (share * rest)
-            samples = around[cells + 1], low, high, around[cells + 4]
-            smooth = self._with_walls(smooth, samples, share)
+            smooth = smooth + (rises[cells] * rest - rises[cells + 1] * share) * (share * rest)
+            slopes = -beside[0][cells], beside[1][cells + 1]
+            smooth = self._with_walls(smooth, (low, high), slopes, share)
             reach, off = NEAR * self.step, (np.abs(x - self.level) for x in (low, high))
             near = [x < reach + s * self.h for x, s in zip(off, (share, rest))]
             which = np.nonzero(near[0] & near[1] & (share > 0) & (share < 1))
@@ -223,35 +217,35 @@ class Resampled(SamplePlanes):
             values[some] = smooth
         return values
 
-    def _slopes(self, lines: Floats, around: Floats) -> Floats:
-        """Return the slopes along the lines at samples, (n, p, q), as distances allow them."""
-        slope = (8 * (around[3:-1] - around[1:-3]) - (around[4:] - around[:-4])) / (12 * self.h)
+    def _rises(self, lines: Floats, behind: Floats, ahead: Floats) -> Floats:
+        """Return the slopes along the lines at samples, (n, p, q), as distances allow them.
+
+        They are per spacing, as the differences to the samples ``behind`` and ``ahead`` are.
+        """
         least, most = np.zeros((2, *lines.shape))  # squared slopes across the lines
         for axis, step in enumerate(self.across, 1):
-            rises = np.diff(lines, axis=axis) / step
-            behind = np.concatenate([rises.take([0], axis), rises], axis)
-            ahead = np.concatenate([rises, rises.take([-1], axis)], axis)
-            mean, half = np.abs(behind + ahead) / 2, np.abs(behind - ahead) / 2
+            before, after = _slopes_beside(lines, axis, step)
+            mean, half = np.abs(before + after) / 2, np.abs(before - after) / 2
             least += np.maximum(mean - half, 0) ** 2
             most += (mean + half) ** 2
-        low, high = np.sqrt(np.maximum(1 - most, 0)), np.sqrt(np.maximum(1 - least, 0))
-        slope = np.sign(slope) * np.clip(np.abs(slope), low, high)
-        behind, ahead = (
-            (around[2:-2] - around[1:-3]) / self.h,
-            (around[3:-1] - around[2:-2]) / self.h,
-        )
+        low, high = (self.h * np.sqrt(np.maximum(1 - x, 0)) for x in (most, least))
+        beyond = np.concatenate([behind[:1], behind[:-1]]) + np.concatenate([ahead[1:], ahead[-1:]])
+        rise = (7 * (behind + ahead) - beyond) / 12  # of fourth order
+        rise = np.sign(rise) * np.clip(np.abs(rise), low, high)
         mean, half = (ahead + behind) / 2, MARGIN / 2 * np.abs(ahead - behind)
-        return np.asarray(np.clip(slope, mean - half, mean + half))
+        return np.asarray(np.clip(rise, mean - half, mean + half))
 
-    def _with_walls(self, smooth: Floats, samples: tuple[Floats, ...], share: Floats) -> Floats:
+    def _with_walls(
+        self, smooth: Floats, ends: tuple[Floats, ...], beyond: tuple[Floats, ...], share: Floats
+    ) -> Floats:
         """Return values between samples, with walls that are thinner than the spacing.
 
         There is a wall if the field falls towards the surface, rises behind it, and the straight
         lines from both sides meet beyond it.
         """
-        side = np.sign(samples[1] - self.level)
-        before, low, high, after = ((x - self.level) * side for x in samples)
-        falling, rising = np.minimum(before - low, self.h), np.minimum(after - high, self.h)
+        side = np.sign(ends[0] - self.level)
+        low, high = ((x - self.level) * side for x in ends)
+        falling, rising = (np.minimum(x * side, self.h) for x in beyond)
         is_wall = (high > 0) & (np.minimum(falling, rising) > STEEP_WALL * self.h)
         is_wall &= low * rising + high * falling <= falling * rising
         wall = np.maximum(low - falling * share, high - rising * (1 - share))
@@ -269,9 +263,8 @@ class Resampled(SamplePlanes):
         for cell, along in ((cells, share), (cells + 1, 1 - share)):
             for j, k in OFFSETS:
                 sample = around[cell, row + ACROSS + j, column + ACROSS + k]
-                apart = (
-                    (along * self.h) ** 2 + (j * self.across[0]) ** 2 + (k * self.across[1]) ** 2
-                )
-                np.fmax(low, sample - np.sqrt(apart), out=low)
-                np.fmin(high, sample + np.sqrt(apart), out=high)
+                aside = (j * self.across[0]) ** 2 + (k * self.across[1]) ** 2
+                apart = np.sqrt((along * self.h) ** 2 + aside)
+                np.fmax(low, sample - apart, out=low)
+                np.fmin(high, sample + apart, out=high)
         return np.asarray(np.where(low <= high, np.clip(values, low, high), values))

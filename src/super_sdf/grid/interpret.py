@@ -5,15 +5,15 @@ What the user says of the values wins, then what the file says; the rest is reco
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import prod
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import BoolArray, Triple
 from ..errors import GridError
@@ -35,7 +35,6 @@ from .samples import (
     MadePlanes,
     SampleArray,
     changed,
-    check_kind,
     check_spacing,
     steps_of,
 )
@@ -49,6 +48,9 @@ SNAP = 0.02  # a spacing this close to a usual one is taken as that
 UNEQUAL = 1.01  # ratio from which spacings that the values show differ
 APPROXIMATE = "from the values, so the size of the mesh is approximate (give --spacing)"
 ORDINARY = 1e-100, 1e100  # sizes whose squares are numbers, too
+
+Above: TypeAlias = Callable[[NDArray[Any]], BoolArray]
+"""Which samples have the larger value of a mask."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,42 +99,38 @@ class Case:
     why_open: str = ""
 
     def taken(
-        self, kind: Field, positive_inside: bool | None = None, extremes: Extremes | None = None
+        self, kind: Field, positive_inside: bool, extremes: Extremes | None = None
     ) -> dict[str, Any]:
         """Return the arguments with which a grid is made of the samples, negative inside."""
-        kind = replace(
-            kind,
-            given=self.wanted.field == kind.kind,
-            facts={name: x for name, x in self.facts.items() if name != "spacing"},
-            unseen=self.unseen,
-            why_open=self.why_open,
-        )
         samples, (low, high) = self.samples, extremes or (self.look.low, self.look.high)
-        if self.choose_side() if positive_inside is None else positive_inside:
+        if positive_inside:
             floats = np.promote_types(samples.dtype, np.float32)  # unsigned integers have no sign
             samples = MadePlanes(samples, partial(np.negative, dtype=floats), dtype=floats)
             low, high = -high, -low
-        return {
-            "samples": samples,
-            "spacing": self.spacing,
-            "notes": tuple(self.notes),
-            "extremes": (low, high),
-            "field": kind,
-        }
+        given = self.wanted.field == kind.kind
+        facts = {name: x for name, x in self.facts.items() if name != "spacing"}
+        kind = replace(kind, given=given, facts=facts, unseen=self.unseen, why_open=self.why_open)
+        place = {"spacing": self.spacing, "notes": tuple(self.notes)}
+        return {"samples": samples, "extremes": (low, high), "field": kind, **place}
 
-    def choose_side(self) -> bool:
-        """Whether values are positive inside; unless it is said, the border is outside."""
+    def choose_side(self, above: Above | None = None) -> bool:
+        """Whether positive values are inside, or those of a mask that are ``above``.
+
+        Unless it is said, the border is outside.
+        """
         if self.wanted.inside != "auto":
             return self.wanted.inside == "positive"
-        if self.look.is_one_sided:
+        if above is None and self.look.is_one_sided:
             return self.look.low < 0
-        below = border_share(self.look, lambda x: x < 0)
+        below = border_share(self.look, lambda x: ~above(x) if above else x < 0)
         positive, share = below > 0.5, max(below, 1 - below)
-        if positive or share < 1:
-            sign = "positive" if positive else "negative"
+        which, other = ("negative values are", "positive values are")[positive], "sign"
+        if above:
+            which, other = ("the smaller value is", "the larger value is")[positive], "one"
+        if share < 1 or (positive and not above):
             self.notes.append(
-                f"{sign} values are taken as inside: {share:.0%} of the grid's border has the "
-                "other sign (if that is wrong, use --inside)"
+                f"{which} taken as inside: {share:.0%} of the grid's border has the other {other} "
+                "(if that is wrong, use --inside)"
             )
         return positive
 
@@ -166,7 +164,6 @@ def interpret(
     ``hint`` is a kind that the file states.
     """
     steps, notes = None if spacing is None else check_spacing(spacing), list[str]()
-    check_kind(samples.dtype, samples.shape)
     if wanted.inside == "auto" and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
     if wanted.label is not None:
@@ -185,7 +182,7 @@ def interpret(
     _check_size(look)
     case = Case(samples, look, wanted, steps, given, notes)
     if samples.dtype.kind == "b":
-        return _of_mask(case, samples)
+        return _of_mask(case, np.asarray)
     if look.infinite:
         from .unknown import check_infinite
 
@@ -255,7 +252,7 @@ def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
         said = f", of about {facts['noise']:.2g} voxels" if "noise" in facts else ""
         if case.wanted.field != "noisy":
             case.notes.append(f"values taken as noisy (--field noisy): {answer.why}{said}")
-        return case.taken(Field("noisy", exact=NONE_EXACT, network="noisy"))
+        return case.taken(Field("noisy", exact=NONE_EXACT, network="noisy"), case.choose_side())
     if slope := facts.get("slope"):
         case.notes.append(
             f"the values change by {slope:.4g} of a spacing from sample to sample, distances by 1: "
@@ -290,9 +287,9 @@ def _of_sides(case: Case) -> dict[str, Any]:
     if look.is_two and 0 in (look.low, look.high) and inside == "auto":
         # the other value is inside, wherever it is
         case.wanted = replace(case.wanted, inside="positive")
-        return _of_mask(case, changed(case.samples, partial(np.not_equal, 0), np.bool_))
+        return _of_mask(case, partial(np.not_equal, 0))
     if look.is_two:
-        return _of_mask(case, changed(case.samples, partial(np.less, look.low), np.bool_))
+        return _of_mask(case, partial(np.less, look.low))
     if look.low > 0 or look.high < 0:
         raise GridError(
             f"every value is {'above' if look.low > 0 else 'below'} 0 (they go from {look.low:.6g} "
@@ -303,33 +300,23 @@ def _of_sides(case: Case) -> dict[str, Any]:
     below, zeros = border_share(look, lambda x: x < 0), facts.get("zeros", 0)
     is_positive = below > 0.5 if inside == "auto" else inside == "positive"
     with_zeros = look.high == 0 or zeros > 0 or (look.low < 0 and zeros == 0 and is_positive)
-    above = partial(np.less_equal if with_zeros else np.less, 0)
-    return _of_mask(case, changed(case.samples, above, np.bool_))
+    return _of_mask(case, partial(np.less_equal if with_zeros else np.less, 0))
 
 
-def _of_mask(case: Case, mask: SampleArray) -> dict[str, Any]:
-    """Return the distances of the samples that are true to those that are not, on the lattice."""
+def _of_mask(case: Case, above: Above) -> dict[str, Any]:
+    """Return distances between the samples that are above and the others, on their lattice."""
     from .derived import REACH, extremes_of_masks, mask_distances
 
-    positive = case.wanted.inside == "positive"
-    if case.wanted.inside == "auto":  # the border is outside
-        above = float(look_at(mask).faces.mean())
-        positive, share = above < 0.5, max(above, 1 - above)
-        if share < 1:
-            case.notes.append(
-                f"the {'larger' if positive else 'smaller'} value is taken as inside: {share:.0%} "
-                "of the grid's border has the other one (if that is wrong, use --inside)"
-            )
+    positive = case.choose_side(above)
     case.set_spacing(1, "since a mask shows none (give --spacing)")
     case.notes.append(
         "values taken as a mask (--field mask): they show the surface to half a voxel only"
     )
-    assert case.spacing is not None
-    h = min(steps_of(case.spacing))
+    h = min(steps_of(case.spacing or (1, 1, 1)))
     case.samples = MadePlanes(
-        mask, lambda planes: mask_distances(planes == positive).astype(float) * h, REACH
+        case.samples, lambda x: mask_distances(above(x) == positive).astype(float) * h, REACH
     )
-    return case.taken(MASK, positive_inside=False, extremes=extremes_of_masks(h))
+    return case.taken(MASK, False, extremes_of_masks(h))
 
 
 # Densities, and fields with the surface of their spline
@@ -345,7 +332,7 @@ def _of_level(case: Case) -> dict[str, Any]:
             f"(they go from {before.low:.6g} to {before.high:.6g}): {which_level(before)}"
         )
     if look.is_two or wanted.field == "mask":
-        return _of_mask(case, changed(case.samples, partial(np.less, 0), np.bool_))
+        return _of_mask(case, partial(np.less, 0))
     case.fill_in()
     case.set_spacing(1, "since densities show none (give --spacing)")
     return _of_spline(case, "density")
@@ -363,7 +350,8 @@ def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
         deep = INNER * min(steps_of(spacing))
         case.samples = without_inner_faces(case.samples, case.facts["inside"], deep)
     has_jumps = bool(case.facts.get("cut")) and kind == "smooth"
-    return case.taken(Field(kind, exact=NONE_EXACT, network=None, has_jumps=has_jumps))
+    own = Field(kind, exact=NONE_EXACT, network=None, has_jumps=has_jumps)
+    return case.taken(own, case.choose_side())
 
 
 def _slope_at_surface(look: Look, steps: ArrayLike) -> float:

@@ -7,8 +7,10 @@ spread evenly. Of that part some samples are kept: what is asked are shares, for
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -33,16 +35,13 @@ GROWS = 2.0  # times the share of all samples, that of the border above a level 
 SHARE, LEAST = 0.01, 20  # of the most steps over any level, and steps, that count
 MOST_OUTSIDE = 0.65  # of the border, above a level: maps of noise to .55, distances from .76
 MOST_NAMED = 8  # labels that a message lists
-TRIED = 4096  # samples whose different values are counted first
 BENT = 0.1  # share of a slope: its differences where no kink is near; kinks have 1
 NEARLY, FACTOR = 1e-3, 0.05  # off whole numbers, and from 1: nibabel 2e-10, atlases .012
 GOLDEN = 0.6180339887  # its multiples, less whole numbers, are spread evenly from 0 to 1
 
-AXES = np.array([[0, 0, 0], *np.kron(np.eye(3, dtype=int), [[-2], [-1], [1], [2]])])
-ON_LINES = np.array([[1, 2, 0, 3, 4], [5, 6, 0, 7, 8], [9, 10, 0, 11, 12]])
-FACES_OF_3 = np.array([(0, 1, 1), (2, 1, 1), (1, 0, 1), (1, 2, 1), (1, 1, 0), (1, 1, 2)])
-FACES_OF_5 = FACES_OF_3 + 1
+# offsets of the samples in a box, and on the lines along the axes
 BOX = np.indices((5, 5, 5)).reshape(3, -1).T - 2
+CROSS = np.arange(-2, 3)[:, None] * np.eye(3, dtype=int)[:, None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +56,8 @@ class Look:
     is_two: bool  # whether the finite samples have two values
     faces: NDArray[Any]  # all samples on the border of the grid
     # samples that are asked, (p, ny, nz); a plane of NaN is between planes that are not neighbours
-    part: NDArray[Any] = field(default_factory=lambda: np.empty((0, 0, 0)))
-    # samples (n, 5, 5, 5) round some beside the surface at 0
-    boxes: Floats = field(default_factory=lambda: np.empty((0, 5, 5, 5)))
-    # (m, 3, 5), through samples that are neither the lowest nor the highest
-    lines: Floats = field(default_factory=lambda: np.empty((0, 3, 5)))
-    pairs: Floats = field(default_factory=lambda: np.empty((2, 0)))  # different neighbours, (2, k)
-    frequent: dict[float, float] = field(default_factory=dict)  # values, and the share of samples
+    part: NDArray[Any]
+    own: BoolArray  # (p,), the planes from which samples are kept; the others lie beside these
 
     @property
     def is_finite(self) -> bool:
@@ -80,18 +74,53 @@ class Look:
         """The lowest and the highest value, as far as many samples have them: cut off there."""
         return [value for value in (self.low, self.high) if value in self.frequent]
 
+    @cached_property
+    def frequent(self) -> set[float]:
+        """Values of many samples amid equal ones."""
+        found, times = np.unique(self.part[equal_neighbours(self.part) == 6], return_counts=True)
+        least = FREQUENT * np.count_nonzero(~np.isnan(self.part))
+        return set(found[times > least].tolist())
+
+    @cached_property
+    def boxes(self) -> Floats:
+        """Samples (n, 5, 5, 5) round some beside the surface at 0."""
+        return self._around(beside_surface(self.part), BOX, BOXES).reshape(-1, 5, 5, 5)
+
     @property
     def box_lines(self) -> Floats:
         """The lines (n, 3, 5) through the middles of the boxes."""
-        boxes = self.boxes
-        return np.stack([boxes[:, :, 2, 2], boxes[:, 2, :, 2], boxes[:, 2, 2]], 1)
+        return self.boxes[(slice(None), *np.moveaxis(CROSS + 2, -1, 0))]
+
+    @cached_property
+    def lines(self) -> Floats:
+        """Lines of samples (m, 3, 5) through some that are neither the lowest nor the highest."""
+        return self._around((self.part > self.low) & (self.part < self.high), CROSS, LINES)
+
+    @cached_property
+    def pairs(self) -> Floats:
+        """Neighbours that differ, (2, k)."""
+        pairs = list[Floats]()
+        for axis in range(3):
+            lines = np.moveaxis(self.part, axis, 0)
+            one, other = lines[:-1], lines[1:]
+            places = np.flatnonzero((one != other) & ~np.isnan(one) & ~np.isnan(other))
+            at = np.unravel_index(_some(places, PAIRS), one.shape)
+            pairs.append(np.stack([one[at], other[at]]).astype(np.float64))
+        return np.concatenate(pairs, axis=1)
+
+    def _around(self, asked: BoolArray, offsets: NDArray[Any], most: int) -> Floats:
+        """Return the samples at offsets (..., 3) from some of those that are asked."""
+        asked[~self.own] = False
+        at = np.stack(np.unravel_index(_some(np.flatnonzero(asked), most), asked.shape), 1) + 2
+        padded = np.pad(self.part, 2, constant_values=np.nan)
+        step = np.array([padded[0].size, padded.shape[2], 1])
+        places = (at @ step).reshape(-1, *[1] * (offsets.ndim - 1)) + offsets @ step
+        found: Floats = padded.ravel().take(places).astype(np.float64)
+        return found
 
     def without(self, value: float) -> Look:
-        """Return the same with the kept samples of a value unknown."""
-        boxes, lines = (np.where(x == value, np.nan, x) for x in (self.boxes, self.lines))
-        sides = np.sign(boxes[(slice(None), *FACES_OF_5.T)]) * np.sign(boxes[:, 2, 2, 2])[:, None]
-        pairs = self.pairs[:, (self.pairs != value).all(0)]
-        return replace(self, boxes=boxes[(sides < 0).any(1)], lines=lines, pairs=pairs)
+        """Return the same with the samples of a value unknown."""
+        return replace(self, part=np.where(self.part == value, np.nan, self.part))
 
 
 def look_at(samples: SampleArray) -> Look:
@@ -116,15 +145,14 @@ def look_at(samples: SampleArray) -> Look:
         faces += [plane[0], plane[-1], plane[:, 0], plane[:, -1]]
         if i % 16 == 0:
             let_go(samples)
-    shape, together = tuple(map(int, samples.shape)), np.concatenate(faces)
-    look = Look(shape, low, high, unknown, infinite, False, together)
-    if not low < high:
-        return look
     if high <= 0:
         changes = np.array([np.count_nonzero(plane < 0) for plane in samples])
     part, own = _part_of(samples, changes)
+    shape, together = tuple(map(int, samples.shape)), np.concatenate(faces)
     is_two = _has_two([part], low, high) and _has_two(samples, low, high)
-    return _closer(replace(look, is_two=is_two), part, own)
+    if unknown or infinite:
+        part = np.where(np.isfinite(part), part, np.nan)
+    return Look(shape, low, high, unknown, infinite, is_two, together, part, own)
 
 
 def _has_two(values: Iterable[NDArray[Any]], low: float, high: float) -> bool:
@@ -153,36 +181,6 @@ def _part_of(samples: SampleArray, changes: NDArray[np.int64]) -> tuple[NDArray[
         parts += [slab, np.full((1, *slab.shape[1:]), np.nan, kind)]
         own.append(np.arange(len(slab) + 1) == i - low)
     return np.concatenate(parts), np.concatenate(own)
-
-
-def _closer(look: Look, part: NDArray[Any], own: BoolArray) -> Look:
-    """Return a look with samples of a part of the grid; those asked lie in the own planes."""
-    if not look.is_finite:
-        part = np.where(np.isfinite(part), part, np.nan)
-    padded = np.pad(part, 2, constant_values=np.nan)
-    flat, step = padded.ravel(), np.array([padded[0].size, padded.shape[2], 1])
-
-    def around(asked: BoolArray, offsets: NDArray[Any], most: int) -> Floats:
-        asked[~own] = False
-        at = np.stack(np.unravel_index(_some(np.flatnonzero(asked), most), part.shape), 1)
-        found: Floats = flat.take(((at + 2) @ step)[:, None] + offsets @ step).astype(np.float64)
-        return found
-
-    boxes = around(beside_surface(part), BOX, BOXES).reshape(-1, 5, 5, 5)
-    lines = around((part > look.low) & (part < look.high), AXES, LINES)[:, ON_LINES]
-    pairs = list[Floats]()
-    for axis in range(3):
-        lines_of = np.moveaxis(part, axis, 0)
-        one, other = lines_of[:-1], lines_of[1:]
-        places = np.flatnonzero((one != other) & ~np.isnan(one) & ~np.isnan(other))
-        at = np.unravel_index(_some(places, PAIRS), one.shape)
-        pairs.append(np.stack([one[at], other[at]]).astype(np.float64))
-    amid = part[equal_neighbours(part) == 6]  # samples amid equal ones
-    found, times = np.unique(amid, return_counts=True)
-    shares = zip(found.tolist(), (times / np.count_nonzero(~np.isnan(part))).tolist())
-    frequent = {value: share for value, share in shares if share > FREQUENT}
-    together = np.concatenate(pairs, axis=1)
-    return replace(look, part=part, boxes=boxes, lines=lines, pairs=together, frequent=frequent)
 
 
 def _some(places: NDArray[np.intp], most: int) -> NDArray[np.intp]:
@@ -232,8 +230,7 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
     Along each axis it is the steeper one to both sides of a sample, if most are beside some that
     are cut off, else the mean. NaN if it is not known.
     """
-    boxes = look.boxes[:, 1:4, 1:4, 1:4]
-    lines = np.stack([boxes[:, :, 1, 1], boxes[:, 1, :, 1], boxes[:, 1, 1]], 1)
+    lines = look.box_lines[..., 1:4]
     lines = np.where(np.isin(lines, cut), np.nan, lines)
     rise = np.diff(lines) / steps[:, None]
     mean = np.sqrt((rise.mean(2) ** 2).sum(1))
@@ -247,24 +244,17 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
 
 def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int64]] | None:
     """Return the finite values of all planes and how often each is; None if they are many."""
-    counts: dict[Any, int] = {}
+    counts = Counter[Any]()
     for plane in samples:
-        flat = np.ravel(plane)
-        if flat.dtype.kind == "f":
-            flat = flat[np.isfinite(flat)]
-        if len(np.unique(flat[:: max(flat.size // TRIED, 1)])) > MOST_LABELS:
-            return None
-        # the first sample of each run, and how long it is
-        first = np.flatnonzero(np.append(flat.size > 0, flat[1:] != flat[:-1]))
+        flat = plane[np.isfinite(plane)]
+        first = np.flatnonzero(np.append(flat.size > 0, flat[1:] != flat[:-1]))  # of equal ones
         found, which = np.unique(flat[first], return_inverse=True)
-        times = np.bincount(which, np.diff(np.append(first, flat.size))).astype(np.int64)
-        for value, number in zip(found.tolist(), times.tolist()):
-            counts[value] = counts.get(value, 0) + number
+        times = np.bincount(which, np.diff(np.append(first, flat.size)))
+        counts.update(dict(zip(found.tolist(), times.tolist())))
         if len(counts) > MOST_LABELS:
             return None
     values = sorted(counts)
-    kept = np.array(values, samples.dtype)
-    return kept, np.array([counts[value] for value in values], np.int64)
+    return np.array(values, samples.dtype), np.array([counts[x] for x in values], np.int64)
 
 
 def whole_factor(parts: Iterable[NDArray[Any]]) -> float:
@@ -315,38 +305,11 @@ def side_of_zeros(look: Look) -> int:
     return int(np.sign(lone[1] - lone[0]))
 
 
-def are_no_squares(values: Floats) -> bool:
-    """Return whether values are not all sums of three squares, as 7, 15, 23 and 28 are not."""
-    return bool(np.isin((7, 15, 23, 28), np.unique(values).round(3)).any())
-
-
-def counted_steps(look: Look) -> float:
-    """Return of how many samples of two steps the least of 26, or 6, neighbours has one; a share.
-
-    It is 1 where values count steps to the surface, as chessboard and city-block distances do. NaN
-    if they are no multiples of one step, or may be squares of distances.
-    """
-    size = np.abs(look.boxes)
-    step = size[size > 0].min(initial=np.inf)
-    size, values = np.nan_to_num(size / step, nan=np.inf), np.abs(look.pairs / step)
-    one_apart = np.quantile(np.abs(np.diff(look.pairs / step, axis=0)), 0.99) < 1 + NEARLY
-    is_even = (np.abs(values - np.rint(values)) <= NEARLY).all()
-    if not (is_even and (one_apart or are_no_squares(values))):
-        return float("nan")
-    windows = np.lib.stride_tricks.sliding_window_view(size, (3, 3, 3), axis=(1, 2, 3))
-    around = windows[size[:, 1:4, 1:4, 1:4] == 2].reshape(-1, 27)
-    of_six = around[:, np.ravel_multi_index(FACES_OF_3.T, (3, 3, 3))]
-    return max(float((x.min(1) == 1).mean()) for x in (around, of_six)) if len(around) else 1.0
-
-
 def parting_level(values: Floats) -> float:
     """Return the level that parts the values into two of least variance (Otsu's)."""
-    counts, edges = np.histogram(values, 512)
-    mids = (edges[1:] + edges[:-1]) / 2
-    below, mean = np.cumsum(counts)[:-1], np.cumsum(counts * mids)[:-1]
-    above, other = counts.sum() - below, (counts * mids).sum() - mean
-    apart = below * above * (mean / np.maximum(below, 1) - other / np.maximum(above, 1)) ** 2
-    return float(edges[1:-1][apart.argmax()])
+    ordered, below = np.sort(values), np.arange(1, len(values))
+    apart = np.cumsum(ordered - ordered.mean())[:-1] ** 2 / (below * below[::-1])
+    return float(ordered[apart.argmax()])
 
 
 def last_digit(look: Look) -> float:

@@ -21,17 +21,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..arrays import BoolArray
 from .look import (
     BOX,
-    FACES_OF_3,
+    NEARLY,
     Floats,
     Look,
-    are_no_squares,
     as_labels,
     border_share,
     count_valleys,
-    counted_steps,
     different_values,
     equal_neighbours,
     last_digit,
@@ -57,11 +57,10 @@ FEW_LABELS = 8  # different values: rounded distances and images from 11, lesion
 # along two axes, and many patterns of signs, or many of all. Else faces are along the axes.
 FOLLOW = 0.953  # distances to .9502 (but where faces are along the axes), transforms from .957
 STAIRS = 0.2  # solids along the axes to .18, masks of others from .26
-ZEROS = 0.25  # share of samples at 0 beside the surface: sides that start at 0 have .3
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
 NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
-ROUGH = 1.0  # fourth differences over slopes: lattices of short periods to .5, transforms from 4.7
-COUNTED = 0.99  # multiples of one step: transforms 1, rounded distances to .976
+ROUGH = 1.0  # fourth differences over slopes: lattices of short periods to .5, transforms from 1.5
+COUNTED = 0.93  # equal ones a step farther off: transforms 1, rounded distances and images to .87
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
 # 4. Unknown samples: steps to a frequent value over the steepest ones; how many of them jump.
 JUMP = 1.5  # cut off 1.0, sentinels from 2
@@ -79,7 +78,6 @@ NARROW = 4.5  # spacings up to which values that are cut off have too few slopes
 NEVER = 5e-4  # contradictions of these: cut off 0, fused depth images from .0018
 SLOPE_NEAR = 0.5, 1.25  # of these: cut off at half a voxel .55 to 1.05, in half the unit .5 and 2
 SLOPE_OFF = 0.25  # of rounded distances from 1
-CROWDED = 0.7  # of the uncut samples, those in the last tenth: cut off to .55, tanh from .85
 SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
 THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
 # 6. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
@@ -101,8 +99,8 @@ RISING = 0.1  # of steps between neighbours, median over steepest: images to .03
 VALLEY = 0.2, 1.5  # unsigned distances .3 to .6; densities .05, noise 3
 ENOUGH = 20  # samples from which a share is evidence
 
-CENTRE_OF_5 = 62  # of the samples in a box of 5 x 5 x 5
-TRANSFORM = "a distance transform, so only their sign says something"
+MIDDLE = 62  # of the samples in a box of 5 x 5 x 5
+FACES = np.array([[4, 22], [10, 16], [12, 14]])  # of 3 x 3 x 3 samples, those beside the middle
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,21 +125,16 @@ def recognise(
         return Answer("labels", "", facts, which_label(samples))
     if is_mask:
         return Answer("mask", "there are two values", facts)
-    follow = not hint and _follow_from_signs(look, given, facts)
-    is_sure = follow and (facts["shape"] >= FOLLOW or facts["zeros"] >= ZEROS)
-    if (is_sure and facts["stepped"]) or (follow and _jump_over_0(look)):
-        return Answer("mask", TRANSFORM, facts | {"zeros": side_of_zeros(look)})
-    signs = look
+    if not hint and (step := _step_of_transform(look, given)):
+        why = "a distance transform, so only their sign says something"
+        return Answer("mask", why, facts | {"step": step, "zeros": side_of_zeros(look)})
     look = _without_sentinels(look, facts)
-    unit = _unit_of_distances(look, given, facts)
-    if unit is not None:
-        return _distances(look, unit, given, facts)
-    if look.frequent.get(0.0) and look.low < 0 < look.high:  # no surface fills a space
-        others, known = look.without(0.0), facts | {"unknown_values": [0.0]}
-        if (unit := _unit_of_distances(others, given, known)) is not None:
-            return _distances(others, unit, given, known)
-    if follow and facts["stepped"]:
-        return Answer("mask", TRANSFORM, facts | {"zeros": side_of_zeros(signs)})
+    if (answer := _distances(look, given, facts)) is not None:
+        return answer
+    if 0.0 in look.frequent and look.low < 0 < look.high:  # no surface fills a space
+        known = facts | {"unknown_values": [0.0]}
+        if (answer := _distances(look.without(0.0), given, known)) is not None:
+            return answer
     if hint == "density":
         return Answer("density", "", facts, which_level(look))
     if look.is_one_sided:
@@ -150,9 +143,7 @@ def recognise(
         value = facts["perhaps_unknown"]
         said = f"beside some of the samples that are {value:g} the values jump: --unknown {value:g}"
         return Answer("smooth", "", facts, said)
-    unit = facts.get("unit") or typical_slope(look, np.ones(3), facts["cut"])
-    steps = np.full(3, unit) if given is None else given
-    if _is_cut_near(look, steps, facts):
+    if (steps := _steps_of_cut(look, given, facts)) is not None:
         return Answer("distance", "", facts | {"spacing": steps})
     return _of_both_sides(look, given, facts)
 
@@ -174,73 +165,75 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
     if len(distinct) > 3:  # images are cut off at their ends
         inner &= (part != distinct[0]) & (part != distinct[-1])
     equal = equal_neighbours(part)[inner]
-    facts["amid"] = float((equal == 6).mean()) if len(equal) else 1.0
+    amid, level = ((equal >= n).mean() if len(equal) else 1.0 for n in (6, 4))
     if len(distinct) > 3 and facts["by_rank"] >= BY_RANK:
-        return bool(facts["amid"] >= AMID)
-    facts["plateaus"] = float((equal >= 4).mean()) if len(equal) else 1.0
+        return bool(amid >= AMID)
     few = len(distinct) <= FEW_LABELS and look.low >= 0
-    has_cores = facts["amid"] >= AMID or look.is_one_sided  # distances to boxes have none
-    return bool(few or (facts["plateaus"] >= PLATEAUS and has_cores))
+    has_cores = amid >= AMID or look.is_one_sided  # distances to boxes have none
+    return bool(few or (level >= PLATEAUS and has_cores))
 
 
-def _follow_from_signs(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
-    """Return whether samples beside the surface are equal wherever the 27 signs round them are.
+def _step_of_transform(look: Look, given: Floats | None) -> float:
+    """Return the typical size beside the surface of values that follow from their signs, else 0.
 
-    Of one shape they all have one size. So have distances to faces along the axes, which differ by
-    their steps; others may follow by chance, which is told by their slopes.
+    Samples are equal wherever the 27 signs round them are; of most transforms they all have one
+    size. So have distances to faces along the axes, which differ by their steps.
     """
-    boxes = look.boxes[:, 1:4, 1:4, 1:4]
-    facts["zeros"] = float((look.boxes[:, 2, 2, 2] == 0).mean()) if len(look.boxes) else 0.0
-    facts["follow"], most, largest = 0.0, 0, max(abs(look.low), abs(look.high))
-    fine = np.repeat(np.ones(3, bool) if given is None else given < 1.01 * given.min(), 2)
-    cut = [x for x in facts["cut"] if x]
-    whole = np.isfinite(boxes).all((1, 2, 3)) & (boxes[:, 1, 1, 1] != 0)
-    for signs in (boxes > 0, boxes >= 0):  # 0 may be on either side
-        along = (signs != signs[:, 1:2, 1:2, 1:2])[(slice(None), *FACES_OF_3[fine].T)]
-        ring = whole & along.any(1)
-        free = ring & ~np.isin(boxes[:, 1, 1, 1], cut)
-        x = boxes[free, 1, 1, 1]
-        typical = float(np.quantile(np.abs(x), 0.5)) if len(x) else 0.0
-        if len(x) < max(ENOUGH, ring.sum() / 2) or typical < NOTHING * largest:
+    fine = np.ones(3, bool) if given is None else given < 1.01 * given.min()
+    middle, largest = look.boxes[:, 2, 2, 2], max(abs(look.low), abs(look.high))
+    known = np.isfinite(look.boxes[:, 1:4, 1:4, 1:4]).all((1, 2, 3)) & (middle != 0)
+    cut = [value for value in look.cut if value]
+    best, step, is_stepped, counts = (FOLLOW, 0), 0.0, False, look.boxes
+    for sign in (1, -1):  # 0 may be on either side
+        signs = (sign * look.boxes[:, 1:4, 1:4, 1:4] > 0).reshape(-1, 27)
+        along = (signs != signs[:, 13:14])[:, FACES].any(2)[:, fine]
+        ring = known & along.any(1)
+        free = ring & ~np.isin(middle, cut)
+        x = middle[free]
+        if len(x) < max(ENOUGH, ring.sum() / 2):
             continue
+        typical = float(np.quantile(np.abs(x), 0.5))
         alike = np.abs(np.abs(x) - typical) <= 0.01 * typical
-        shape = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
-        bits = np.packbits(signs[free].reshape(-1, 27), axis=1)
-        key = np.ascontiguousarray(bits).view(np.uint32).ravel()
+        share = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
+        key = np.ascontiguousarray(np.packbits(signs[free], axis=1)).view(np.uint32).ravel()
         order = np.argsort(key, kind="stable")
-        same, share = np.diff(key[order]) == 0, shape
+        same = np.diff(key[order]) == 0
         if same.sum() >= 5 * ENOUGH:
             equal = np.abs(np.diff(x[order])[same]) <= 0.01 * typical
-            share = max(shape, float(equal.mean()))
-        if share > facts["follow"] or (share >= FOLLOW and len(x) > most):
-            most, patterns = len(x), int(np.count_nonzero(~same)) + 1
-            stairs = float((along[free].reshape(most, -1, 2).any(2).sum(1) > 1).mean())
-            facts.update(follow=share, shape=shape, stairs=stairs, step=typical)
-            is_many = patterns > min(PATTERNS, OF_ALL * most)
-            facts["stepped"] = stairs > STAIRS and is_many and len(cut) < 2
-    counted = counted_steps(look) if facts["zeros"] and not look.is_one_sided else np.nan
-    if not np.isnan(counted):  # rounded distances may be so, too
-        return counted >= COUNTED
-    if facts["follow"] < FOLLOW or (look.is_one_sided and _fades_out(look, given, facts)):
-        return False
+            share = max(share, float(equal.mean()))
+        if (share, len(x)) > best and typical > NOTHING * largest:
+            best, step, counts = (share, len(x)), typical, look.boxes[ring] * (sign / typical)
+            is_many = np.count_nonzero(~same) >= min(PATTERNS, OF_ALL * len(x))
+            has_stairs = (along[free].sum(1) > 1).mean() > STAIRS
+            is_stepped = bool(has_stairs and is_many and len(cut) < 2)
+    if not (step and (is_stepped or _jump_over_0(look))):
+        return 0.0
+    whole = look.pairs / np.abs(look.pairs[look.pairs != 0]).min()
+    if (np.abs(whole - np.rint(whole)) <= NEARLY).all() and not _count_steps(counts, fine):
+        return 0.0
     rough = np.abs(np.diff(look.box_lines, 4)[..., 0]).sum(1)
     rise = np.abs(np.diff(look.box_lines[..., 1::2])[..., 0]).sum(1) / 2
-    known = np.isfinite(rough + rise)
-    return bool(np.median(rough[known]) >= ROUGH * np.median(rise[known])) or not known.any()
+    rough, rise = (x[np.isfinite(rough + rise)] for x in (rough, rise))
+    return step if not len(rise) or np.median(rough) >= ROUGH * np.median(rise) else 0.0
 
 
-def _fades_out(look: Look, given: Floats | None, facts: dict[str, Any]) -> bool:
-    """Return whether values of one side grow as no transform does, as an image that fades to 0.
+def _count_steps(boxes: Floats, fine: BoolArray) -> bool:
+    """Return whether whole numbers in boxes (n, 5, 5, 5) count steps to the surface.
 
-    Distances grow by a step from sample to sample, unless they are squared: then they are sums of
-    squares of steps. And they have no flat top.
+    Then those above 0 are equal where others are beside an edge of theirs but no face, and equal
+    and larger right behind those at the surface. Distances and images that were rounded differ.
     """
-    step, values = facts["step"], np.abs(look.pairs)
-    longest = step * (1.0 if given is None else float(given.max() / given.min()))
-    if np.quantile(np.abs(values[0] - values[1]), 0.99) <= 2 * longest:
-        return False
-    is_cut = (look.high if look.low >= 0 else look.low) in facts["cut"]
-    return is_cut or are_no_squares(values / step)
+    windows = np.lib.stride_tricks.sliding_window_view(boxes > 0.5, (3, 3, 3), axis=(1, 2, 3))
+    windows = windows.reshape(-1, 27, 27)
+    others = windows[..., 13:14] & ~windows
+    offsets = np.abs(np.indices((3, 3, 3)) - 1).reshape(3, 27)
+    edges = (offsets[fine].sum(0) == 2) & ~offsets[~fine].any(0)
+    values, at_face = boxes[:, 1:4, 1:4, 1:4].reshape(-1, 27), others[..., FACES].any((2, 3))
+    second = values[others[..., edges].any(2) & ~at_face]
+    third = values[:, FACES][(windows[..., 13] & ~others.any(2))[:, FACES]]
+    alike = [(np.abs(x - np.median(x)) < 0.01).mean() for x in (second, third) if len(x)]
+    farther = np.median(third if len(third) else second) if alike else 0.0
+    return bool(min(alike, default=0.0) >= COUNTED and farther > 1.5)
 
 
 def _jump_over_0(look: Look) -> bool:
@@ -268,32 +261,32 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
         jumps = float((steps > JUMP * np.quantile(change[~at], 0.99)).mean())
         if jumps > 0.5:
             found.append(value)
-        elif jumps > MIXED and value in facts["cut"]:
+        elif jumps > MIXED and value in look.cut:
             facts["perhaps_unknown"] = value
     # far inside and far outside a value may stand for "unknown" with either sign
     found += [x for x in (look.low, look.high) if -x in found and x not in found]
-    if found:
-        facts["unknown_values"] = found
-        facts["cut"] = [x for x in facts["cut"] if x not in found]
-        facts.pop("perhaps_unknown", None)
+    if not found:
+        return look
     for value in found:
         look = look.without(value)
+    facts.pop("perhaps_unknown", None)
+    facts |= {"unknown_values": found, "cut": look.cut}
     return look
 
 
 # Question 5: distances
 
 
-def _unit_of_distances(look: Look, given: Floats | None, facts: dict[str, Any]) -> Any:
-    """Return the unit of values that are distances, see ``_find_unit``; None if they are none."""
+def _distances(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answer | None:
+    """Return distances, or why they are none to a surface in the grid; None if they are none."""
     facts["digit"] = last_digit(look)
-    unit = _find_unit(np.where(np.isin(look.lines, facts["cut"]), np.nan, look.lines), given, facts)
+    unit = _find_unit(np.where(np.isin(look.lines, look.cut), np.nan, look.lines), given, facts)
     enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
     if unit is None or not enough or facts["slopes"] < SLOPES:
         return None
     steps = unit * (np.ones(3) if given is None else given)
     facts["contradictions"] = _contradictions(look, steps, facts["digit"])
-    return unit if facts["contradictions"] <= CONTRADICTIONS else None
+    return _in_unit(look, unit, given, facts) if facts["contradictions"] <= CONTRADICTIONS else None
 
 
 def _find_unit(inner: Floats, given: Floats | None, facts: dict[str, Any]) -> Any:
@@ -329,13 +322,13 @@ def _contradictions(look: Look, steps: Floats, digit: float, noise: float = 0.0)
     boxes = look.boxes.reshape(len(look.boxes), -1) / h
     apart = np.sqrt(((BOX * steps / h) ** 2).sum(1))
     allowed = max(EXACT, min(digit / h, MOST_DIGIT), NOISES * noise)
-    beyond = np.abs(boxes - boxes[:, CENTRE_OF_5, None]) > apart + allowed
+    beyond = np.abs(boxes - boxes[:, MIDDLE, None]) > apart + allowed
     beyond &= np.abs(boxes) < MATTERS
     return float((np.count_nonzero(beyond, axis=1) >= 2).mean())
 
 
-def _distances(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any]) -> Answer:
-    """Return distances, or why they are none to a surface in the grid."""
+def _in_unit(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any]) -> Answer:
+    """Return distances with a unit, that of one axis or each, or why they are none to a surface."""
     steps = np.ones(3) * unit if given is None else given
     facts["spacing"] = steps
     if given is not None and np.ndim(unit):
@@ -372,13 +365,9 @@ def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
     on either side leave of the way between two samples is how thick it is.
     """
     sign = 1 if look.low >= 0 else -1
-    nearest = look.low if sign > 0 else look.high
-    if nearest in facts["cut"]:
+    if (look.low if sign > 0 else look.high) in look.cut:
         return Answer("density", "", facts, which_level(look))
-    if abs(nearest) > 1.05 / 2 * float(np.sqrt((steps**2).sum())):  # half a diagonal
-        said = "every wall is nearer to some sample than that, so there is no surface"
-        return Answer("distance", "", facts, said)
-    thickness = []
+    thickness = list[NDArray[Any]]()
     for axis in range(3):
         lines = np.moveaxis(look.part, axis, 0) * (sign / steps[axis])
         before, left, right, after = (lines[i : len(lines) - 3 + i] for i in range(4))
@@ -387,10 +376,9 @@ def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
         thickness.append(left_over[(np.minimum(falling, rising) > 0.25) & (left_over > -0.6)])
     walls = np.concatenate(thickness)
     if not len(walls):
-        said = "only samples on the border of the grid are near 0, so no surface lies in it"
+        said = "no wall lies between samples, so there is no surface"
         return Answer("distance", "", facts, said)
-    walls = walls[walls > -0.25]
-    if len(walls) and np.median(walls) > THICK:
+    if (walls > -0.25).any() and np.median(walls[walls > -0.25]) > THICK:
         return Answer("distance", "", facts)
     return _unsigned(sign, float(steps.max()), facts)
 
@@ -402,17 +390,16 @@ def _unsigned(sign: int, h: float, facts: dict[str, Any]) -> Answer:
     return Answer("distance", "", facts, said)
 
 
-def _is_cut_near(look: Look, given: Floats, facts: dict[str, Any]) -> bool:
-    """Return whether values are distances cut off, or unknown, so near that few slopes are left."""
+def _steps_of_cut(look: Look, given: Floats | None, facts: dict[str, Any]) -> Floats | None:
+    """Return the steps of distances cut off, or unknown, so near that few slopes are left."""
+    unit = facts.get("unit") or typical_slope(look, np.ones(3), look.cut)
+    steps = np.full(3, unit) if given is None else given
     known = max(-look.low, look.high) if look.unknown or "unknown_values" in facts else np.inf
-    nearest = min(map(abs, facts["cut"]), default=known)
-    if nearest >= NARROW * given.max():
-        return False
-    size = np.abs(look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]) / nearest
-    facts["crowded"] = float((size > 0.9).mean()) if size.size else 0.0
-    slope = typical_slope(look, given, facts["cut"])
-    is_even = facts["crowded"] < CROWDED and SLOPE_NEAR[0] < slope < SLOPE_NEAR[1]
-    return is_even and _contradictions(look, given, facts["digit"]) <= NEVER
+    nearest = min(map(abs, look.cut), default=known)
+    if nearest >= NARROW * steps.max():
+        return None
+    is_even = SLOPE_NEAR[0] < typical_slope(look, steps, look.cut) < SLOPE_NEAR[1]
+    return steps if is_even and _contradictions(look, steps, facts["digit"]) <= NEVER else None
 
 
 # Questions 6 to 8: noise, densities, smooth fields
@@ -425,12 +412,12 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
     if np.ptp(values) < IMAGE * digit:
         steps = _before_rounding(look, digit, given, facts)
         if steps is not None and given is not None and steps is not given:
-            return _distances(look, float(steps[0] / given[0]), given, facts)
+            return _in_unit(look, float(steps[0] / given[0]), given, facts)
         if steps is not None:
             facts["noise"] = digit / float(steps.max()) / 12**0.5  # standard deviation
             why = f"distances rounded to {digit:.3g}"
             return Answer("noisy", why, facts | {"spacing": steps})
-        if not facts["cut"] or abs(look.low + look.high) >= ALIKE * look.high:
+        if not look.cut or abs(look.low + look.high) >= ALIKE * look.high:
             return Answer("density", "", facts, which_level(look, signed=True))
     middle = look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]
     if len(middle) >= ENOUGH:
@@ -486,8 +473,8 @@ def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
     share = np.count_nonzero(~np.isnan(look.part)) / np.prod(look.shape)
     found = count_valleys(look, steep, sign)[0] / share / float(np.prod(look.shape)) ** (2 / 3)
     # steps between plateaus, with noise on them, make valleys, too
-    facts["rising"] = float(np.median(change)) / steep
-    is_unsigned = (look.low if sign > 0 else look.high) not in facts["cut"]
-    if is_unsigned and facts["rising"] > RISING and VALLEY[0] < found < VALLEY[1]:
+    is_rising = np.median(change) > RISING * steep
+    is_cut = (look.low if sign > 0 else look.high) in look.cut
+    if is_rising and not is_cut and VALLEY[0] < found < VALLEY[1]:
         return _unsigned(sign, steep, facts)
     return Answer("density", "", facts, which_level(look))

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from math import prod
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -119,7 +119,7 @@ class MadePlanes(SamplePlanes):
     ) -> None:
         self.source, self.make, self.margin, self.dtype = source, make, beside, np.dtype(dtype)
         self.beside = beside + getattr(source, "beside", 0)
-        low, high = box or ((0, 0, 0), source.shape)
+        low, high = box or ((0,) * len(source.shape), source.shape)
         self.low, self.shape = np.array(low), tuple(np.subtract(high, low).tolist())
 
     def read(self, first: int, last: int) -> NDArray[Any]:
@@ -189,22 +189,22 @@ def over_three(values: NDArray[Any], choose: np.ufunc) -> NDArray[Any]:
     return values
 
 
-def as_samples(values: ArrayLike | SamplePlanes) -> SampleArray:
-    """Return samples as an array; those that are read by slices are not loaded."""
-    if isinstance(values, SamplePlanes):
-        return values
-    stored: Any = values
-    if hasattr(stored, "chunks") and isinstance(getattr(stored, "dtype", None), np.dtype):
-        return MadePlanes(stored, dtype=stored.dtype)  # of h5py, Zarr or Dask
-    try:
-        samples: NDArray[Any] = np.asanyarray(without_device(values))
-    except (TypeError, ValueError, RuntimeError):  # ragged lists
-        raise GridError(f"values are {seen(values)}: give an array of three axes") from None
-    if not hasattr(samples, "mask"):  # of a masked array: what is masked is unknown
-        return samples
-    if samples.dtype.kind in "fiu":
-        samples = samples.astype(np.result_type(samples.dtype, np.float32))
-    return np.ma.filled(samples, np.nan if samples.dtype.kind == "f" else False)
+def as_samples(values: Any) -> SampleArray:
+    """Return samples along three axes as an array; those that are read by slices are not loaded."""
+    samples: Any = values
+    if hasattr(values, "chunks") and isinstance(getattr(values, "dtype", None), np.dtype):
+        samples = MadePlanes(values, dtype=values.dtype)  # of h5py, Zarr or Dask
+    elif not isinstance(values, SamplePlanes):
+        try:
+            samples = np.asanyarray(without_device(values))
+        except (TypeError, ValueError, RuntimeError):  # ragged lists
+            raise GridError(f"values are {seen(values)}: give an array of three axes") from None
+    if hasattr(samples, "mask"):  # of a masked array: what is masked is unknown
+        if samples.dtype.kind in "fiu":
+            samples = samples.astype(np.result_type(samples.dtype, np.float32))
+        samples = np.ma.filled(samples, np.nan if samples.dtype.kind == "f" else False)
+    check_kind(samples.dtype, samples.shape)
+    return cast(SampleArray, samples)
 
 
 def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
@@ -297,7 +297,7 @@ def in_rows(matrix: Any) -> str:
 
 def placed(
     values: Any, spacing: ArrayLike | None = None, origin: ArrayLike | None = None
-) -> tuple[Any, ArrayLike | None, ArrayLike | None]:
+) -> tuple[SampleArray, ArrayLike | None, ArrayLike | None]:
     """Return samples along x, y and z, spacing and origin; of a ``DataArray``, by its coordinates.
 
     What is given replaces that of the coordinates; None is not known. Dimensions are x, y and z in
@@ -305,7 +305,7 @@ def placed(
     """
     xarray: Any = sys.modules.get("xarray")
     if xarray is None or not isinstance(values, (xarray.DataArray, xarray.Dataset)):
-        return values, spacing, origin
+        return as_samples(values), spacing, origin
     if isinstance(values, xarray.Dataset):
         names = ", ".join(map(str, values.data_vars)) or "none"
         raise GridError(f"values are a Dataset: give one of its arrays ({names})")
@@ -330,7 +330,7 @@ def placed(
         steps.append(abs(step))
         samples = np.flip(samples, axis) if step < 0 else samples
     spacing = steps or None if spacing is None else spacing
-    return samples, spacing, lowest or None if origin is None else origin
+    return as_samples(samples), spacing, lowest or None if origin is None else origin
 
 
 def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
@@ -346,9 +346,8 @@ def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
     if step == 0 or not off <= EVEN * abs(step) + np.spacing(np.abs(coordinates).max()):
         usual = float(np.nanmedian(steps))
         worst = int(np.nan_to_num(np.abs(steps - usual), nan=np.inf).argmax())
-        raise GridError(
-            f"{said} are not evenly spaced: {places[worst]:.6g} is followed by "
-            f"{places[worst + 1]:.6g}, a step of {steps[worst]:.6g} among steps of {usual:.6g}; "
-            f"resample the array (array.interp({name}=...))"
-        )
+        pair = f"{places[worst]:.6g} is followed by {places[worst + 1]:.6g}"
+        pair = f"{pair}, a step of {steps[worst]:.6g} among steps of {usual:.6g}"
+        how = f"resample the array (array.interp({name}=...))"
+        raise GridError(f"{said} are not evenly spaced: {pair}; {how}")
     return first, step

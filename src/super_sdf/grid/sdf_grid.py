@@ -23,10 +23,8 @@ from .samples import (
     Index,
     SampleArray,
     SamplePlanes,
-    as_samples,
     as_triple,
     check_direction,
-    check_kind,
     check_spacing,
     cropped,
     in_rows,
@@ -90,8 +88,10 @@ class SdfGrid:
     low: float
     high: float
     field: Field
-    space: str | None
-    on_sample: tuple[BoolArray, ...] | None  # of each axis, if resampled: which planes are samples
+    space: str | None = None
+    on_sample: tuple[BoolArray, ...] | None = (
+        None  # of each axis, if resampled: which planes are samples
+    )
 
     def __init__(
         self,
@@ -100,10 +100,8 @@ class SdfGrid:
         origin: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
-        values, _, origin = placed(values, spacing, origin)
-        samples, h = as_samples(values), max(check_spacing(spacing))
-        check_kind(samples.dtype, samples.shape)
-        look = look_at(samples)
+        samples, _, origin = placed(values, spacing, origin)
+        h, look = max(check_spacing(spacing)), look_at(samples)
         if not look.is_finite:
             bad = (np.argwhere(~np.isfinite(plane)) for plane in samples)
             i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
@@ -172,8 +170,6 @@ class SdfGrid:
             low=low,
             high=high,
             field=field,
-            space=None,
-            on_sample=None,
         )
         return grid
 
@@ -189,8 +185,8 @@ class SdfGrid:
     @property
     def values(self) -> NDArray[Any]:
         """All samples, negative inside."""
-        samples = self.samples
-        return samples.loaded if isinstance(samples, SamplePlanes) else samples
+        whole: NDArray[Any] = np.asanyarray(self.samples)
+        return whole
 
     def planes(self, first: int, last: int) -> NDArray[Any]:
         """Return the samples with first <= i < last, negative inside, (last - first, ny, nz)."""
@@ -308,8 +304,8 @@ def make_grid(
     """
     told: dict[str, Any] = {"label": label, "level": level, "scale": scale, "unknown": unknown}
     wanted = Options(inside=inside, field=field, **told)
-    values, spacing, origin = placed(values, spacing, origin)
-    taken = interpret(as_samples(values), wanted, spacing, hint)
+    samples, spacing, origin = placed(values, spacing, origin)
+    taken = interpret(samples, wanted, spacing, hint)
     if origin is None:
         taken["notes"] += ("origin not given: sample (0, 0, 0) is at 0, 0, 0",)
         origin = 0.0
@@ -352,13 +348,8 @@ def crop(grid: SdfGrid, low: Index, high: Index) -> SdfGrid:
 
 def describe_place(grid: SdfGrid) -> dict[str, Any]:
     """Return where the samples of a grid lie, for JSON."""
-    return {
-        "shape": list(grid.shape),
-        "spacing": list(grid.spacing),
-        "origin": list(grid.origin),
-        "direction": [list(row) for row in grid.direction],
-        "space": grid.space,
-    }
+    names = ("shape", "spacing", "origin", "direction", "space")
+    return {name: getattr(grid, name) for name in names}
 
 
 def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:

@@ -23,7 +23,7 @@ from ..files.readers import PLACE
 from ..grid.derived import extremes_of_masks
 from ..grid.interpret import MASK
 from ..grid.look import MOST_LABELS, as_labels, named
-from ..grid.samples import as_samples, check_kind, check_spacing, placed
+from ..grid.samples import check_spacing, placed
 from ..grid.sdf_grid import SdfGrid, mean_spacing, with_fields
 from ..network.contract import Decoder, adapt
 from ..network.network import load_network, network_for
@@ -110,9 +110,7 @@ def find_image(
         values, notes = place["values"], list(place["notes"])
     elif asked.axes is not None:
         raise OptionError(f"--axes is {seen(asked.axes)}: that is for files; transpose the array")
-    values, spacing, origin = placed(values, place["spacing"], place["origin"])
-    samples = as_samples(values)
-    check_kind(samples.dtype, samples.shape)
+    samples, spacing, origin = placed(values, place["spacing"], place["origin"])
     counts, numbers, missing = find_labels(
         as_labels(samples), in_order(asked.labels), partly=partly
     )
