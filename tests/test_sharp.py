@@ -1,6 +1,7 @@
 """The mesher that keeps edges and corners: where they lie, and a manifold on anything."""
 
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruc
 from super_sdf.surface.sharp import features
 from super_sdf.truth.solid import Solid, read_mesh
 
+extract_sharp = partial(extract_mesh, mesher="sharp")
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
 BOX = np.array([6.2, 5.1, 4.3])
 
@@ -30,10 +32,6 @@ def turned_box(half=BOX, samples=22):
 
 def intersections(mesh):
     return len(Solid(mesh).intersecting())
-
-
-def extract_sharp(field, grid):
-    return extract_mesh(field, grid, mesher="sharp")
 
 
 def test_a_smooth_surface_and_a_field_that_is_no_distance_stay_those_of_marching_cubes():
