@@ -168,6 +168,8 @@ def test_missing_doubled_tilted_and_unplaced_slices_are_refused():
 
     gap = said("gap", of=[image for k, image in enumerate(images) if k != 6])
     assert "gap: IM011 is 0.54 mm off from even steps of 0.96: put all slices of one" in gap
+    Path("gap/IM000").write_bytes(Path("gap/IM000").read_bytes()[:300])
+    assert "gap/IM000 is damaged, or no DICOM file: replace it" in said_of("gap")
     save_slices("twice", images[3:5], "b")
     assert "off from even steps" in said("twice")
     one = said("one", of=images[:1])

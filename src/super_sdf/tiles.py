@@ -8,6 +8,7 @@ vertex is that of its owner.
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -150,17 +151,16 @@ def plan(
         part = before[np.ix_(*zip(low, high))]
         return int(np.diff(np.diff(np.diff(part, axis=0), axis=1), axis=2).sum())
 
-    boxes: list[Box] = [((0, 0, 0), as_index(cells.shape))]
-    done: list[Box] = []
+    whole: Box = ((0, 0, 0), as_index(cells.shape))
+    boxes, done = [(seen(whole), whole)], list[Box]()  # from the smallest to the largest
     while boxes:
-        boxes.sort(key=seen)
-        box = boxes.pop()
-        needed = seen(box)
+        needed, box = boxes.pop()
         if needed <= most and len(boxes) + len(done) + 1 >= least:
-            done += [box, *boxes]
+            done += [box, *(other for _, other in boxes)]
             break
         if halves := _halves(box, cells, -(-LEAST_SIDE // side)):
-            boxes += halves
+            for half in halves:
+                insort(boxes, (seen(half), half))
         elif room is None or needed <= most:
             done.append(box)
         else:

@@ -141,8 +141,8 @@ def look_at(samples: SampleArray) -> Look:
         sides += [] if former is None else [(inside, former)]
         changes[i] = sum(int(np.count_nonzero(a != b)) for a, b in sides)
         former = inside
-        faces += [plane.ravel()] if i in (0, len(samples) - 1) else []
-        faces += [plane[0], plane[-1], plane[:, 0], plane[:, -1]]
+        ends = [plane.ravel()] if i in (0, len(samples) - 1) else []
+        faces += [x.copy() for x in (*ends, plane[0], plane[-1], plane[:, 0], plane[:, -1])]
         if i % 16 == 0:
             let_go(samples)
     if high <= 0:

@@ -5,14 +5,14 @@
 3. Do they follow from the sides of the samples, as in a distance transform? A mask.
 4. Does a value of many samples stand for unknown ones? It is left out.
 5. Is the commonest slope that of nearly all smooth samples, and contradicts no sample two others?
-   Distances; the slope is the spacing in the unit of the values. Where parts touch inside, the
-   field is smooth.
-6. Is all that contradicts distances explained by noise? Noisy distances.
-7. Is 0 no level of theirs: one side only, few different values, or most of them near 0? Densities.
+   Distances, also if they are cut off so near that few slopes are left; the slope is the spacing
+   in the unit of the values. Where parts touch inside, the field is smooth.
+6. Is 0 no level of theirs: one side only, few different values, or most of them near 0? Densities,
+   but for distances that were rounded, which are noisy.
+7. Does noise explain all that contradicts distances of the given spacing? Noisy distances.
 8. Everything else is smooth: the surface at 0 is that of its cubic spline.
 
-Lengths are in spacings, values in the slope of a distance. Every threshold stands in a gap that was
-measured; the gap is the comment beside it.
+Lengths are in spacings, values in the slope of a distance. A comment has each threshold's gap.
 """
 
 from __future__ import annotations
@@ -80,14 +80,7 @@ SLOPE_NEAR = 0.5, 1.25  # of these: cut off at half a voxel .55 to 1.05, in half
 SLOPE_OFF = 0.25  # of rounded distances from 1
 SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
 THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
-# 6. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
-# samples of all.
-NOISE = 0.05  # uniform noise of .05 to .5 voxel and Gaussian to .033; logits .087, networks .096
-MOST_NOISE = 1.0  # spacings: with more, distances beside the surface say nothing of it
-NOISES = 2.5  # times its deviation, by which noise may make two samples differ
-SPREAD = 0.34  # of fourth differences, lowest quarter over median: noise from .39, fused to .29
-SMOOTH_SHARE = 0.06  # noise of .05 voxel to .03; fields of other slopes from .10
-# 7. Densities: range over the smallest step; median of the sizes over the largest, with more
+# 6. Densities: range over the smallest step; median of the sizes over the largest, with more
 # surface at 0 than at the level that parts them best; valleys per sample of a face. Distances may
 # be rounded, to this part of the spacing.
 ROUNDED = 1.0
@@ -97,6 +90,13 @@ CENTRED = 0.13  # maps of density and statistics to .11, fields from .15
 AREA = 1.0  # fields to 1.11 and d^3 1.02 with centres from .15, maps from 1.14
 RISING = 0.1  # of steps between neighbours, median over steepest: images to .03, distances from .3
 VALLEY = 0.2, 1.5  # unsigned distances .3 to .6; densities .05, noise 3
+# 7. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
+# samples of all.
+NOISE = 0.05  # uniform noise of .05 to .5 voxel and Gaussian to .033; logits .087, networks .096
+MOST_NOISE = 1.0  # spacings: with more, distances beside the surface say nothing of it
+NOISES = 2.5  # times its deviation, by which noise may make two samples differ
+SPREAD = 0.34  # of fourth differences, lowest quarter over median: noise from .39, fused to .29
+SMOOTH_SHARE = 0.06  # noise of .05 voxel to .03; fields of other slopes from .10
 ENOUGH = 20  # samples from which a share is evidence
 
 MIDDLE = 62  # of the samples in a box of 5 x 5 x 5
@@ -402,7 +402,7 @@ def _steps_of_cut(look: Look, given: Floats | None, facts: dict[str, Any]) -> Fl
     return steps if is_even and _contradictions(look, steps, facts["digit"]) <= NEVER else None
 
 
-# Questions 6 to 8: noise, densities, smooth fields
+# Questions 6 to 8: densities, noise, smooth fields
 
 
 def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answer:

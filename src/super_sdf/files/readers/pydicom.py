@@ -59,8 +59,7 @@ def read_dicom(request: Request) -> Volume:
         if header.get("SOPClassUID") in (BITS, LABEL_MAP)
     }
     named = {name: uid for uid, found in segments.items() for name in found.values()}
-    names = [*series, *(named if request.member else ())]
-    name = request.choose(names, "series of DICOM images")
+    name = request.choose([*series, *(named if request.member else ())], "series of DICOM images")
     images = series[named.get(name, name)]
     frames, labels = list(_frames(images)), segments.get(named.get(name, name))
     if labels is None:
@@ -80,12 +79,15 @@ def _images_in(path: Path) -> dict[str, list[tuple[Path, Any]]]:
     for file in [check_beside(path, name) for name in sorted(names)] if path.is_dir() else [path]:
         with file.open("rb") as opened:
             start = opened.read(PREAMBLE + 4)
-        if start[PREAMBLE:] == b"DICM":
-            header = pydicom.dcmread(file, stop_before_pixels=True)
-            if "Rows" in header:  # a folder may hold other documents, too
-                uid = str(header.get("SeriesInstanceUID", ""))
-                series.setdefault(uid, []).append((file, header))
-        elif file.suffix.lower() == ".dcm" or not any(start):
+        is_dicom = start[PREAMBLE:] == b"DICM"
+        header: Any = pydicom.dcmread(file, stop_before_pixels=True) if is_dicom else {}
+        if "Rows" in header:
+            series.setdefault(str(header.get("SeriesInstanceUID", "")), []).append((file, header))
+            continue
+        # a folder may hold other files, too, and other documents of DICOM
+        kind = header.file_meta.get("MediaStorageSOPClassUID") if is_dicom else None
+        is_other = "Image" not in kind.name if kind else not is_dicom and any(start)
+        if (file.suffix.lower() == ".dcm" and not kind) or not is_other:
             raise FileError(f"{file} is damaged, or no DICOM file: replace it, or remove it")
     return series
 
@@ -182,8 +184,8 @@ def _of_images(frames: list[_Frame]) -> Volume:
     def use(plane: NDArray[Any], frame: _Frame, values: NDArray[Any]) -> None:
         plane[:] = values if is_plain else values * frame.scale[0] + frame.scale[1]
 
-    step = float(np.ptp(heights)) / (count - 1)
-    return _volume(frames, heights.argsort().argsort(), step, use, dtype)
+    step, planes = float(np.ptp(heights)) / (count - 1), heights.argsort().argsort()
+    return _volume(frames, planes, step, use, dtype)
 
 
 def _of_segments(
@@ -208,7 +210,6 @@ def _of_segments(
                 raise GridError(f"its segments overlap: give one of them, {said}")
             plane[inside] = 1 if chosen else frame.segment
 
-    names: Names = {number: (label, None) for number, label in labels.items()}
-    names = {1: names[chosen[0]]} if chosen else names
+    names: Names = {1 if chosen else n: (labels[n], None) for n in chosen or labels}
     dtype = np.dtype(np.uint8 if chosen or max(labels) < 256 else np.uint16)
     return _volume(frames, planes, step, use, dtype, hint="" if chosen else LABELS, names=names)

@@ -59,8 +59,7 @@ def _imagej_axes(file: Any) -> dict[str, Axis]:
 
 def _ome_axes(ome: ElementTree.Element) -> dict[str, Axis]:
     """Return those axes by their names whose spacing the metadata of OME states."""
-    pixels = ome.find(".//{*}Pixels")
-    about = {} if pixels is None else pixels.attrib
+    about: dict[str, str] = getattr(ome.find(".//{*}Pixels"), "attrib", {})
     sizes = {axis: float(about.get(f"PhysicalSize{axis.upper()}") or 0) for axis in "xyz"}
     units = {axis: about.get(f"PhysicalSize{axis.upper()}Unit", "µm") for axis in "xyz"}
     return {axis: Axis(axis, units[axis], size) for axis, size in sizes.items() if size > 0}
