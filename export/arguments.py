@@ -26,26 +26,22 @@ class Parser(argparse.ArgumentParser):
             self.exit(1, f"Error: {getattr(error, 'flagged', error)}\n")
 
 
-def share(text: str) -> float:
-    number = float(text)
-    if not 0 <= number <= 1:
-        raise argparse.ArgumentTypeError(f"{text}: give a number from 0 to 1")
+def numbers(
+    said: str, allowed: Callable[[float], bool], kind: Callable[[str], float] = float
+) -> Callable[[str], float]:
+    """Return a parser for the numbers that are ``allowed``; others are told what is ``said``."""
+
+    def number(text: str) -> float:
+        if not allowed(value := kind(text)):
+            raise argparse.ArgumentTypeError(f"{text}: give {said}")
+        return value
+
     return number
 
 
-def positive(text: str) -> float:
-    number = float(text)
-    if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"{text}: give a number greater than 0")
-    return number
+share = numbers("a number from 0 to 1", lambda number: 0 <= number <= 1)
+positive = numbers("a number greater than 0", lambda number: 0 < number < math.inf)
 
 
-def at_least(least: int) -> Callable[[str], int]:
-    """Return a parser for whole numbers of at least ``least``."""
-
-    def whole(text: str) -> int:
-        if int(text) < least:
-            raise argparse.ArgumentTypeError(f"{text}: give at least {least}")
-        return int(text)
-
-    return whole
+def at_least(least: int) -> Callable[[str], float]:
+    return numbers(f"at least {least}", lambda number: number >= least, int)

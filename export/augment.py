@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import permutations, product
-from math import prod
 
 import numpy as np
 import torch
@@ -71,13 +70,8 @@ def prepare(sample: Sample) -> Prepared:
 
 
 def cube_symmetries() -> IntArray:
-    """Return the 48 rotations and reflections of the cube as matrices, (48, 3, 3) int32.
-
-    The first is the identity, the next three are half turns about the axes; the first eight keep
-    every axis on itself.
-    """
-    by_handedness = sorted(product((1, -1), repeat=3), key=lambda sign: -prod(sign))
-    signs = [np.diag(sign) for sign in by_handedness]
+    """Return the 48 rotations and reflections of the cube as matrices, (48, 3, 3) int32."""
+    signs = [np.diag(sign) for sign in product((1, -1), repeat=3)]
     orders = [np.eye(3, dtype=np.int32)[list(order)] for order in permutations(range(3))]
     return np.array([sign @ order for order in orders for sign in signs], np.int32)
 

@@ -148,14 +148,6 @@ def capped(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     return loss, weight / weight.sum()
 
 
-def write_rule(rule: features.Rule) -> None:
-    """Write the rule into the package, each weight under the name that it has there."""
-    names = json.loads(features.RULE.read_text())["weights"]
-    weights = {name: round(weight, 4) for name, weight in zip(names, rule.weights, strict=True)}
-    stored = json.dumps({"bias": round(rule.bias, 4), "weights": weights}, indent=2)
-    features.RULE.write_text(stored + "\n")
-
-
 def main(words: Sequence[str] | None = None) -> None:
     """Gather rows, or read those of a file, fit the rule, and print what is lost."""
     parser = Parser(description=__doc__.split("\n")[0])
@@ -175,7 +167,10 @@ def main(words: Sequence[str] | None = None) -> None:
     for name, some in {"middle": 0 * ways, "rule": ways, "edge": 0 * ways + 1}.items():
         print(f"{name}: {weight @ loss_of(loss, some)[0]:.4f}")
     if options.write:
-        write_rule(rule)
+        names = json.loads(features.RULE.read_text())["weights"]
+        weights = {name: round(weight, 4) for name, weight in zip(names, rule.weights, strict=True)}
+        stored = json.dumps({"bias": round(rule.bias, 4), "weights": weights}, indent=2)
+        features.RULE.write_text(stored + "\n")
 
 
 if __name__ == "__main__":

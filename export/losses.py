@@ -122,15 +122,10 @@ def side_by_side(tables: Sequence[Tensor], starts: np.ndarray) -> Tensor:
     return torch.cat([torch.where(table < 0, end, table + at) for table, at in pairs])
 
 
-def encode(net: SuperSdfNet, batch: Batch, share: float | None = None) -> Encoded:
-    """Return the inputs of the head for all voxels of the band; for ``share`` see ``Gate.rows``."""
-    return net.encode_all(batch.patches, batch.table, share)
-
-
-def predict(net: SuperSdfNet, batch: Batch, encoded: Encoded) -> Tensor:
-    """Return the values (D, Q) of a batch that was encoded; those of shared nodes are averaged."""
-    voxels = encoded.some(batch.voxels)
-    values = net.decode_parts(voxels, batch.counts, batch.moved)
+def predict(net: SuperSdfNet, batch: Batch, encoded: Encoded | None = None) -> Tensor:
+    """Return the values (D, Q) of a batch, encoded or not; those of shared nodes are averaged."""
+    voxels = (encoded or net.encode_all(batch.patches, batch.table)).some(batch.voxels)
+    values = net.decode(voxels, batch.counts, batch.moved)
     rows = batch.near.gather(1, batch.place[batch.window])
     query, there = batch.query[batch.window], (rows < len(values)).to(values.dtype)
     seen = torch.cat([values, values.new_zeros(1, values.shape[1])]).gather(0, rows)
@@ -163,17 +158,18 @@ def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
     blocks, and the error of what the gate says of this.
     """
 
-    def lost(encoded: Encoded) -> Tensor:
+    def lost(encoded: Encoded | None = None) -> Tensor:
         return voxel_losses(predict(net, batch, encoded), batch.targets, recipe)
 
     if net.config.gated:
         low, high = recipe.shares_gated
-        encoded = encode(net, batch, low + (high - low) * float(torch.rand(())))
+        share = low + (high - low) * float(torch.rand(()))
+        encoded = net.encode_all(batch.patches, batch.table, share)
         of_first = lost(replace(encoded, features=encoded.early))
         apart = encoded.doubts[batch.voxels] - of_first.detach().log()
         loss = recipe.first_weight * of_first + recipe.gate_weight * apart.abs() + lost(encoded)
     else:
-        loss = lost(encode(net, batch))
+        loss = lost()
     sums = loss.new_zeros(len(batch.counts)).index_add(0, batch.window, loss)
     return sums / torch.tensor(batch.counts, device=loss.device)
 
@@ -197,8 +193,9 @@ class Errors:
 def measure(net: SuperSdfNet, samples: Sequence[Prepared]) -> Errors:
     """Return the errors of samples, in float32, as the exported network computes."""
     with torch.no_grad():
-        batches = [batch_of([sample.on(net.device)]) for sample in samples]
-        errors = [errors_of(predict(net, batch, encode(net, batch)), batch) for batch in batches]
+        device = net.correction.weight.device
+        batches = [batch_of([sample.on(device)]) for sample in samples]
+        errors = [errors_of(predict(net, batch), batch) for batch in batches]
     return Errors(*np.nanmean(errors, axis=0).tolist())
 
 

@@ -4,9 +4,9 @@
     features of D voxels, offsets (Q, 3)     -> values (D, Q)            the head
 
 The encoder is a stem on the 27 samples and a stack of residual blocks, each a convolution over
-the 27 neighbours (a gather and a matrix product) and a pointwise layer. The head is a branch and
-a trunk: coefficients per voxel times functions of the offset. It adds a residual to the quadratic
-interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
+27, 19 or 7 neighbours (a gather and a matrix product) and a pointwise layer. The head is a branch
+and a trunk: coefficients per voxel times functions of the offset. It adds a residual to the
+quadratic interpolation of the patch. All lengths are in half voxels (Eqs. 4 and 5).
 
 A network may be gated: its last blocks run only on the voxels on which much is still lost after the
 first ones, as a gate says. Neighbours stay as they are there. The head gets all other voxels from a
@@ -23,10 +23,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from super_sdf.arrays import CENTRE
+from super_sdf.arrays import CENTRE, NEIGHBOURHOOD
 from super_sdf.refine import band
 
 
@@ -42,6 +43,7 @@ class NetworkConfig:
     frequencies: int = 4
     keeps_samples: bool = True  # the sample's value, where it can be a distance; not with masks
     gated: int = 0  # of the blocks, the last ones, that run only where the gate is open
+    places: tuple[int, ...] = ()  # that each of ``all_blocks`` sees; all 27 if nothing is given
 
     @property
     def receptive_field(self) -> int:
@@ -57,13 +59,18 @@ SIZES = {
 """The sizes of the shipped networks, by name."""
 
 
+PLACES = {
+    n: np.flatnonzero(np.abs(NEIGHBOURHOOD).sum(1) <= k) for k, n in enumerate((1, 7, 19, 27))
+}
+"""Which of the 27 places a block sees, by their number: without corners, or the faces only."""
+
 CHUNK = 1024  # voxels gathered at a time on a CPU, so that their columns stay in cache
 
 
 class GatherMatMul(torch.autograd.Function):
     """The columns of features times a weight, differentiated without a scatter.
 
-    If u is v's neighbour at place k, then v is u's neighbour at place 26 - k. So the gradient is a
+    If u is v's neighbour at place k of n, then v is u's at place n - 1 - k. So the gradient is a
     convolution, too, with the places reversed, and no scatter-add is needed. The columns are
     gathered again for it: at 27 times the features they would fill the memory.
 
@@ -73,7 +80,7 @@ class GatherMatMul(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, features: Tensor, weight: Tensor, table: Tensor, around: Tensor) -> Tensor:
-        """Map features (V, C), weight (27 C, C_out) and table (V, 27) to (V, C_out)."""
+        """Map features (V, C), weight (n C, C_out) and table (V, n) to (V, C_out)."""
         ctx.save_for_backward(features, weight, table, around)
         return convolve(torch.cat([features, around]), weight, table)
 
@@ -81,7 +88,7 @@ class GatherMatMul(torch.autograd.Function):
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, None, None]:
         """Map the gradient (V, C_out) to the gradients of features and weight."""
         features, weight, table, around = ctx.saved_tensors
-        reversed_weight = weight.view(27, -1, weight.shape[1]).flip(0).transpose(1, 2)
+        reversed_weight = weight.view(table.shape[1], -1, weight.shape[1]).flip(0).transpose(1, 2)
         of_features = convolve(
             grad, reversed_weight.reshape(-1, features.shape[1]), table.clamp(max=len(grad))
         )
@@ -101,7 +108,7 @@ def convolve(features: Tensor, weight: Tensor, table: Tensor) -> Tensor:
 
 
 def gathered(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
-    """Yield the rows that a table (V, 27) names side by side, (n, 27 C), and which voxels they are.
+    """Yield the rows that a table (V, n) names side by side, (m, n C), and which voxels they are.
 
     A row of zeros stands for an absent voxel. On a GPU they come all at once.
     """
@@ -120,17 +127,19 @@ def gathered(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
 
 
 class NeighbourConv(nn.Module):
-    """A sparse 3x3x3 convolution over the band."""
+    """A sparse convolution over the band, of which a voxel sees some of the 27 places."""
 
-    def __init__(self, channels: int) -> None:
+    def __init__(self, channels: int, places: int) -> None:
         super().__init__()
-        rows = 27 * channels
+        self.places, rows = places, places * channels
         self.weight = nn.Parameter(torch.randn(rows, channels) / rows**0.5)
         self.bias = nn.Parameter(torch.zeros(channels))
 
     def forward(self, features: Tensor, table: Tensor, around: Tensor | None = None) -> Tensor:
         """Map (V, C) to (V, C); ``around`` (N, C) are other voxels that the table names."""
         dtype = torch.bfloat16 if torch.is_autocast_enabled(features.device.type) else torch.float32
+        if self.places < table.shape[1]:
+            table = table[:, PLACES[self.places]]
         others = (features[:0] if around is None else around).detach().to(dtype)
         mixed = GatherMatMul.apply(features.to(dtype), self.weight.to(dtype), table, others)
         return mixed + self.bias.to(dtype)
@@ -139,9 +148,9 @@ class NeighbourConv(nn.Module):
 class Block(nn.Module):
     """A residual block: neighbour convolution, then a pointwise layer; starts as the identity."""
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, config: NetworkConfig, places: int) -> None:
         super().__init__()
-        self.conv = NeighbourConv(config.channels)
+        self.conv = NeighbourConv(config.channels, places)
         self.expand = nn.Linear(config.channels, config.hidden)
         self.reduce = nn.Linear(config.hidden, config.channels)
         nn.init.normal_(self.reduce.weight, std=0.02)
@@ -249,9 +258,10 @@ class SuperSdfNet(nn.Module):
         self.stem = nn.Sequential(
             nn.Linear(27, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.channels)
         )
-        self.blocks = nn.ModuleList(Block(config) for _ in range(config.blocks))
+        places = config.places or [27] * (config.blocks + 1)
+        self.blocks = nn.ModuleList(Block(config, count) for count in places[: config.blocks])
         if config.gated:
-            self.early = Block(config)
+            self.early = Block(config, places[config.blocks])
             self.gate = Gate(config)
         self.branch = nn.Linear(config.channels, config.functions - config.channels)
         self.correction = nn.Linear(config.channels, 1)
@@ -295,18 +305,10 @@ class SuperSdfNet(nn.Module):
         features = early.index_copy(0, rows, self.deepen(first, table, rows))
         return Encoded(features, patches, noisy, early, doubts)
 
-    @property
-    def device(self) -> torch.device:
-        return self.correction.weight.device
-
     def all_blocks(self) -> nn.ModuleList:
         return nn.ModuleList([*self.blocks, *([self.early] if self.config.gated else [])])
 
-    def decode(self, voxels: Encoded, offsets: Tensor) -> Tensor:
-        """Return the values (D, Q) of voxels at offsets (Q, 3)."""
-        return self.decode_parts(voxels, [len(voxels.features)], offsets[None])
-
-    def decode_parts(self, voxels: Encoded, counts: list[int], offsets: Tensor) -> Tensor:
+    def decode(self, voxels: Encoded, counts: list[int], offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of samples side by side, each at its offsets, (B, Q, 3).
 
         Of the D voxels the first ``counts[0]`` are of the first sample, and so on.
@@ -323,7 +325,8 @@ class SuperSdfNet(nn.Module):
     def forward(self, patches: Tensor, table: Tensor, voxels: Tensor, offsets: Tensor) -> Tensor:
         """Return the values (D, Q) of the voxels (D,) at the offsets (Q, 3)."""
         table = torch.where(table < 0, len(patches), table)  # index of the row of zeros
-        return self.decode(self.encode_all(patches, table).some(voxels), offsets)
+        encoded = self.encode_all(patches, table).some(voxels)
+        return self.decode(encoded, [len(voxels)], offsets[None])
 
 
 def in_float32(given: Tensor) -> torch.autocast:

@@ -23,7 +23,7 @@ import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
 
-from export.network import SuperSdfNet
+from export.network import PLACES, SuperSdfNet
 from super_sdf.arrays import CENTRE
 from super_sdf.network import onnx as sessions
 from super_sdf.refine import band
@@ -61,6 +61,7 @@ class Graph(Writer):
         self.net, self.channels = net, net.config.channels
         named = [*net.named_parameters(), *net.named_buffers()]
         self.names = {id(tensor): name for name, tensor in named}
+        self.tables = {27: "neighbours"}  # by the number of places of its rows
 
     def whole(self, number: int) -> str:
         return self.constant(np.array(number, np.int64))
@@ -121,7 +122,12 @@ def rows_of(name: str, kind: int, *width: int | str) -> Declared:
 def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     graph = Graph(net)
     rows = graph.op("Shape", "patches", start=0, end=1)
-    numbers, there = chunked_voxels(graph, rows)
+    end = graph.op("Squeeze", graph.op("Add", rows, fill_up(graph, rows, CHUNK_INPUT)))
+    numbers = graph.op("Range", graph.whole(0), end, graph.whole(1))
+    numbers, there = masked_chunks(graph, numbers, graph.op("Squeeze", rows))
+    for count in sorted({block.conv.places for block in net.all_blocks()} - {27}):
+        columns = graph.wholes(*PLACES[count])
+        graph.tables[count] = graph.op("Gather", "neighbours", columns, axis=1)
     features, excess = scan_stem(graph, numbers, there)
     channels, gated = net.config.channels, net.config.gated
     for number in range(len(net.blocks) - gated):
@@ -151,18 +157,11 @@ def fill_up(graph: Graph, count: str, size: str) -> str:
     return graph.op("Sub", size, graph.op("Mod", count, size))
 
 
-def chunked_voxels(graph: Graph, rows: str) -> tuple[str, str]:
-    """Return the indices of the voxels, (n, chunk), and a mask of 1 and 0, (n, chunk, 1).
-
-    Padding has the index of the last voxel and mask 0.
-    """
-    end = graph.op("Squeeze", graph.op("Add", rows, fill_up(graph, rows, CHUNK_INPUT)))
-    numbers = graph.op("Range", graph.whole(0), end, graph.whole(1))
-    return masked_chunks(graph, numbers, graph.op("Squeeze", rows))
-
-
 def masked_chunks(graph: Graph, numbers: str, count: str) -> tuple[str, str]:
-    """Return indices of voxels in chunks, and a mask: see ``chunked_voxels``."""
+    """Return indices of voxels, (n, chunk), and a mask of 1 and 0, (n, chunk, 1).
+
+    Numbers from ``count`` on are padding: they have the index of the last voxel and mask 0.
+    """
     there = graph.op("Cast", graph.op("Less", numbers, count), to=TensorProto.FLOAT)
     last = graph.op("Sub", count, graph.whole(1))
     shape = graph.op("Concat", graph.wholes(-1), CHUNK_INPUT, axis=0)
@@ -204,9 +203,9 @@ def scan_block(
     """
     block = graph.net.early if number == EARLY else graph.net.blocks[number]
     body = Graph(graph.net, f"block{number}_")
-    table = body.op("Gather", "neighbours", "some", axis=0)
+    table = body.op("Gather", graph.tables[block.conv.places], "some", axis=0)
     gathered = body.op("Gather", everywhere, table, axis=0)
-    columns = body.op("Reshape", gathered, body.wholes(-1, 27 * graph.channels))
+    columns = body.op("Reshape", gathered, body.wholes(-1, len(block.conv.weight)))
     product = body.op("MatMul", columns, body.parameter(block.conv.weight))
     mixed = body.op("Relu", body.op("Add", product, body.parameter(block.conv.bias)))
     change = body.op("Mul", body.two_layers(mixed, block.expand, block.reduce), "there")

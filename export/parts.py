@@ -16,6 +16,7 @@ beside the pocket of a rod), the least arc of fillets and diameter of drillings.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -188,19 +189,14 @@ def enclosure(rng: np.random.Generator) -> Manifold:
 KINDS: tuple[Kind, ...] = (housing, block, rod, clevis, slide, enclosure)
 
 
-def drawn(rng: np.random.Generator, kind: Kind) -> Manifold:
-    """Draw a part of diagonal 1; measures to which an edge does not fit are drawn again."""
-    while True:
-        try:
-            return unit_sized(kind(rng))
-        except ValueError:
-            continue
-
-
 def draw_part(number: int, seed: int = 0) -> tuple[str, Mesh]:
     """Return the name and the mesh of a part, its box centred and of diagonal 1."""
     kind, rng = KINDS[number % len(KINDS)], np.random.default_rng((seed, number))
-    solid = unit_sized(drawn(rng, kind).simplify(TOLERANCE))
+    solid = None
+    while solid is None:
+        with suppress(ValueError):  # an edge does not fit: other measures are drawn
+            solid = unit_sized(kind(rng))
+    solid = unit_sized(solid.simplify(TOLERANCE))
     return f"part-{number:02d}-{kind.__name__}", mesh_of(solid)
 
 

@@ -1,8 +1,7 @@
-r"""Write the int8 variant of an exported network, and check its error.
+"""Write the int8 variant of an exported network, and check its error.
 
-    python -m export.quantize src/super_sdf/models/base.onnx \
-        --out src/super_sdf/models/base-int8.onnx
-    python -m export.quantize src/super_sdf/models/base-int8.onnx   # optimises its graph again
+    python -m export.quantize base.onnx --out base-int8.onnx
+    python -m export.quantize base-int8.onnx   # optimises its graph again
 
 Only the blocks change; stem, head and the features between the blocks stay float32. Weights are
 integers with one scale per output channel. The features have one step, in units that make their
@@ -32,7 +31,7 @@ from onnx import TensorProto, numpy_helper
 from torch import Tensor, nn
 
 from export.augment import DISTANCES, Prepared, draw_samples
-from export.losses import batch_of, encode
+from export.losses import batch_of
 from export.network import Block, SuperSdfNet
 from export.onnx_graph import EARLY, Writer, declared, rows_of
 from export.to_onnx import read_card, read_network, write_model
@@ -85,7 +84,8 @@ def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
         block.expand.register_forward_hook(ranges.see_expand)
         found.append(ranges)
     for sample in samples:
-        encode(watched, batch_of([sample]))
+        batch = batch_of([sample])
+        watched.encode_all(batch.patches, batch.table)
     last = found[net.config.blocks - net.config.gated :]
     if last:
         low = torch.stack([each.low for each in last]).amin(0)
@@ -102,7 +102,7 @@ def in_even_units(net: SuperSdfNet, ranges: list[Ranges]) -> tuple[SuperSdfNet, 
     units = units.clamp(min=LEAST_STEP * units.max())
     net, count = copy.deepcopy(net), len(units)
     for block in net.all_blocks():
-        block.conv.weight *= units.repeat(27)[:, None]
+        block.conv.weight *= units.repeat(block.conv.places)[:, None]
     for layer in (net.stem[2], *(block.reduce for block in net.all_blocks())):
         layer.weight /= units[:, None]
         layer.bias /= units

@@ -1,12 +1,9 @@
-r"""Export a trained network as the ONNX file that the runtime loads, and check that they agree.
+"""Export a trained network as the ONNX file that the runtime loads, and check that they agree.
 
-    python -m export.to_onnx --run training/run --out src/super_sdf/models/base.onnx \
-        --data "..." --accuracy "..."
-    python -m export.to_onnx --from src/super_sdf/models/base.onnx \
-        --out src/super_sdf/models/base.onnx
+    python -m export.to_onnx --run training/run --out base.onnx --data "..." --accuracy "..."
+    python -m export.to_onnx --from base.onnx --out base.onnx   # the same in the current graph
 
-The second command rewrites a file with the same weights and metadata in the current graph. The
-result is kept only if its values are those of PyTorch to 1e-4 of a voxel.
+The result is kept only if its values are those of PyTorch to 1e-4 of a voxel.
 """
 
 from __future__ import annotations
@@ -90,15 +87,20 @@ def read_network(path: Path) -> SuperSdfNet:
     weights, card = read_weights(path), read_card(path)
     trunk, inputs = weights["trunk.layers.0.weight"].shape
     channels = len(weights["correction.weight"][0])
+    convs = {name for name in weights if name.endswith("conv.weight")}
+    early = convs & {"early.conv.weight"}
+    in_order = [*(f"blocks.{number}.conv.weight" for number in range(len(convs - early))), *early]
+    places = tuple(len(weights[name]) // channels for name in in_order)
     config = NetworkConfig(
         channels=channels,
-        blocks=sum(name.startswith("blocks.") and name.endswith("conv.bias") for name in weights),
+        blocks=len(convs - early),
         hidden=len(weights["stem.0.bias"]),
         functions=channels + len(weights["branch.bias"]),
         trunk=trunk,
         frequencies=(inputs - 3) // 6,
         keeps_samples=card.get("inputs") != contract.MASKS,
         gated=int(card.get("gated", 0)),
+        places=() if set(places) == {27} else places,
     )
     net = SuperSdfNet(config)
     net.load_state_dict(weights)

@@ -1,10 +1,7 @@
 """Train the network; resumable, with a log and a plot of the loss.
 
     python -m export.train --store training/store --run training/run --minutes 90   # or resume
-    python -m export.train --store training/store --run training/run --device cuda --by-clock
     python -m export.train ... --start src/super_sdf/models/base.onnx --rate 0.7   # its weights
-    python -m export.train ... --start src/super_sdf/models/base.onnx --blocks 14  # more blocks
-    python -m export.train ... --size mask --inputs masks   # the network for masks
 
 A run folder holds ``checkpoint.pt`` (weights, averaged weights, optimisers, time spent),
 ``log.csv`` and ``loss.png``, all written every five minutes. The learning rate depends on the share
@@ -31,9 +28,10 @@ from torch import Tensor
 from export.arguments import Parser, at_least, positive, share
 from export.augment import DISTANCES, INPUTS, USUAL
 from export.losses import RECIPE, Batch, Recipe, measure, window_losses
-from export.network import SIZES, SuperSdfNet
+from export.network import PLACES, SIZES, SuperSdfNet
 from export.store import HELD_OUT, Store, check_store
 from export.to_onnx import read_weights
+from super_sdf.arrays import CENTRE
 from super_sdf.errors import OptionError
 
 SAVE_SECONDS = 300  # between checkpoints, each with a line in the log
@@ -91,10 +89,12 @@ class Run:
 
     def start_from(self, weights: dict[str, Tensor]) -> None:
         """Take the weights of a network of this width; blocks that it lacks change nothing yet."""
-        fresh = {name: array.clone() for name, array in self.net.state_dict().items()}
+        fresh, weights = {n: a.clone() for n, a in self.net.state_dict().items()}, dict(weights)
         for name, array in fresh.items():
             if name not in weights and ".reduce." in name:
                 array.zero_()
+            if name in weights and name.endswith("conv.weight"):
+                weights[name] = of_places(weights[name], len(array))
         try:
             self.net.load_state_dict({**fresh, **weights})
         except RuntimeError as error:
@@ -127,6 +127,13 @@ class Run:
         for kept, buffer in zip(self.average.buffers(), self.net.buffers()):
             kept.copy_(buffer)
         return float(total.detach()), losses.tolist()
+
+
+def of_places(weight: Tensor, rows: int) -> Tensor:
+    """Return the rows of a convolution's weight, (n C, C), for the places that so many are for."""
+    width = weight.shape[1]
+    given, wanted = (PLACES.get(count // width, CENTRE) for count in (len(weight), rows))
+    return weight.view(-1, width, width)[np.isin(given, wanted)].flatten(0, 1)
 
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:
@@ -217,6 +224,8 @@ def main(words: Sequence[str] | None = None) -> None:
     add("--size", choices=SIZES, default="base", help="size of the network")
     add("--inputs", choices=INPUTS, default=DISTANCES, help="what the network is trained on")
     add("--start", type=Path, help="an .onnx file of that width to start from")
+    seen = "neighbours that each block sees, then that beside the gated ones; all if not given"
+    add("--places", type=int, nargs="+", choices=PLACES, default=(), help=seen)
     clock = "count the minutes from the start of this call, reading and pauses included"
     add("--by-clock", action="store_true", help=clock)
     add("--device", choices=["cpu", "cuda"], default="cpu")
@@ -238,6 +247,7 @@ def run_training(options: argparse.Namespace) -> None:
         blocks=options.blocks or size.blocks,
         keeps_samples=options.inputs == DISTANCES,
         gated=size.gated if options.gated is None else options.gated,
+        places=tuple(options.places),
     )
     drawn = {name: getattr(options, name) for name in ("shifted", "noisy", "truncated")}
     recipe = replace(

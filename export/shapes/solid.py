@@ -99,13 +99,6 @@ def draw_candidate(rng: np.random.Generator, families: Sequence[str] = ()) -> Ma
     return unit_sized(solid).simplify(TOLERANCE)
 
 
-def is_usable(solid: Manifold) -> bool:
-    """Say whether a solid of diagonal 1 is valid, has a volume and not too many faces."""
-    if solid.status() != Error.NoError or solid.num_tri() > MAX_FACES:
-        return False
-    return float(solid.volume()) > MIN_VOLUME
-
-
 def without_crumbs(mesh: Mesh) -> Mesh:
     """Drop the pieces, and fill the cavities, of less than 2 % of the largest piece's volume."""
     edges = mesh.faces[:, [0, 1, 2]], mesh.faces[:, [1, 2, 0]]
@@ -130,7 +123,8 @@ def random_solid(rng: np.random.Generator, families: Sequence[str] = ()) -> Mesh
     """
     for _ in range(ATTEMPTS):
         solid = draw_candidate(rng, families)
-        if is_usable(solid):
+        valid = solid.status() == Error.NoError and solid.num_tri() <= MAX_FACES
+        if valid and float(solid.volume()) > MIN_VOLUME:
             mesh = without_crumbs(mesh_of(solid))
             low, high = mesh.vertices.min(0), mesh.vertices.max(0)
             scale = 1 / float(np.linalg.norm(high - low))

@@ -8,8 +8,8 @@ import torch
 
 from export import dataset, measure, store, to_onnx, train
 from export.augment import CLEAN, DISTANCES, USUAL, change, masked, turned
-from export.losses import RECIPE, batch_of, encode, errors_of, predict, window_losses
-from export.network import SuperSdfNet, interpolation_weights
+from export.losses import RECIPE, batch_of, errors_of, predict, window_losses
+from export.network import PLACES, SuperSdfNet, interpolation_weights
 from export.shapes.smooth import ellipsoid
 from export.store import Sampler, Store, chances
 from export.tests.conftest import SMALL
@@ -100,10 +100,10 @@ def test_shared_nodes_have_the_mean_that_the_runtime_gives_them(net, prepared):
     sample = replace(sample, offsets=offsets, targets=torch.zeros(len(sample.voxels), len(offsets)))
     batch = batch_of([sample])
     with torch.no_grad():
-        encoded = encode(net, batch)
+        near = batch.near.numpy().astype(np.int32)
+        encoded = net.encode_all(batch.patches, batch.table)
         got = predict(net, batch, encoded).numpy()
-        singly = net.decode(encoded.some(sample.voxels), offsets).numpy()
-    near = batch.near.numpy().astype(np.int32)
+        singly = net.decode(encoded.some(sample.voxels), [len(near)], offsets[None]).numpy()
     blocks = np.append(singly.T, np.zeros((len(offsets), 1), np.float32), axis=1)
     nodes.average_shared(blocks, nodes.share_parts(np.where(near == len(near), -1, near)), 4)
     np.testing.assert_allclose(got, blocks[:, :-1].T, atol=1e-5)
@@ -141,16 +141,31 @@ def test_a_run_learns(tmp_path, samples):
 
 
 def test_a_network_starts_from_one_with_fewer_blocks_and_has_its_values(tmp_path, net, prepared):
-    larger = SuperSdfNet(replace(net.config, blocks=6, gated=net.config.gated and 4))
+    places = net.config.places and (27, 19, 7, 19, 27, 27, 7)
+    gated = net.config.gated and 4
+    larger = SuperSdfNet(replace(net.config, blocks=6, gated=gated, places=places))
     run = train.Run(tmp_path, larger)
     run.start_from(net.state_dict())
     batch = batch_of(prepared[:1])
     if not net.config.gated:
         with torch.no_grad():
-            values = [predict(each, batch, encode(each, batch)) for each in (net, run.average)]
+            values = [predict(each, batch) for each in (net, run.average)]
         torch.testing.assert_close(*values)
     with pytest.raises(train.OptionError, match=r"^start has a network of another size: "):
         run.start_from(SuperSdfNet(replace(SMALL, hidden=64)).state_dict())
+
+
+def test_blocks_that_see_fewer_places_start_with_the_weights_of_these(tmp_path, prepared):
+    torch.manual_seed(0)
+    places, batch = (27, 19, 7, 7, 19), batch_of(prepared[:1])
+    whole, some = SuperSdfNet(replace(SMALL, gated=2)), replace(SMALL, gated=2, places=places)
+    run = train.Run(tmp_path, SuperSdfNet(some))
+    run.start_from(whole.state_dict())
+    with torch.no_grad():
+        for block, count in zip(whole.all_blocks(), places):
+            block.conv.weight.view(27, -1)[np.setdiff1d(range(27), PLACES[count])] = 0
+        values = [predict(each, batch) for each in (whole, run.average)]
+    torch.testing.assert_close(*values)
 
 
 def test_every_new_window_comes_once_then_those_with_much_loss_more_often():
