@@ -351,9 +351,9 @@ def test_wrong_options_are_refused(message):
 
 
 def test_a_mask_is_no_grid_without_make_grid():
-    for values in (MASK, MASK.astype(int)):
+    for make, values in ((SdfGrid, MASK.astype(int)), (SdfGrid.trusted, MASK)):
         with pytest.raises(GridError, match="a mask holds no distances; make a grid of it with"):
-            SdfGrid(values, 1.0)
+            make(values, 1.0)
 
 
 def test_a_mask_shows_no_spacing_and_one_value_no_surface():

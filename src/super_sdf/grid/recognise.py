@@ -78,6 +78,7 @@ NARROW = 4.5  # spacings up to which values that are cut off have too few slopes
 NEVER = 5e-4  # contradictions of these: cut off 0, fused depth images from .0018
 SLOPE_NEAR = 0.5, 1.25  # of these: cut off at half a voxel .55 to 1.05, in half the unit .5 and 2
 SLOPE_OFF = 0.25  # of rounded distances from 1
+CROWDED = 0.7  # of the uncut samples, those in the last tenth: cut off to .55, tanh from .85
 SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
 THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
 # 6. Densities: range over the smallest step; median of the sizes over the largest, with more
@@ -398,7 +399,9 @@ def _steps_of_cut(look: Look, given: Floats | None, facts: dict[str, Any]) -> Fl
     nearest = min(map(abs, look.cut), default=known)
     if nearest >= NARROW * steps.max():
         return None
+    size = np.abs(look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]) / nearest
     is_even = SLOPE_NEAR[0] < typical_slope(look, steps, look.cut) < SLOPE_NEAR[1]
+    is_even &= not size.size or float((size > 0.9).mean()) < CROWDED
     return steps if is_even and _contradictions(look, steps, facts["digit"]) <= NEVER else None
 
 

@@ -13,7 +13,7 @@ from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
 from ..options import FieldKind, Inside, Options
 from .interpret import NONE_EXACT, Field, interpret
-from .look import Extremes, border_share, look_at, typical_slope
+from .look import Extremes, Look, border_share, look_at, typical_slope
 from .samples import (
     AXES,
     EQUAL_SPACING,
@@ -33,6 +33,7 @@ from .samples import (
     steps_of,
 )
 
+NO_MASK = "a mask holds no distances; make a grid of it with make_grid or read_grid"
 MOST_RISE = 1.25  # spacings by which distances change from sample to sample; at most 1
 
 
@@ -101,21 +102,11 @@ class SdfGrid:
         direction: ArrayLike | None = None,
     ) -> None:
         samples, _, origin = placed(values, spacing, origin)
-        h, look = max(check_spacing(spacing)), look_at(samples)
-        if not look.is_finite:
-            bad = (np.argwhere(~np.isfinite(plane)) for plane in samples)
-            i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
-            raise GridError(
-                f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}: every sample must be finite; "
-                "replace unknown far samples by a large distance of the right sign"
-            )
+        h, look = max(check_spacing(spacing)), _look_at_finite(samples)
         if look.low == look.high:
             raise GridError(f"every value is {look.low:.6g}: a constant field has no surface")
-        if look.is_two and (min(look.shape) > 2 or samples.dtype == np.bool_):
-            raise GridError(
-                f"the only values are {look.low:.6g} and {look.high:.6g}: a mask holds no "
-                "distances; make a grid of it with make_grid or read_grid"
-            )
+        if look.is_two and min(look.shape) > 2:
+            raise GridError(f"the only values are {look.low:.6g} and {look.high:.6g}: {NO_MASK}")
         below = border_share(look, lambda x: x < 0)
         if below > 0.5:
             raise GridError(
@@ -159,7 +150,10 @@ class SdfGrid:
             )
         if (is_sheared or not is_cubic(steps)) and not are_distances:
             field = replace(field, own_lattice=True, exact=NONE_EXACT)
-        low, high = extremes or (float(np.min(samples)), float(np.max(samples)))
+        if extremes is None:
+            look = _look_at_finite(samples)
+            extremes = look.low, look.high
+        low, high = extremes
         grid = object.__new__(cls)
         vars(grid).update(
             samples=samples,
@@ -237,6 +231,21 @@ class SdfGrid:
         turned = along if self.is_straight else np.linalg.solve(self.direction, along.T).T
         places: NDArray[np.float64] = turned / np.array(self.spacing)
         return places
+
+
+def _look_at_finite(samples: SampleArray) -> Look:
+    """Look at samples; GridError unless they are finite numbers."""
+    look = look_at(samples)
+    if samples.dtype == np.bool_:
+        raise GridError(f"values are true or false: {NO_MASK}")
+    if not look.is_finite:
+        bad = (np.argwhere(~np.isfinite(plane)) for plane in samples)
+        i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
+        raise GridError(
+            f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}: every sample must be finite; "
+            "replace unknown far samples by a large distance of the right sign"
+        )
+    return look
 
 
 def make_grid(

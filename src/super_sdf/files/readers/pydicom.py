@@ -75,7 +75,7 @@ def _images_in(path: Path) -> dict[str, list[tuple[Path, Any]]]:
     import pydicom
 
     series: dict[str, list[tuple[Path, Any]]] = {}
-    names = [each.name for each in path.iterdir() if not each.is_dir()] if path.is_dir() else []
+    names = [x.name for x in path.glob("[!.]*") if not x.is_dir()] if path.is_dir() else []
     for file in [check_beside(path, name) for name in sorted(names)] if path.is_dir() else [path]:
         with file.open("rb") as opened:
             start = opened.read(PREAMBLE + 4)
