@@ -130,7 +130,7 @@ class Run:
 
 
 def of_places(weight: Tensor, rows: int) -> Tensor:
-    """Return the rows of a convolution's weight, (n C, C), for the places that so many are for."""
+    """Return the rows, (n C, C), of a convolution's weight that belong to the n places it keeps."""
     width = weight.shape[1]
     given, wanted = (PLACES.get(count // width, CENTRE) for count in (len(weight), rows))
     return weight.view(-1, width, width)[np.isin(given, wanted)].flatten(0, 1)

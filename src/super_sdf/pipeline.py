@@ -275,11 +275,11 @@ def mesh_grid(
     everything, threads = Tile((0, 0, 0), shape, (0, 0, 0), shape), useful_threads(decoder.threads)
     task = Task(everything, lattice, shape, chosen, factor, threads)
     room = Room.of(chosen.max_memory, factor, decoder.memory_bytes)
-    in_one_piece = room.voxels() if map_tiles is None and least_tiles == 1 else -1  # at most
-    bands = [survey(lattice, chosen.offset, threads=threads, most=in_one_piece)]
+    most_at_once = room.voxels() if map_tiles is None and least_tiles == 1 else -1  # voxels
+    bands = [survey(lattice, chosen.offset, threads=threads, most=most_at_once)]
     steps.finish("band")
     whole = bands[0].whole
-    if whole.count <= in_one_piece:
+    if whole.count <= most_at_once:
         # popped, so that nothing here keeps the band in memory
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:
