@@ -36,7 +36,7 @@ LIPSCHITZ_SLACK = 0.1
 MAX_DISTANCE = 2.8  # of exact samples: those near the band's edge, 3, may have been truncated there
 MIN_SLOPE = 0.7  # towards the steepest neighbour; near 1 for a distance
 MAX_NOISY_SHARE = 0.02  # of all samples; in a noisier field no sample is taken as exact
-BLOCK_SAMPLES, LEAST_PLANES = 1 << 18, 4  # read at a time, about, and a plane more on either side
+BLOCK_SAMPLES = 1 << 18  # read at a time, about, and a plane more on either side
 # The largest difference between neighbours along an axis, and between a voxel's sample and that at
 # each place of its patch, (27,).
 MAX_STEP = 2 + LIPSCHITZ_SLACK
@@ -110,9 +110,7 @@ def survey(
     low, high, lowest, highest = ends.tolist()
     if grid.on_sample is None:  # what is interpolated beyond the band promises little
         limits = max(low, lowest), min(high, highest)  # at its ends a field may be cut off
-    step = max(
-        BLOCK_SAMPLES // prod(grid.shape[1:]), LEAST_PLANES, 2 * getattr(grid.samples, "beside", 0)
-    )
+    step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), 4, 2 * getattr(grid.samples, "beside", 0))
     blocks = [(at, min(at + step, grid.shape[0])) for at in range(0, grid.shape[0], step)]
     for found in over_threads(partial(_find, grid, offset, limits), blocks, threads):
         if offset and not whole:  # distances must not be cut off near it; at 0 none is better
