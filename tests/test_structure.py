@@ -19,6 +19,7 @@ ROOMS = [
     "pages",
     "convert",
     "functions.pyvista",
+    "functions.scikit_image",
     "labels",
     "simplify check",
     "pipeline",
@@ -36,16 +37,16 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
-    TOP: 1250,
-    "grid": 2480,  # 1,800
+    TOP: 1308,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
+    "grid": 2486,  # 1,800
     "network": 500,
     "refine": 1300,
-    "surface": 2200,
+    "surface": 2207,  # 2,200; and what is noted of a mesh
     "tiles": 300,
-    "files": 2700,
-    "functions": 600,
-    "labels": 900,
-    "simplify check truth": 1170,  # 1,100; and the walls between labels, which are simplified, too
+    "files": 2705,  # 2,700; and the keywords of ``read_grid``, one by one
+    "functions": 729,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached
+    "labels": 901,
+    "simplify check truth": 1184,  # 1,100; and the walls between labels, which are simplified, too
     "batch": 900,
     "pages": 400,
     "cli": 800,
