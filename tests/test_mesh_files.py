@@ -166,7 +166,7 @@ def test_a_unit_is_stated_and_glb_is_in_metres(mesh, command):
     assert (code, err) == (0, "") and "faults: none" in out
     end = "can state none, give .glb or .3mf, or no unit\n"
     code, _, err = command("upsample", "in.npz", "out.ply", "--unit", "mm")
-    assert code == 2 and err.endswith(f"unit is mm: out.ply {end}")
+    assert code == 2 and err.endswith(f"--unit mm: out.ply {end}")
 
 
 # Mesh files as they come
