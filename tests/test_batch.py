@@ -202,7 +202,7 @@ LISTS = {
     "": "list.jsonl names no file: give a path a line",
     '{"in": "a",}': "list.jsonl, line 1: no JSON from character 12 on, '}': give an object such as",
     "[]": 'list.jsonl, line 1: it is []: give an object such as {"in": "a.npy"}\n',
-    '{"in": "a.npy", "labels": []}': "list.jsonl, line 1: labels is []: give all, or some labels",
+    '{"in": "a.npy", "labels": 2}': "list.jsonl, line 1: labels is 2: give all, or some labels",
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': give the path of a grid",
     '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: factor is 3: give an even number",

@@ -104,11 +104,9 @@ LABEL = number("a whole number, -2^63 to 2^64 - 1", -(2**63) - 1, 2**64 - 1, ste
 
 
 def _labels(value: Any) -> str | tuple[int | str, ...]:
-    """Return "all", or some labels, numbers or names: one, several, or text with commas."""
+    """Return "all", or some labels, numbers or names; in text with commas."""
     if not isinstance(value, str):
-        if not (some := value if isinstance(value, Iterable) else [value]):
-            raise ValueError
-        return tuple(each if isinstance(each, str) else LABEL.make(each) for each in some)
+        return tuple(each if isinstance(each, str) else LABEL.make(each) for each in value)
     parts = [part.strip() for part in value.split(",")]
     is_number = re.compile("[-+]?[0-9]+").fullmatch
     return "all" if value == "all" else tuple(int(n) if is_number(n) else n for n in parts)
