@@ -19,7 +19,7 @@ from super_sdf.cli.main import cli
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 CARDS = sorted((ROOT / "src" / "super_sdf" / "models").glob("*.md"))
-PAGES = [README, ROOT / "CHANGELOG.md", ROOT / "examples" / "README.md", *CARDS,
+PAGES = [*sorted(ROOT.glob("*.md")), ROOT / "examples" / "README.md", *CARDS,
          *sorted((ROOT / "docs").rglob("*.md"))]  # fmt: skip
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 # Documents speak of today: what was, and what it was like, is in the history of the repository.
