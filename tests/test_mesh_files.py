@@ -18,7 +18,7 @@ from super_sdf.errors import FileError, MeshError, OptionError, SuperSdfError
 from super_sdf.files import meshes
 from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
 from super_sdf.options import Options
-from super_sdf.truth.solid import load_solid, merged, read_mesh
+from super_sdf.truth import load_solid, merged, read_mesh
 
 pytestmark = pytest.mark.usefixtures("folder")
 
@@ -161,7 +161,7 @@ def test_a_unit_is_stated_and_glb_is_in_metres(mesh, command):
     assert (code, err) == (0, "") and "faults: none" in out
     end = "can state none, give .glb or .3mf, or no unit\n"
     code, _, err = command("upsample", "in.npz", "out.ply", "--unit", "mm")
-    assert code == 2 and err.endswith(f"unit is mm: out.ply {end}")
+    assert code == 2 and err.endswith(f"--unit mm: out.ply {end}")
 
 
 # Mesh files as they come

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from importlib.util import find_spec
 
 FLAG = re.compile(r"(?<!install )--([a-z-]+)(?: ('[^']*'|[\w.,+-]*\w))?( (?=--))?")
-VERBS = ("is", "are", "has", "does", "needs")
+VERBS = ("is", "are", "has", "does", "needs", "takes")
 WORDS = ("and", "or", "if", "out", "to", "with", "for")
 SWITCHES = {"open": "cap=False", "cap": "cap=True", "force": "force=True"}
 SWITCHES |= {"labels all": "reconstruct_labels(values)"}
@@ -78,7 +78,7 @@ def _keyword(found: re.Match[str]) -> str:
         return f"{name} {value}"
     if value is None or value in WORDS:
         return SWITCHES.get(name, f"{name}=") + (f" {value}" if value else "") + more
-    if value.isalnum() and value[0].islower():
+    if value.isidentifier():
         value = repr(value)
     return f"{name}=({value})" if "," in value else f"{name}={value}{more}"
 

@@ -123,7 +123,7 @@ def open_volume(
     numbers = tuple(map(int, re.findall(r"\d+", brackets)))
     axes = OPTIONS["axes"].check(axes)
     if format_.axes is None and (axes or direction is not None):
-        what = f"axes is {axes!r}" if axes else "direction is given"
+        what = f"--axes {axes}" if axes else "--direction is given"
         raise OptionError(f"{what}, but {format_.name} files state their axes: leave it out")
     order = axes or format_.axes or "xyz"
     logs = logging.root.manager.disable

@@ -138,7 +138,7 @@ def in_order(labels: Any) -> list[int] | None:
         return None
     chosen = sorted({options.LABEL.check(label, "--labels") for label in labels})
     if not 0 < len(chosen) <= MOST_LABELS:
-        raise OptionError(f"--labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
+        raise OptionError(f"--labels has {len(chosen):,} labels: give 1 to {MOST_LABELS:,}")
     return chosen
 
 
