@@ -96,6 +96,8 @@ def features_everywhere():
     with pytest.MonkeyPatch.context() as patch:
         for name in ("LEAST_SLOPE_TRUST", "LEAST_SPHERES"):
             patch.setattr(features, name, 0)
+        for name in ("SURE_COSINE", "SURE_TRUST"):
+            patch.setattr(features, name, -np.inf)
         patch.setattr(features, "SHARP_COSINE", 1.1)
         patch.setattr(features, "HALF_ANGLE_COSINE", 1.1)
         patch.setattr(features, "load_rule", lambda: features.Rule(1.0, ()))
@@ -125,6 +127,18 @@ def test_no_triangles_intersect_with_features_everywhere(features_everywhere):
     assert all(intersections(extract_sharp(*field)) <= n for field, n in zip(fields, plain))
     features_everywhere.setattr(features, "without_folds", lambda *of: of[1])
     assert intersections(extract_sharp(*fields[0])) > 100
+
+
+def test_features_that_bring_the_mesh_no_nearer_to_the_spheres_are_dropped(features_everywhere):
+    """Of a ball, few are left where none is sure, and thousands if all are."""
+    field = upsample(ball(16, 5.0), load_network("fast"), 4)
+    everywhere = np.ones(len(field.voxel_ijk), bool)
+    features_everywhere.setattr(features, "voxels_near_kinks", lambda *of: everywhere)
+    plain = len(extract_mesh(field, mesher="marching").vertices)
+    sure = len(extract_sharp(field).vertices) - plain
+    for name in ("SURE_COSINE", "SURE_TRUST"):
+        features_everywhere.setattr(features, name, np.inf)
+    assert sure > 1000 and len(extract_sharp(field).vertices) - plain < 0.1 * sure
 
 
 def test_a_blade_and_a_gap_do_not_intersect():

@@ -1,9 +1,7 @@
 """Where the surface has an edge or a corner, and where on it a vertex belongs.
 
 1. Candidates are patches whose planes differ, by the settled planes of the faces beside.
-2. Each gets the point where these planes meet, moved so that the samples' spheres agree: the foot
-   point of a sample in the cone of normals of an edge, outside a convex one or inside a concave
-   one, lies on the edge.
+2. Each gets the point where these planes meet, moved so that the samples' spheres agree: a wedge.
 3. ``Edges.evidence`` gathers what speaks for an edge there and what against it: how sharply the
    field itself turns, flat ground beside, spheres that touch or are pierced. Most of it is averaged
    along the chain of candidates, since an edge has a length.
@@ -11,7 +9,9 @@
    way on an edge, a part of it on rounded ground. Where it is little, marching cubes is kept. The
    rule, ``rule.json``, was fitted by ``export.edges`` to where the true surface of shapes lies.
 5. Beside features, vertices are moved as much of the way onto the settled planes.
-6. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
+6. A feature that is not sure, and brings the mesh no nearer to the samples' spheres that pass by,
+   is dropped: a detail narrower than a voxel, say.
+7. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
 
 References
 ----------
@@ -27,21 +27,37 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
-from itertools import combinations
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal
 
 import numpy as np
 
 from ...arrays import BoolArray, Index, IntArray, Numbers, Vectors, dot, inner, length, unit
-from ...refine.bounds import SampleSpheres
 from ...refine.field import FineField
 from ...threads import map_chunks
 from ..marching import CAP_HEIGHT, Crossings, tables
 from ..mesh import CLEARANCE
 from .folds import REACH, Rounding, without_folds
-from .patches import Patches, Placed, beside, find_patches, triangles_of, voxels_near_kinks
-from .planes import ROUNDS, Planes, planes_at_crossings, settle_planes, square_falloff
+from .patches import (
+    Patches,
+    Placed,
+    beside,
+    find_patches,
+    nth_of_run,
+    triangles_of,
+    voxels_near_kinks,
+)
+from .planes import ROUNDS, Planes, planes_at_crossings, settle_planes
+from .wedges import (
+    LARGEST_RADIUS,
+    TOUCHED_ALONG,
+    TOUCHING,
+    contact_of,
+    find_spheres,
+    lean,
+    samples_around,
+    wedges_of,
+)
 
 RULE = Path(__file__).with_name("rule.json")
 SHARP_COSINE = 0.85  # normals of a patch that differ by more, 32 degrees, may make a feature
@@ -56,27 +72,18 @@ FARTHEST_MOVE = 0.5  # fine spacings
 OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
 OF_PATCH = 4  # numbers of evidence that are not averaged along the chain
 LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and normals say nothing
+# Of features that are surely sharp: share, cosine of the two faces, logarithm of the trust in the
+# flattest ground. With all others of 63 shapes at 32^3 come nine tenths of what brings no gain.
+SURE_SHARE, SURE_COSINE, SURE_TRUST = 0.9, -0.3, -0.6
+# Coarse spacings: from a sphere to the feature that it passes by, and to the nearer of both meshes
+PASSES_BY, OFF_MESH = 0.1, 0.15
+LEAST_GAIN, EXACT = 0.2, 0.01  # of what is left after, beyond what is exact in coarse spacings
+SIDES: tuple[Literal["left", "right"], ...] = "left", "right"
 TEMPORARIES = 500  # numbers per patch in the search for its spheres among 125 samples
 # Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
 # is the fan beside.
-REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + REACH + 5
+REACH_IN_CELLS = RINGS + ROUNDS + 2 * CHAIN_ROUNDS + 2 * MOVED_RINGS + REACH + 7
 REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
-
-# Of wedges, in coarse spacings:
-ALONG = 0.6  # distance along an edge at which a sphere counts for a quarter
-FARTHEST_ALONG = 1.8
-CLOSE_BY = 0.3  # distance along an edge within which no sphere may be pierced: see ``Contact``
-OFF_SPHERE = 0.05  # distance from a sphere at which it counts for half
-FARTHEST_SPHERE = 0.3
-LARGEST_RADIUS = 1.4  # samples near the band's edge, 1.5, may have been truncated there
-LEAST_RADIUS = 0.05  # of spheres: of smaller ones the direction is unknown
-PIERCED = 0.02  # by which a sphere outside the cone must be pierced to count
-TOUCHING = 0.04  # from a sphere at which it is touched ...
-TOUCHED_ALONG = 1.0  # ... if it is within this distance along the edge
-ITERATIONS = 3
-LONGEST_STEP = 0.25
-RANK = 0.05  # eigenvalues below this share of the largest leave a direction open
-NEAR = 2  # voxels to each side whose samples are looked at
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,6 +124,12 @@ class Candidates:
         """Return how far the vertex of each goes from the middle to the edge, (f,), 0 to 1."""
         return np.where(self.spheres < LEAST_SPHERES, 0, load_rule().share(self.evidence))
 
+    def are_doubtful(self, share: Numbers) -> BoolArray:
+        """Return which features, (f,), the spheres may contradict: all but what is surely sharp."""
+        cosine, flattest = self.evidence[:, 0], self.evidence[:, 3]
+        is_sure = (share >= SURE_SHARE) & (cosine > SURE_COSINE) & (flattest > SURE_TRUST)
+        return (share > LEAST_SHARE) & ~is_sure
+
 
 @dataclass(frozen=True, eq=False)
 class Features:
@@ -146,7 +159,11 @@ def find_features(
         return None
     own = planes_at_crossings(field, crossings, used, border, threads)
     candidates = find_candidates(patches, own, kinked, field, threads)
-    placed = place(patches, own, candidates, candidates.share())
+    placed = place(patches, own, candidates, share := candidates.share())
+    doubtful = np.flatnonzero(candidates.are_doubtful(share))
+    if len(doubtful):
+        share[doubtful[no_gain(patches, placed, candidates.patch[doubtful], own, field)]] = 0
+        placed = place(patches, own, candidates, share)
     box = field.factor * border.astype(np.float64)
     position = _kept_in_grid(placed.position, own.point, box)
     peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, box)
@@ -185,6 +202,68 @@ def place(patches: Patches, own: Planes, candidates: Candidates, share: Numbers)
     vertex = candidates.middle + share[:, None] * (candidates.edge - candidates.middle)
     placed = Placed(position, candidates.planes.normal, candidates.patch[kept], vertex[kept])
     return placed.unfolded(patches)
+
+
+def no_gain(
+    patches: Patches, placed: Placed, feature: Index, own: Planes, field: FineField
+) -> BoolArray:
+    """Return which features, (f,), bring the mesh no nearer to the spheres that pass by.
+
+    Compared are means along the chain of how far the triangles round a feature are from spheres:
+    those of marching cubes, and those with features. Details narrower than a voxel are told so.
+    """
+    fans, spheres, factor = patches.chosen(feature), field.spheres, field.factor
+    number = samples_around((fans.low // factor).astype(np.int32), spheres)
+    centre: Vectors = np.stack(np.unravel_index(spheres.number, spheres.shape), 1).astype(float)
+    centre = factor * (centre + 0.5)
+    radius = np.abs(spheres.distance) / 2  # in coarse spacings
+    peak = placed.peak[np.searchsorted(placed.feature, feature)]
+    beyond = length(centre[number] - peak[:, None]) / factor - radius[number]
+    passes = (number >= 0) & (radius[number] < LARGEST_RADIUS) & (np.abs(beyond) < PASSES_BY)
+    fan, sphere = np.nonzero(passes)[0], number[passes]
+    plain = replace(placed, position=own.point, feature=feature[:0], peak=peak[:0])
+    off = np.empty((2, len(fan)))
+    for each, mesh in zip(off, (plain, placed)):
+        each[:] = _distance_from_fans(patches, mesh, feature, fan, centre[sphere]) / factor
+    off = np.abs(off - radius[sphere])
+    near = np.flatnonzero(off.min(0) < OFF_MESH)
+    weights = *off[:, near], np.ones(len(near))
+    sums = [np.bincount(fan[near], each, len(feature)) for each in weights]
+    before, after, count = _mean_along_chain(fans, np.stack(sums, 1)).T
+    return np.asarray(before - after <= LEAST_GAIN * (after - EXACT * count))
+
+
+def _distance_from_fans(
+    patches: Patches, placed: Placed, feature: Index, fan: Index, point: Vectors
+) -> Numbers:
+    """Return the distance of points (n, 3) from the triangles at the crossings of their fans."""
+    around = patches.having(patches.dilate(feature, 1, len(placed.position)))
+    _, triangles = triangles_of(patches, placed, around)
+    corner = np.argsort(triangles, axis=None, kind="stable")
+    ordered, crossing = triangles.ravel()[corner], patches.crossing[feature[fan]]
+    row, side = np.nonzero(crossing >= 0)
+    first, last = (np.searchsorted(ordered, crossing[row, side], end) for end in SIDES)
+    pair = np.repeat(row, last - first)
+    near = triangles[corner[np.repeat(first, last - first) + nth_of_run(last - first)] // 3]
+    distance: Numbers = np.full(len(fan), np.inf)
+    corners = np.ascontiguousarray(np.moveaxis(placed.points[near], 0, 2))
+    apart = _distance_from_triangles(np.ascontiguousarray(point[pair].T), corners)
+    np.minimum.at(distance, pair, apart)
+    return distance
+
+
+def _distance_from_triangles(point: Vectors, corners: Vectors) -> Numbers:
+    """Return the distance of each point (3, n) from its triangle (3, 3, n), corner by corner."""
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0], axis=0)
+    squared, is_over = np.full(point.shape[1], np.inf), np.ones(point.shape[1], bool)
+    for k in range(3):
+        way, start = corners[k] - corners[k - 1], point - corners[k - 1]
+        share = np.clip(inner(start, way) / np.maximum(inner(way, way), 1e-18), 0, 1)
+        off = start - share * way
+        squared = np.minimum(squared, inner(off, off))
+        is_over &= inner(np.cross(way, start, axis=0), normal) >= 0
+    height = inner(point - corners[0], normal) ** 2 / np.maximum(inner(normal, normal), 1e-18)
+    return np.asarray(np.sqrt(np.where(is_over, height, squared)))
 
 
 def find_candidates(
@@ -289,49 +368,6 @@ def _nearest_feature(
     return distance[:-1], nearest
 
 
-class Wedges(NamedTuple):
-    """Where two or more faces meet, one for each of some patches.
-
-    Positions and lengths are in coarse spacings, from node (0, 0, 0) of the fine lattice, so sample
-    (i, j, k) is at (i + 1/2, j + 1/2, k + 1/2). Vectors are in columns.
-    """
-
-    point: Vectors  # (3, f), on the edge, or the corner
-    tangent: Vectors  # (3, f), direction of the edge; 0 at a corner, where three faces or more meet
-    sides: Vectors  # (2, 3, f), the two normals that differ most
-    cosine: Numbers  # (f,), of the angle between these
-    # (f,), 1 if the solid fills less than half of the space round the edge, -1 if it fills more
-    convex: Numbers
-    # (f, 3, 3), mean of the squares of the normals: how the planes hold the point
-    stiffness: Vectors
-
-
-class Nearby(NamedTuple):
-    """Pairs of a wedge and a sphere that passes near it, in the order of the wedges.
-
-    Columns of wedges stand here once for each pair, vectors as (3, n).
-    """
-
-    wedge: Index  # (n,)
-    centre: Vectors  # the sample
-    radius: Numbers
-    tangent: Vectors
-    outward: Vectors  # (2, 3, n), the sides of the wedge, turned to where the spheres are
-    cosine: Numbers
-    may_touch: BoolArray  # whether it is an edge, and the sample on the side where the cone is
-
-
-class Contact(NamedTuple):
-    """How spheres stand to the edges that they are near."""
-
-    direction: Vectors  # (3, n), from the sample to the edge, of unit length
-    along: Numbers  # (n,), distance along the edge
-    gap: Numbers  # (n,), distance from the sphere to the edge, negative if it is pierced
-    in_cone: BoolArray  # (n,), whether it must touch the edge, by the normals of the two faces
-    # (n,), whether it may not be pierced: further on, the edge may have ended or turned
-    is_close: BoolArray
-
-
 def _measure(
     patches: Patches, planes: Planes, own: Planes, field: FineField, rows: slice
 ) -> tuple[Vectors, Vectors, Vectors, IntArray]:
@@ -372,115 +408,3 @@ def _measure(
     )
     spheres = np.bincount(near.wedge, minlength=count).astype(np.int32)
     return middle, factor * leant.T, np.stack(columns, 1).astype(np.float64), spheres
-
-
-def wedges_of(point: Vectors, normal: Vectors, there: BoolArray) -> Wedges:
-    """Return the wedges of patches, at the points nearest to all planes of each.
-
-    A plane is given by a point and a normal, (3, S, f) each; ``there``, (S, f), says which are.
-    Normals of the others must be 0.
-    """
-    count = there.sum(0)
-    stiffness = np.stack([(normal[i] * normal).sum(1) for i in range(3)]) / count
-    values, vectors = np.linalg.eigh(np.moveaxis(stiffness, 2, 0))
-    middle = (point * there).sum(1) / count
-    height = inner(point - middle[:, None], normal)
-    right = (height * normal).sum(1) / count
-    inverse = np.where(values > RANK * values[:, -1:], 1 / np.maximum(values, 1e-9), 0)
-    step = np.einsum("pij,pj->pi", vectors, inverse * np.einsum("pij,ip->pj", vectors, right))
-    peak = middle + step.T
-    pairs = list(combinations(range(len(there)), 2))
-    cosines = [
-        np.where(there[i] & there[j], inner(normal[:, i], normal[:, j]), 2) for i, j in pairs
-    ]
-    one, other = np.array(pairs)[np.argmin(cosines, axis=0)].T
-    row = np.arange(len(count))
-    first, second = normal[:, one, row], normal[:, other, row]
-    above = inner(point[:, one, row] - peak, second) + inner(point[:, other, row] - peak, first)
-    convex = np.where(above < 0, 1.0, -1.0)
-    corner = values[:, 0] > RANK * values[:, -1]
-    tangent = np.where(corner, 0, vectors[:, :, 0].T)
-    sides = np.stack([first, second])
-    return Wedges(peak, tangent, sides, inner(first, second), convex, np.moveaxis(stiffness, 2, 0))
-
-
-def find_spheres(wedges: Wedges, voxel: IntArray, spheres: SampleSpheres) -> Nearby:
-    """Return the spheres that pass within ``FARTHEST_SPHERE`` of each wedge's edge.
-
-    Wedges of a ``voxel``, (f, 3), follow each other, and have the same samples around.
-    """
-    first = np.append(True, np.any(np.diff(voxel, axis=0) != 0, axis=1))[: len(voxel)]
-    number = _samples_around(voxel[first], spheres)
-    radius = np.abs(spheres.distance) / 2
-    usable, of_wedge = (number >= 0) & (radius < LARGEST_RADIUS)[number], np.cumsum(first) - 1
-    steps = np.indices((2 * NEAR + 1,) * 3).reshape(3, -1) - float(NEAR)
-    start = wedges.point - voxel.T - 0.5
-    along = inner(start, wedges.tangent)[:, None] - wedges.tangent.T @ steps
-    across = inner(start, start)[:, None] - 2 * start.T @ steps + inner(steps, steps) - along**2
-    off = np.sqrt(np.maximum(across, 0))
-    off -= np.where(usable, radius[number], np.inf).take(of_wedge, 0)
-    kept = (np.abs(off) < FARTHEST_SPHERE) & (np.abs(along) < FARTHEST_ALONG)
-    wedge, place = np.nonzero(kept)
-    number = number[of_wedge[wedge], place]
-    centre = np.stack(np.unravel_index(spheres.number[number], spheres.shape)) + 0.5
-    tangent, convex = wedges.tangent.take(wedge, 1), wedges.convex[wedge]
-    may_touch = (np.sign(spheres.distance[number]) == convex) & tangent.any(0)
-    outward = -convex * wedges.sides.take(wedge, 2)
-    columns = centre, radius[number].astype(np.float64), tangent, outward, wedges.cosine[wedge]
-    return Nearby(wedge, *columns, may_touch)
-
-
-def _samples_around(voxel: IntArray, spheres: SampleSpheres) -> Index:
-    """Return the numbers of the exact samples within ``NEAR`` of voxels (v, 3), -1 for none.
-
-    A line of them along the last axis is searched for at once: (v, 125).
-    """
-    keys, (nx, ny, nz) = spheres.number, spheres.shape
-    di, dj = np.indices((2 * NEAR + 1,) * 2).reshape(2, -1) - NEAR
-    i, j, k = voxel[:, 0, None] + di, voxel[:, 1, None] + dj, voxel[:, 2, None]
-    line = (i * ny + j) * nz
-    start = np.searchsorted(keys, line + np.maximum(k - NEAR, 0))
-    number = start[..., None] + np.arange(2 * NEAR + 1)
-    there = ((i >= 0) & (i < nx) & (j >= 0) & (j < ny))[..., None] & (number < len(keys))
-    place = keys.take(number, mode="clip") - (line + k - NEAR)[..., None]
-    there &= place <= (np.minimum(nz - 1 - k, NEAR) + NEAR)[..., None]
-    found = np.flatnonzero(there)
-    around = np.full(number.size, -1)
-    around[found - found % (2 * NEAR + 1) + place.ravel()[found]] = number.ravel()[found]
-    return around.reshape(len(voxel), -1)
-
-
-def contact_of(point: Vectors, near: Nearby) -> Contact:
-    """Return how spheres stand to edges at points (3, f); none must touch a corner."""
-    away = point.take(near.wedge, 1) - near.centre
-    along = inner(away, near.tangent)
-    across = away - along * near.tangent
-    apart = np.sqrt(inner(across, across))
-    direction = across / np.maximum(apart, 1e-12)
-    first, second = inner(direction, near.outward[0]), inner(direction, near.outward[1])
-    in_cone = (first > near.cosine * second) & (second > near.cosine * first)
-    in_cone &= near.may_touch & (apart > LEAST_RADIUS)
-    return Contact(direction, along, apart - near.radius, in_cone, np.abs(along) < CLOSE_BY)
-
-
-def lean(wedges: Wedges, near: Nearby) -> Vectors:
-    """Return the points, (3, f), at which planes and spheres agree best, by least squares."""
-    point, count, wedge = wedges.point, wedges.point.shape[1], near.wedge
-    tangent = wedges.tangent.T
-    hold = wedges.stiffness + 1e-3 * np.eye(3) + 1e3 * tangent[:, :, None] * tangent[:, None, :]
-    for _ in range(ITERATIONS):
-        direction, along, gap, in_cone, is_close = contact_of(point, near)
-        counts = in_cone | (is_close & (gap < -PIERCED))
-        weight = counts * square_falloff(along / ALONG) / (1 + (gap / OFF_SPHERE) ** 2)
-        pull = np.einsum("pij,jp->pi", wedges.stiffness, wedges.point - point)
-        stiff = hold.copy()
-        for i in range(3):
-            pull[:, i] -= np.bincount(wedge, weight * gap * direction[i], count)
-            for j in range(i + 1):
-                total = np.bincount(wedge, weight * direction[i] * direction[j], count)
-                stiff[:, i, j] += total
-                if i != j:
-                    stiff[:, j, i] += total
-        step = np.linalg.solve(stiff, pull[..., None])[..., 0].T
-        point = point + np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-    return point
