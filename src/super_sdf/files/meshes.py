@@ -102,8 +102,8 @@ def write_mesh(
     ------
     OptionError, MeshError, FileError
         If the suffix is unknown, or that of a format that states no unit; if the arrays are no
-        mesh; if the file cannot be written, or its format cannot hold the mesh: a coordinate is not
-        finite, or corners of a triangle would coincide.
+        mesh, or a coordinate is not finite; if the file cannot be written, or its format cannot
+        hold the mesh: corners of a triangle would coincide.
     """
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     path = check_free(check_mesh_suffix(PATH.check(path, "path"), world.unit), force=force)
@@ -125,8 +125,6 @@ def write_meshes(
         for path, parts in files.items():
             for mesh in parts.values():
                 check_mesh(mesh)
-                if not np.isfinite(mesh.vertices).all():
-                    raise FileError(f"{path} cannot be written: a vertex of the mesh is not finite")
             part = stack.enter_context(replacing(path, force=force))
             with part.open("wb") as file:
                 WRITERS[path.suffix.lower()](file, parts, world or World())
