@@ -21,7 +21,7 @@ from super_sdf.grid.sdf_grid import volume_of_samples
 from super_sdf.labels import reconstruct as labelling
 from super_sdf.labels.files import read_names
 from super_sdf.labels.volumes import keep_volume
-from super_sdf.truth.solid import Solid
+from super_sdf.truth import Solid
 
 
 def ball(centre, radius):

@@ -18,7 +18,7 @@ from super_sdf.errors import FileError, MeshError, OptionError, SuperSdfError
 from super_sdf.files import meshes
 from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
 from super_sdf.options import Options
-from super_sdf.truth.solid import load_solid, merged, read_mesh
+from super_sdf.truth import load_solid, merged, read_mesh
 
 pytestmark = pytest.mark.usefixtures("folder")
 

@@ -19,7 +19,7 @@ from super_sdf.errors import (
     OutOfMemoryError,
 )
 from super_sdf.network.network import load_network
-from super_sdf.truth.solid import Solid, smallest_angles
+from super_sdf.truth import Solid, smallest_angles
 
 PART = Path(__file__).parent.parent / "examples" / "part.npz"
 QUICK = ("--quality", "fast", "--factor", 2)

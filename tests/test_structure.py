@@ -32,7 +32,7 @@ ROOMS = [
     "grid",
     "options threads",
     "errors arrays",
-    "__init__ __main__ models",
+    "__init__ __main__",
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
@@ -50,7 +50,7 @@ BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a r
     "pages": 400,
     "cli": 800,
 }
-MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 45, 110  # 95, 45, 110 in the design
+MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 88, 45, 110  # 90, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 17_800, 36_000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {
@@ -174,7 +174,7 @@ def test_what_every_conversion_needs_is_few_packages(module):
     names = {a.name for node in at_once if isinstance(node, ast.Import) for a in node.names}
     names |= {str(n.module) for n in at_once if isinstance(n, ast.ImportFrom) and not n.level}
     others = {name.split(".")[0] for name in names} - LIBRARIES - set(sys.stdlib_module_names)
-    is_extra = module.startswith(("files.readers.", "simplify.", "check.", "truth.", "pages."))
+    is_extra = module.startswith(("files.readers.", "simplify.", "check.", "truth", "pages."))
     assert not others or is_extra or module in ("batch.cluster", "functions.pyvista")
 
 

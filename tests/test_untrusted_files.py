@@ -17,7 +17,7 @@ from placed import CUBES, sampled, save
 
 from super_sdf import read_grid
 from super_sdf.errors import FileError
-from super_sdf.truth.solid import read_mesh
+from super_sdf.truth import read_mesh
 
 VALUES = sampled(CUBES)
 RAW = VALUES.ravel("F").tobytes()

@@ -25,7 +25,7 @@ from .refine.band import Band, no_surface, survey
 from .refine.nodes import VoxelIndex
 from .surface.mesh import Mesh
 from .threads import check_fits, give_back, memory_bound, useful_threads
-from .truth.solid import Points, Solid, merged, read_mesh, smallest_angles
+from .truth import Points, Solid, merged, read_mesh, smallest_angles
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
 BYTES_PER_TRIANGLE, BYTES_PER_SAMPLE = 650, 150

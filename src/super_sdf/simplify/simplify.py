@@ -15,7 +15,7 @@ from ..errors import MeshError, check_modules
 from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import check_fits, give_back, memory_bound
-from ..truth.solid import Solid
+from ..truth import Solid
 from .collapsing import Unsimplified, down_to, within
 from .measuring import Deviation
 from .walls import Walls
