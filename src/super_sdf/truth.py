@@ -218,7 +218,7 @@ def fitted_layout(
         steps += is_free & (np.abs(room - np.rint(room)) < ON_PLANE)
         origin = (low + high - steps * spacing) / 2  # not finite: refused by the grid
     if not steps.max() < MOST_ALONG_AXIS:
-        raise OptionError(f"spacing is {spacing:g}: it makes {steps.max():.3g} samples an axis")
+        raise OptionError(f"--spacing is {spacing:g}: it makes {steps.max():.3g} samples an axis")
     nx, ny, nz = (int(count) + 1 for count in steps)
     return (nx, ny, nz), spacing, origin
 
@@ -237,7 +237,7 @@ def sample_solid(
     if band is None:
         band = BIG_GRID_BAND if prod(shape) > EXACT_SAMPLES else np.inf
     if not band >= LEAST_BAND:
-        raise OptionError(f"band is {band:g}: give at least {LEAST_BAND:g} voxels")
+        raise OptionError(f"--band is {band:g}: give at least {LEAST_BAND:g} voxels")
     reach = float(np.abs(origin).max()) + spacing * max(shape)
     if not (spacing > 1e-30 and reach < 1e30 and np.spacing(reach) <= POSITION_ERROR * spacing):
         said = f"a spacing of {spacing:g} in a grid that reaches to {reach:g} is too fine for "

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
-from ..errors import GridError, OptionTypeError, seen
+from ..errors import GridError, OptionError, OptionTypeError, seen
 from ..options import FieldKind, Inside, Options
 from .interpret import NONE_EXACT, Field, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
@@ -321,13 +322,16 @@ def make_grid(
     return SdfGrid.trusted(origin=origin, direction=direction, **taken)
 
 
-def check_grid(grid: Any) -> SdfGrid:
-    """Return a grid; OptionTypeError if it is no ``SdfGrid``, but an array or a path, say."""
+def as_grid(grid: Any, **told: Any) -> SdfGrid:
+    """Return a grid, of which nothing is told, or that which ``make_grid`` makes of an array."""
+    if grid is None or isinstance(grid, (str, PathLike)):
+        make = "make one with make_grid(values, spacing=...) or read_grid(path)"
+        raise OptionTypeError(f"grid is {seen(grid)}: {make}")
     if not isinstance(grid, SdfGrid):
-        what = f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else seen(grid)
-        raise OptionTypeError(
-            f"grid is {what}: make one with make_grid(values, spacing=...) or read_grid(path)"
-        )
+        return make_grid(grid, **told)
+    for name, value in told.items():
+        if not (value is None or (isinstance(value, str) and value == "auto")):
+            raise OptionError(f"{name} is given with a grid, which has its own: leave it out")
     return grid
 
 
