@@ -3,16 +3,20 @@
 python examples/array_to_mesh.py [OUT.ply]
 """
 
-import sys
+from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
 
 from super_sdf import reconstruct, write_mesh
 
+options = ArgumentParser(description=__doc__)
+options.add_argument("out", nargs="?", default="part.ply", help="mesh file")
+out = options.parse_args().out
+
 part = np.load(Path(__file__).parent / "part.npz")
 
 mesh = reconstruct(part["values"], spacing=part["spacing"], origin=part["origin"])
-write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "part.ply", force=True)
+write_mesh(mesh, out, force=True)
 
 print(f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {mesh.volume():.0f} mm^3")
