@@ -78,8 +78,11 @@ def test_version_help_info_and_usage_errors(command):
     assert "\nok       networks: base" in out
     assert "an even number from 2 to 16" in command("upsample", "--help")[1]
     assert command("upsample")[0] == 2
-    code, out, err = command("nonsense")
-    assert (code, out) == (2, "") and err.startswith("Error: No such command 'nonsense'")
+    said = "Error: 'upsmple' is no command: give one of upsample, batch, check, sample, "
+    assert command("upsmple") == (2, "", f"{said}view, info\n")
+    for word, meant in {"labl": "label", "qualty": "quality", "memry": "max-memory"}.items():
+        end = f"Error: No such option '--{word}'. Did you mean '--{meant}'?\n"
+        assert command("upsample", "in.npy", "out.ply", f"--{word}", 1) == (2, "", end)
 
 
 def bad_files() -> None:

@@ -17,7 +17,7 @@ import time
 from contextlib import ExitStack
 from typing import Any
 
-from click import Argument, Option
+from click import Argument, Option, Path
 
 from .. import __version__
 from ..options import OPTIONS, Options
@@ -28,8 +28,8 @@ TILES_PER_THREAD = 2  # of a cluster: one that dies costs little
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 TAKES = (
-    Argument(["source"], metavar="IN"),
-    Argument(["target"], metavar="OUT"),
+    Argument(["source"], metavar="IN", type=Path()),
+    Argument(["target"], metavar="OUT", type=Path()),
     *OPTIONS,
     "names", "cluster", "jobs", "check",
     Option(["--save-field"], metavar="FIELD",
@@ -130,8 +130,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         shape = " x ".join(map(str, field["shape"]))
         lines.append(f"{field['path']}: the refined field, lattice {shape}")
     if few:
-        off = few["deviation"]
-        line = f"Simplified: from {few['triangles_before']:,} to {triangles:,} triangles; largest "
-        line += f"distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
-        lines.append(f"{line}{off['largest_back']:.4f} back")
+        off = max(few["deviation"][way] for way in ("largest", "largest_back"))
+        said = f"Simplified: from {few['triangles_before']:,} to {triangles:,} triangles; largest "
+        lines.append(f"{said}distance {off:.4f} voxels")
     return lines
