@@ -19,7 +19,7 @@ Kobbelt, Botsch, Schwanecke and Seidel, "Feature Sensitive Surface Extraction fr
 2001, for the point where the planes meet; Sellán, Batty and Stein, "Reach For the Spheres", 2023,
 and Carrera et al., "Dual Contouring of Signed Distance Data", 2026, for the spheres.
 
-Positions are in fine spacings, from node (0, 0, 0) of the fine lattice, but for wedges.
+Positions are in fine spacings, from node (0, 0, 0) of the fine lattice, but for wedges: ``planes``.
 """
 
 from __future__ import annotations
@@ -47,15 +47,18 @@ from .patches import (
     triangles_of,
     voxels_near_kinks,
 )
-from .planes import ROUNDS, Planes, planes_at_crossings, settle_planes
-from .wedges import (
+from .planes import (
     LARGEST_RADIUS,
+    ROUNDS,
     TOUCHED_ALONG,
     TOUCHING,
+    Planes,
     contact_of,
     find_spheres,
     lean,
+    planes_at_crossings,
     samples_around,
+    settle_planes,
     wedges_of,
 )
 
