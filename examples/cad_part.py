@@ -22,7 +22,7 @@ holes = 4 - np.hypot(np.abs(x) - 10, y)
 distances = np.maximum(plate, holes)
 
 fine = reconstruct(make_grid(distances, spacing=1.0))
-mesh = simplify_mesh(fine, error=TOLERANCE).mesh
+mesh = simplify_mesh(fine, error=TOLERANCE)
 write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "plate.3mf", unit="mm", force=True)
 
 exact = 40 * 25 * 8 - 2 * np.pi * 4**2 * 8

@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 
 from super_sdf.arrays import BoolArray
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.solid import Distances, Solid
+from super_sdf.truth import Distances, Solid
 
 from . import samples
 from .samples import DOT, EdgeCurves, Indices, SurfacePoints, nearest_or_dot

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from super_sdf.arrays import IntArray
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.solid import Distances, Points, Solid
+from super_sdf.truth import Distances, Points, Solid
 
 Indices = NDArray[np.int64]
 

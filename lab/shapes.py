@@ -23,8 +23,7 @@ from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.options import OPTIONS
 from super_sdf.refine.band import is_active, rescale
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.sampling import sample_solid
-from super_sdf.truth.solid import Distances, Solid, load_solid
+from super_sdf.truth import Distances, Solid, load_solid, sample_solid
 
 from .samples import EdgeCurves, sample_surface
 

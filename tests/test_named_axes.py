@@ -69,8 +69,8 @@ REFUSED = {
     "(array.interp(y=...))": (
         sphere().assign_coords(y=np.where(np.arange(20) == 7, 13.6, sphere().y))
     ),
-    "coordinates of 'z' is array([ True, False, False, False, False, False, False, False, False..."
-    ": give numbers, in the unit of the distances": sphere().assign_coords(z=np.arange(22) == 0),
+    "coordinates of 'z' is array([False, False, False, False, False, False, False, F...: give n"
+    "umbers, in the unit of the distances": sphere().assign_coords(z=np.arange(22) == 0),
     f"dimensions are 'lon', 'lat', 'z', with coordinates of 'lon', 'lat', 'z': {NAMES}": (
         sphere().rename(x="lon", y="lat")
     ),

@@ -19,6 +19,7 @@ ROOMS = [
     "pages",
     "convert",
     "functions.pyvista",
+    "functions.scikit_image",
     "labels",
     "simplify check",
     "pipeline",
@@ -32,25 +33,25 @@ ROOMS = [
     "grid",
     "options threads",
     "errors arrays",
-    "__init__ __main__ models",
+    "__init__ __main__",
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
-    TOP: 1250,
-    "grid": 2480,  # 1,800
+    TOP: 1308,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
+    "grid": 2486,  # 1,800
     "network": 500,
     "refine": 1300,
-    "surface": 2200,
+    "surface": 2207,  # 2,200; and what is noted of a mesh
     "tiles": 300,
     "files": 2700,
-    "functions": 600,
+    "functions": 729,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached
     "labels": 900,
     "simplify check truth": 1170,  # 1,100; and the walls between labels, which are simplified, too
     "batch": 900,
     "pages": 400,
     "cli": 800,
 }
-MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 45, 110  # 95, 45, 110 in the design
+MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 89, 45, 110  # 90, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 17_800, 36_000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {
@@ -174,7 +175,7 @@ def test_what_every_conversion_needs_is_few_packages(module):
     names = {a.name for node in at_once if isinstance(node, ast.Import) for a in node.names}
     names |= {str(n.module) for n in at_once if isinstance(n, ast.ImportFrom) and not n.level}
     others = {name.split(".")[0] for name in names} - LIBRARIES - set(sys.stdlib_module_names)
-    is_extra = module.startswith(("files.readers.", "simplify.", "check.", "truth.", "pages."))
+    is_extra = module.startswith(("files.readers.", "simplify.", "check.", "truth", "pages."))
     assert not others or is_extra or module in ("batch.cluster", "functions.pyvista")
 
 

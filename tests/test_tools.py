@@ -12,7 +12,7 @@ import pyvista
 from vtkmodules.vtkCommonDataModel import vtkPolyData
 
 from super_sdf import read_grid, reconstruct
-from super_sdf.truth.solid import read_mesh
+from super_sdf.truth import read_mesh
 
 ROOT = Path(__file__).parent.parent
 TOOLS = ROOT / "examples" / "tools"

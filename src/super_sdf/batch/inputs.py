@@ -22,6 +22,7 @@ from ..options import BATCH_LISTS, GOALS, Options
 from .record import Row
 
 LIST_SUFFIXES = (".txt", ".jsonl")
+EXAMPLE = 'give an object such as {"in": "a.npy"}'
 
 
 @dataclass
@@ -138,11 +139,14 @@ def _read_list(path: Path, suffix: str, options: Options) -> Iterator[Job]:
         try:
             entry = {"in": line} if is_text else json.loads(line)
             if not isinstance(entry, dict):
-                raise OptionError(f'{seen(entry)}: give an object, {{"in": "a.npy"}}')
+                raise OptionError(f"it is {seen(entry)}: {EXAMPLE}")
             yield _job_of(entry, path.parent, suffix, options)
-        except (ValueError, RecursionError) as error:
-            kind = "" if isinstance(error, OptionError) else "no JSON: "
-            raise OptionError(f"{path}, line {number}: {kind}{error}") from None
+        except (OptionError, json.JSONDecodeError, RecursionError) as error:
+            said = str(error)
+            if not isinstance(error, OptionError):
+                at = getattr(error, "pos", 0)
+                said = f"no JSON from character {at + 1} on, {seen(line[at:])}: {EXAMPLE}"
+            raise OptionError(f"{path}, line {number}: {said}") from None
 
 
 def _job_of(entry: dict[str, Any], home: Path, suffix: str, options: Options) -> Job:

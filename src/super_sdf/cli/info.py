@@ -1,9 +1,8 @@
-"""Show versions, devices, networks, and extras with the command that installs those missing.
+"""Show versions, devices, networks and extras, and the command that installs missing extras.
 
 With --check, each network also refines a ball on the CPU and on CUDA. With GRID, show instead what
 that grid file states: shape, type, spacing and origin.
 
-  super-sdf info --check
   super-sdf info --check --device cuda
   super-sdf info scan.zarr
 """
@@ -87,10 +86,11 @@ def run_checks(device: Device, check: bool) -> Iterator[tuple[str, str, str]]:
     for name in shipped_models() if check else ():
         for each in devices[:1] if name.endswith("-int8") else devices:
             yield check_network(name, each)
+    absent = [name for name in errors.EXTRAS if errors.to_install(name)]
     for name, modules in errors.EXTRAS.items():
-        lacking = errors.to_install(name)
-        says = f"no {lacking}" if lacking else ", ".join(modules)
-        yield MISSING if lacking else OK, f"extra {name}", says
+        yield MISSING if name in absent else OK, f"extra {name}", ", ".join(modules)
+    if absent:
+        yield MISSING, "to install", f"pip install -e '.[{','.join(absent)}]' in a clone"
 
 
 def check_network(name: str, device: Device) -> tuple[str, str, str]:

@@ -121,7 +121,7 @@ class Resampled(SamplePlanes):
     """Samples interpolated along one axis, from the first on, alike in whatever parts are read.
 
     ``level`` is the value at which the surface will be meshed. The new samples, at ``step``, lie at
-    ``places``, in old spacings; those ``on_sample`` are old ones.
+    ``places``, in old spacings.
     """
 
     dtype = np.dtype(np.float64)
@@ -139,7 +139,6 @@ class Resampled(SamplePlanes):
         nearest = np.rint(places)
         places = np.where(np.abs(places - nearest) <= ON_SAMPLE, nearest, places)
         self.places: Floats = np.minimum(places, count - 1)
-        self.on_sample: BoolArray = np.rint(self.places) == self.places
         shape = list(source.shape)
         shape[axis] = len(self.places)
         self.shape = tuple(shape)

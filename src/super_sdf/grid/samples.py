@@ -191,6 +191,8 @@ def over_three(values: NDArray[Any], choose: np.ufunc) -> NDArray[Any]:
 
 def as_samples(values: Any) -> SampleArray:
     """Return samples along three axes as an array; those that are read by slices are not loaded."""
+    while getattr(values, "ndim", 0) > len(AXES) and values.shape[0] == 1:  # a batch, a channel
+        values = values[0]
     samples: Any = values
     if hasattr(values, "chunks") and isinstance(getattr(values, "dtype", None), np.dtype):
         check_kind(values.dtype, values.shape)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
-from ..errors import GridError, OptionTypeError, seen
+from ..errors import GridError, OptionError, OptionTypeError, seen
 from ..options import FieldKind, Inside, Options
 from .interpret import NONE_EXACT, Field, interpret
 from .look import Extremes
@@ -64,6 +65,7 @@ class SdfGrid:
     high: float
     field: Field
     space: str | None = None
+    is_resampled: bool = False  # values between samples are interpolated
 
     def __init__(
         self,
@@ -106,9 +108,9 @@ class SdfGrid:
             each = [(plane.min(), plane.max()) for plane in samples]
             extremes = float(np.min(each)), float(np.max(each))
         first = as_triple(0.0 if origin is None else origin, "origin")
-        place = {"spacing": steps, "origin": first, "direction": axes}
+        place = {"spacing": steps, "origin": first, "direction": axes, "notes": notes}
         values = {"samples": samples, "low": extremes[0], "high": extremes[1], "field": field}
-        return with_fields(object.__new__(cls), notes=notes, **place, **values)
+        return with_fields(object.__new__(cls), **place, **values)
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -250,13 +252,16 @@ def make_grid(
     return SdfGrid.trusted(origin=origin, direction=direction, **taken)
 
 
-def check_grid(grid: Any) -> SdfGrid:
-    """Return a grid; OptionTypeError if it is no ``SdfGrid``, but an array or a path, say."""
+def as_grid(grid: Any, **told: Any) -> SdfGrid:
+    """Return a grid, of which nothing is told, or that which ``make_grid`` makes of an array."""
+    if grid is None or isinstance(grid, (str, PathLike)):
+        make = "make one with make_grid(values, spacing=...) or read_grid(path)"
+        raise OptionTypeError(f"grid is {seen(grid)}: {make}")
     if not isinstance(grid, SdfGrid):
-        what = f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else seen(grid)
-        raise OptionTypeError(
-            f"grid is {what}: make one with make_grid(values, spacing=...) or read_grid(path)"
-        )
+        return make_grid(grid, **told)
+    for name, value in told.items():
+        if not (value is None or (isinstance(value, str) and value == "auto")):
+            raise OptionError(f"{name} is given with a grid, which has its own: leave it out")
     return grid
 
 
@@ -333,4 +338,4 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         f"finest, to {shape} samples"
     )
     more = {"spacing": as_triple(steps, "spacing"), "notes": (*grid.notes, note)}
-    return with_fields(grid, samples=samples, **more)
+    return with_fields(grid, samples=samples, is_resampled=True, **more)
