@@ -13,7 +13,7 @@ from solids import box_distance
 from test_field_kinds import PLACE, box, thin_frame
 from trimesh import grouping
 
-from super_sdf import SdfGrid, make_grid, reconstruct
+from super_sdf import make_grid, reconstruct
 from super_sdf.errors import GridError
 from super_sdf.options import OPTIONS
 

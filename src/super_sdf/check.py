@@ -278,8 +278,7 @@ def touch(
     values = band.patches[:, CENTRE]
     # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
     trusted = band.exact & (values > values.min()) & (values < values.max())
-    points = band.grid.to_world(band.voxel_ijk)
-    places = grid.to_index(points)
+    places = grid.to_index(points := band.grid.to_world(band.voxel_ijk))
     is_sample = (np.abs(places - np.rint(places)) <= ON_SAMPLE).all(1)
     rows = np.flatnonzero(trusted & is_sample)  # what is interpolated promises nothing
     sampled = int(np.count_nonzero(is_sample))

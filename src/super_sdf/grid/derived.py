@@ -109,6 +109,7 @@ def fill_in(values: NDArray[Any], spacing: Triple, limits: Extremes) -> Floats:
     height = dot(missing[near] - feet[nearest[near]], normal[nearest[near]])
     aside = np.sqrt(np.maximum(apart[near] ** 2 - height**2, 0))
     apart[near] = np.hypot(height, np.maximum(aside - DISC * min(spacing), 0))
+    apart = np.float32(apart / far).astype(np.float64) * far  # alike in whatever parts are read
     least = np.where(filled[cut] > 0, high, -low)
     filled[cut] = np.copysign(np.clip(apart, least, far), filled[cut])
     return filled
