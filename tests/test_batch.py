@@ -178,9 +178,19 @@ def test_patterns_keep_the_folders_below_their_fixed_part_and_links_in_a_circle_
     Path("in/.hidden").mkdir()
     shutil.copy("in/a.npy", "in/.hidden/a.npy")
     assert len(batch("in/**", "--dry-run")[1]["to_do"]) == 4
-    jobs = find_jobs(["in/de*/er/*.npy", "in/.h*/*.npy"], ".ply", Options())
+    jobs = find_jobs(["in/de*/er/*.npy", "in/.h*/*.npy"], ".ply", Options(), None)
     assert [job.target for job in jobs] == ["deep/er/c.d.ply", ".hidden/a.ply"]
-    assert len(find_jobs(["in"], ".ply", Options())) == 5
+    assert len(find_jobs(["in"], ".ply", Options(), None)) == 5
+
+
+def test_a_name_chooses_among_the_arrays_of_each_file(batch):
+    Path("frames").mkdir()
+    for name in ("1.npz", "2.npz"):
+        values = ball(12, 3.0).values
+        np.savez(f"frames/{name}", density=-values, speed=values)
+    facts = batch("frames", "--grid", "density", "--level", 0)[1]
+    assert facts["done"] == 2 and contents().keys() == {"1-density.ply", "2-density.ply"}
+    assert "holds several arrays" in batch("frames/1.npz", out="other")[2]
 
 
 def test_lists_name_files_from_where_they_lie_and_objects_have_options_of_their_own(batch, command):
@@ -214,7 +224,7 @@ LISTS = {
 }
 KINDS = ", ".join(GRID_SUFFIXES)
 NO_GRIDS = {
-    "none.npy": "none.npy does not exist: give grids, folders, patterns or a list\n",
+    "none.npy": "none.npy does not exist: give grids, folders or lists\n",
     "in/*.raw": f"in/*.raw holds no grid ({KINDS})\n",
     "empty": f"empty holds no grid ({KINDS})\n",
     "odd.raw": f"odd.raw is neither a grid ({KINDS}) nor a list (.txt, .jsonl)\n",

@@ -178,9 +178,12 @@ def test_the_keys_of_json_are_as_documented(grids):
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_run(example, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [example.name, "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(example), run_name="__main__")
     monkeypatch.setattr(sys, "argv", [example.name])
     runpy.run_path(str(example), run_name="__main__")
-    assert capsys.readouterr().out
+    assert capsys.readouterr().out.startswith("usage: ")
     scenes = [trimesh.load_scene(path) for path in tmp_path.iterdir() if path.suffix != ".vdb"]
     assert all(part.is_watertight for scene in scenes for part in scene.geometry.values())
 

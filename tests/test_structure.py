@@ -21,7 +21,7 @@ ROOMS = [
     "functions.pyvista",
     "functions.scikit_image",
     "labels",
-    "simplify check",
+    "simplify check evaluation",
     "pipeline",
     "tiles",
     "functions",
@@ -37,21 +37,21 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
-    TOP: 1308,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
+    TOP: 1310,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
     "grid": 2486,  # 1,800
     "network": 500,
     "refine": 1300,
     "surface": 2207,  # 2,200; and what is noted of a mesh
     "tiles": 300,
-    "files": 2700,
+    "files": 2718,  # 2,700; and readers and writers of other packages
     "functions": 729,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached
     "labels": 900,
-    "simplify check truth": 1170,  # 1,100; and the walls between labels, which are simplified, too
+    "simplify check truth evaluation": 1527,  # 1,100; and the evaluation, which lab imports
     "batch": 900,
     "pages": 400,
-    "cli": 800,
+    "cli": 839,  # 800; and standard input and output
 }
-MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 89, 45, 110  # 90, 45, 110 in the design
+MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 90, 45, 114  # 90, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 17_800, 36_000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {
@@ -175,7 +175,9 @@ def test_what_every_conversion_needs_is_few_packages(module):
     names = {a.name for node in at_once if isinstance(node, ast.Import) for a in node.names}
     names |= {str(n.module) for n in at_once if isinstance(n, ast.ImportFrom) and not n.level}
     others = {name.split(".")[0] for name in names} - LIBRARIES - set(sys.stdlib_module_names)
-    is_extra = module.startswith(("files.readers.", "simplify.", "check.", "truth", "pages."))
+    is_extra = module.startswith(
+        ("files.readers.", "simplify.", "check.", "truth", "evaluation", "pages.")
+    )
     assert not others or is_extra or module in ("batch.cluster", "functions.pyvista")
 
 

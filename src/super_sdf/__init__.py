@@ -15,6 +15,7 @@ __version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from .errors import SuperSdfError as SuperSdfError, SuperSdfWarning as SuperSdfWarning
+    from .evaluation import evaluate as evaluate
     from .files.fields import read_field as read_field, write_field as write_field
     from .files.grids import grid_from_image as grid_from_image, read_grid as read_grid
     from .files.meshes import write_mesh as write_mesh
@@ -51,6 +52,7 @@ PUBLIC = {
     "Mesh": ("surface.mesh", "vertices, faces, and what was noted of them"),
     "write_mesh": ("files.meshes", "a mesh to a file: .ply, .stl, .obj, .off, .glb, .3mf"),
     "simplify_mesh": ("simplify.simplify", "a mesh of fewer triangles within a measured distance"),
+    "evaluate": ("evaluation", "Chamfer distance, F1, normals, edges of meshes beside references"),
     "SuperSdfError": ("errors", "every error of this package"),
     "SuperSdfWarning": ("errors", "every warning of this package"),
 }

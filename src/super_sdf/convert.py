@@ -77,8 +77,8 @@ def convert(
         facts = _facts(grid, made, options)
         mesh = _finished(made.mesh, grid, options, facts)
         steps.lap("simplify" if options.goals() else "isosurface")
-        world, beside = World(options.unit, grid.space), [Path(save_field)] if save_field else []
-        write_meshes({Path(target): {"": mesh}}, force=force, world=world, beside=beside)
+        world = World(options.unit, grid.space)
+        write_meshes({Path(target): {"": mesh}}, force=force, world=world)
         steps.lap("write")
     if saved:
         facts["saved_field"] = saved

@@ -11,7 +11,7 @@ A new format is a name in ``options.MESH_FORMATS`` and a function ``write_NAME``
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +25,7 @@ from ..arrays import FloatArray, unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, PATH, Unit
 from ..surface.mesh import Mesh, check_mesh
+from .formats import plugin
 from .output import check_free, replacing
 
 MESH_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
@@ -62,7 +63,8 @@ def has_parts(path: str | Path) -> bool:
 
 def check_mesh_suffix(path: Path, unit: str | None = None) -> Path:
     """Return the path of a mesh file; OptionError for another suffix, or if it states no unit."""
-    if path.suffix.lower() not in MESH_SUFFIXES:
+    ending = path.suffix.lower()
+    if not (ending in MESH_SUFFIXES or plugin("writers", ending)):
         raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
     if unit and not has_parts(path):
         stating = " or ".join(SCENES)
@@ -115,20 +117,19 @@ def write_meshes(
     *,
     force: bool = False,
     world: World | None = None,
-    beside: Iterable[Path] = (),
 ) -> None:
-    """Write files of meshes, by path and name: all of them, or none.
-
-    None is written, either, if a file ``beside`` them, which is to appear next, cannot be.
-    """
+    """Write files of meshes, by path and name: all of them, or none."""
     with ExitStack() as stack:
         for path, parts in files.items():
             for mesh in parts.values():
                 check_mesh(mesh)
             part = stack.enter_context(replacing(path, force=force))
             with part.open("wb") as file:
-                WRITERS[path.suffix.lower()](file, parts, world or World())
-        for path in (*files, *beside):
+                if (ending := path.suffix.lower()) in WRITERS:
+                    WRITERS[ending](file, parts, world or World())
+                else:
+                    plugin("writers", ending).load()(file, *parts.values())
+        for path in files:
             check_free(path, force=force)  # before the first of them appears
 
 
