@@ -5,6 +5,7 @@ import os
 import re
 import sys
 import zipfile
+from io import BytesIO, TextIOWrapper
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +45,30 @@ def test_json_has_options_counts_times_and_findings(here, command):
     assert report["triangles"] > report["vertices"] > report["band_voxels"] > 0
     assert report["asked"] == json.loads(json.dumps(Options(spacing=1, origin=(1, 2, 3)).digest()))
     assert {"load network", "read", "network", "isosurface", "write"} <= set(report["seconds"])
+
+
+def test_a_hyphen_is_standard_input_or_output(here, command, monkeypatch):
+    assert command("upsample", "in.npy", "out.obj", "-q") == (0, "", "")
+    for source in ("-", "in.npy"):
+        monkeypatch.setattr("sys.stdin", TextIOWrapper(BytesIO(Path("in.npy").read_bytes())))
+        code, out, err = command("upsample", source, "-", "--format", "obj")
+        assert (code, out) == (0, Path("out.obj").read_text()) and "\n-: " in err
+    monkeypatch.setattr("sys.stdin", TextIOWrapper(BytesIO()))
+    said = "stdin.npy is empty: give a file with something in it"
+    assert command("upsample", "-", "a.ply") == (1, "", f"Error: {said}\n")
+
+
+@pytest.mark.parametrize(
+    ("target", "words", "said"),
+    [
+        ("a.ply", "--format stl", "--format stl is for an OUT that is -: leave it out for a.ply"),
+        ("-", "--labels all", "--labels makes a file for each label: give --format glb or 3mf"),
+        ("-", "--json", "--json is for standard output, too: give a file for OUT"),
+    ],
+)
+def test_what_does_not_go_with_a_hyphen(target, words, said, here, command):
+    code, _, err = command("upsample", "in.npy", target, *words.split())
+    assert (code, err) == (2, f"Error: {said}\n") and os.listdir() == ["in.npy"]
 
 
 def test_options_reach_the_result(here, command):

@@ -49,7 +49,7 @@ BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a r
     "simplify check truth evaluation": 1527,  # 1,100; and the evaluation, which lab imports
     "batch": 900,
     "pages": 400,
-    "cli": 800,
+    "cli": 839,  # 800; and standard input and output
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 90, 45, 114  # 90, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 17_800, 36_000
