@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import Triple
-from ..errors import GridError, OptionError, OptionTypeError, seen
+from ..errors import GridError, OptionError, OptionTypeError, in_python, seen
 from ..options import FieldKind, Inside, Options
 from .interpret import NONE_EXACT, Field, interpret
 from .look import Extremes
@@ -48,8 +48,6 @@ class SdfGrid:
         and stay in memory; ``planes`` reads some of them without that.
     low, high : float
         The smallest and the largest sample, negative inside.
-    notes : tuple of str
-        Sentences that say what was inferred rather than given.
     field : Field
         What the values are, and which of them can be exact.
     space : str or None
@@ -60,7 +58,7 @@ class SdfGrid:
     spacing: Triple
     origin: Triple
     direction: Direction
-    notes: tuple[str, ...]
+    flagged: tuple[str, ...]  # notes, with the flags of the command line
     low: float
     high: float
     field: Field
@@ -108,7 +106,7 @@ class SdfGrid:
             each = [(plane.min(), plane.max()) for plane in samples]
             extremes = float(np.min(each)), float(np.max(each))
         first = as_triple(0.0 if origin is None else origin, "origin")
-        place = {"spacing": steps, "origin": first, "direction": axes, "notes": notes}
+        place = {"spacing": steps, "origin": first, "direction": axes, "flagged": notes}
         values = {"samples": samples, "low": extremes[0], "high": extremes[1], "field": field}
         return with_fields(object.__new__(cls), **place, **values)
 
@@ -120,6 +118,11 @@ class SdfGrid:
             f"SdfGrid({shape} {self.samples.dtype}, spacing {spacing}, origin {origin}{turned}, "
             f"values {self.low:.6g} to {self.high:.6g})"
         )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences that say what was inferred rather than given."""
+        return tuple(map(in_python, self.flagged))
 
     @property
     def values(self) -> NDArray[Any]:
@@ -337,5 +340,5 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         f"the spacing differs between axes: the values are resampled along {along} to {h:.6g}, the "
         f"finest, to {shape} samples"
     )
-    more = {"spacing": as_triple(steps, "spacing"), "notes": (*grid.notes, note)}
+    more = {"spacing": as_triple(steps, "spacing"), "flagged": (*grid.flagged, note)}
     return with_fields(grid, samples=samples, is_resampled=True, **more)
