@@ -44,7 +44,7 @@ def sort_options(app, ctx, lines):
 
 
 def put_from_root(app, docname, source):
-    """Put a page of the root in the place of its name; its links are from the root."""
+    """Put a page of the root in the place of the link to that page; its links are from the root."""
     if docname not in FROM_ROOT:
         return
     name, up = FROM_ROOT[docname], "../" * docname.count("/")
@@ -53,7 +53,7 @@ def put_from_root(app, docname, source):
     moved |= {path: f"{page}.md" for page, path in FROM_ROOT.items()}
     for path, page in moved.items():
         text = text.replace(f"](../{up}{path}", f"]({up}{page}")
-    source[0] = source[0].replace(f"{name}\n", text, 1)
+    source[0] = source[0].replace(f"[{name}](../{up}{name})", text, 1)
 
 
 def setup(app):
