@@ -97,7 +97,7 @@ def test_other_mistakes_are_one_line():
         (FileError, lambda: contour(scalars="b"), "the image has no array of points or cells 'b'"),
         (GridError, lambda: contour(scalars="vectors"), "its array 'vectors' has 3 "),
         (OptionError, lambda: contour(3), "factor is 3: "),
-        (GridError, thin.contour, "values have shape (20, 22, 1): give at least 2 samples on each"),
+        (GridError, thin.contour, "values have shape (20, 22, 1): give three axes (x, y, z), with"),
     ):
         assert refusal(kind, call).startswith(said)
     image.spacing = (0.2, 0.2, 0.2)

@@ -22,7 +22,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from click import Argument, Choice, Option, Path as PathName
+from click import Argument, Choice, Option
 
 from ..options import MESH_FORMATS, OPTIONS
 from . import main
@@ -36,7 +36,7 @@ MOST_FAILURES = 20  # printed; the report has all
 STATES = ("done_before", "failed_before", "refused")  # of inputs that are left alone
 
 TAKES = (
-    Argument(["sources"], metavar="IN...", nargs=-1, required=True, type=PathName()),
+    Argument(["sources"], metavar="IN...", nargs=-1, required=True, type=main.NAME),
     Option(["--out", "folder"], metavar="DIR", required=True, type=main.FILE,
         help="Folder for the meshes and report.jsonl; subfolders of IN are kept."),
     Option(["--grid", "member"], metavar="NAME", default="",

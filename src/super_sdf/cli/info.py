@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from click import Argument, Option, Path
+from click import Argument, Option
 
 from .. import __version__, errors
 from ..options import OPTIONS, Device
@@ -26,7 +26,7 @@ SAID = {float: "{:.10g}", int: "{:,}", type(None): "not stated"}  # how facts ar
 CENTRE, RADIUS = 15.63, 12.0  # of a ball, in voxels; the centre is on no sample
 MOST_OFF, MOST_OFF_OF_MASK = 0.05, 0.6  # voxels; a mask shows the surface to half a voxel
 TAKES = (
-    Argument(["source"], metavar="[GRID]", required=False, type=Path()),
+    Argument(["source"], metavar="[GRID]", required=False, type=main.NAME),
     Option(["--check"], is_flag=True, help="Also run the networks."),
     main.table_option("device", "cpu skips CUDA; cuda makes it a failure if CUDA fails."),
     "json",

@@ -39,7 +39,7 @@ SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasatt
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HEADINGS = {name: row.group for name, row in OPTIONS.items()} | {"names": VALUES}
 HEADINGS |= dict.fromkeys(("cluster", "jobs", "retry", "dry_run"), WORK)
-FILE = click.Path(path_type=Path)
+FILE, NAME = click.Path(path_type=Path), click.Path(readable=False)  # the second as it is given
 
 Paths = Iterable[str | Path]
 

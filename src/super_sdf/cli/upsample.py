@@ -23,7 +23,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from click import Argument, Choice, Option, Path as PathName
+from click import Argument, Choice, Option
 
 from .. import __version__
 from ..errors import OptionError, SuperSdfError
@@ -36,8 +36,8 @@ TILES_PER_THREAD = 2  # of a cluster: one that dies costs little
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 TAKES = (
-    Argument(["source"], metavar="IN", type=PathName()),
-    Argument(["target"], metavar="OUT", type=PathName()),
+    Argument(["source"], metavar="IN", type=main.NAME),
+    Argument(["target"], metavar="OUT", type=main.NAME),
     Option(["--format", "kind"], type=Choice(MESH_FORMATS),
         help="Mesh file format of an OUT that is -. Default: ply."),
     *OPTIONS,

@@ -15,13 +15,13 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
 
-from click import Argument, Option, Path as PathName
+from click import Argument, Option
 
 from ..options import OPTIONS
 from . import main
 
 TAKES = (
-    Argument(["sources"], metavar="MESH|GRID...", nargs=-1, required=True, type=PathName()),
+    Argument(["sources"], metavar="MESH|GRID...", nargs=-1, required=True, type=main.NAME),
     Option(["--out"], type=main.FILE, metavar="PAGE.html",
         help="File for the page. Default: one in the temporary folder that only you can read."),
     "force",
