@@ -305,10 +305,10 @@ def test_a_label_is_never_rounded(dtype, values, label, listed):
 def test_densities_have_their_surface_at_a_level():
     density = 40 - 10 * torus(48).astype(np.float32)
     grid = make_grid(density, **PLACE, level=40, scale=0.1)
-    assert grid.notes[0] == "values above 40 are taken as inside (see --inside)"
+    assert grid.notes[0] == "values above 40 are taken as inside (see inside=)"
     np.testing.assert_allclose(grid.values, torus(48), atol=1e-4)
     below = make_grid(-density, **PLACE, level=-40, scale=0.1, inside="negative")
-    assert below.notes[0] == "values below -40 are taken as inside (see --inside)"
+    assert below.notes[0] == "values below -40 are taken as inside (see inside=)"
     np.testing.assert_allclose(below.values, torus(48), atol=1e-4)
 
 
@@ -318,7 +318,7 @@ def test_densities_have_the_surface_of_their_spline():
         grid = make_grid(densities, level=125)
         assert (grid.field.kind, grid.field.network) == ("density", None)
         assert grid.notes[1:] == (
-            "spacing not given: taken as 1, since densities show none (give --spacing)",
+            "spacing not given: taken as 1, since densities show none (give spacing=)",
             "origin not given: sample (0, 0, 0) is at 0, 0, 0",
         )
     two = make_grid(np.where(MASK, 900, 100), **PLACE, level=500)
@@ -360,7 +360,7 @@ def test_a_mask_shows_no_spacing_and_one_value_no_surface():
     notes = make_grid(MASK).notes + make_grid(TRANSFORMS["in other units"]).notes
     said = "spacing not given: taken as "
     assert [note[len(said) :] for note in notes if note.startswith(said)] == [
-        "1, since a mask shows none (give --spacing)",
+        "1, since a mask shows none (give spacing=)",
         "0.37, the step of the transform",
     ]
     with pytest.raises(GridError, match="every value is False: a constant field has no surface"):

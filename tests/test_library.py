@@ -154,6 +154,7 @@ SAID = {
     "--labels has 'lung': choose fewer (--labels 1,2)": "labels has 'lung': choose fewer "
     "(labels=(1,2))",
     "end it there (--open), or use --force": "end it there (cap=False), or use force=True",
+    "leave it out, or --offset and --open": "leave it out, or offset= and cap=False",
     "pip install --force-reinstall onnxruntime": "pip install --force-reinstall onnxruntime",
 }
 

@@ -37,8 +37,8 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
-    TOP: 1310,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
-    "grid": 2486,  # 1,800
+    TOP: 1311,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
+    "grid": 2487,  # 1,800
     "network": 500,
     "refine": 1300,
     "surface": 2207,  # 2,200; and what is noted of a mesh

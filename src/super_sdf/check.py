@@ -125,7 +125,7 @@ class Certificate:
             "sample_volume": self.sample_volume,
             "volume_ml": self.volume_ml,
             "faults": self.faults(),
-            "inferred": list(self.grid.notes),
+            "inferred": list(self.grid.flagged),
         }
 
     def faults(self) -> list[str]:

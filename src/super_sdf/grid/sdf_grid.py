@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
-from ..errors import GridError, OptionError, OptionTypeError, seen
+from ..errors import GridError, OptionError, OptionTypeError, in_python, seen
 from ..options import FieldKind, Inside, Options
 from .interpret import NONE_EXACT, Field, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
@@ -67,8 +67,6 @@ class SdfGrid:
         and stay in memory; ``planes`` reads some of them without that.
     low, high : float
         The smallest and the largest sample, negative inside.
-    notes : tuple of str
-        Sentences that say what was inferred rather than given.
     field : Field
         What the values are, and which of them can be exact.
     space : str or None
@@ -86,14 +84,12 @@ class SdfGrid:
     spacing: Triple
     origin: Triple
     direction: Direction
-    notes: tuple[str, ...]
+    flagged: tuple[str, ...]  # notes, with the flags of the command line
     low: float
     high: float
     field: Field
     space: str | None = None
-    on_sample: tuple[BoolArray, ...] | None = (
-        None  # of each axis, if resampled: which planes are samples
-    )
+    on_sample: tuple[BoolArray, ...] | None = None  # of resampled axes: which planes are samples
 
     def __init__(
         self,
@@ -161,7 +157,7 @@ class SdfGrid:
             spacing=steps,
             origin=as_triple(0.0 if origin is None else origin, "origin"),
             direction=axes,
-            notes=notes,
+            flagged=notes,
             low=low,
             high=high,
             field=field,
@@ -176,6 +172,11 @@ class SdfGrid:
             f"SdfGrid({shape} {self.samples.dtype}, spacing {spacing}, origin {origin}{turned}, "
             f"values {self.low:.6g} to {self.high:.6g})"
         )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences that say what was inferred rather than given."""
+        return tuple(map(in_python, self.flagged))
 
     @property
     def values(self) -> NDArray[Any]:
@@ -417,7 +418,7 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
         f"{' and '.join(sorted(coarser))} to {h:.6g}, the finest, to "
         f"{' x '.join(map(str, samples.shape))} samples"
     )
-    more = {"notes": (*grid.notes, note), "on_sample": tuple(known)}
+    more = {"flagged": (*grid.flagged, note), "on_sample": tuple(known)}
     return with_fields(grid, samples=samples, spacing=(steps[0], steps[1], steps[2]), **more)
 
 
