@@ -348,10 +348,8 @@ def test_wrong_options_are_refused(message):
     assert refusal(OptionError, make_grid, torus(), **PLACE, **BAD[message]) == message
 
 
-def test_a_mask_is_no_grid_without_make_grid():
-    for make, values in ((SdfGrid, MASK.astype(int)), (SdfGrid.trusted, MASK)):
-        with pytest.raises(GridError, match="a mask holds no distances; make a grid of it with"):
-            make(values, 1.0)
+def test_the_constructor_takes_a_mask():
+    assert SdfGrid(MASK.astype(int), 1.0).field.kind == "mask"
 
 
 def test_a_mask_shows_no_spacing():
