@@ -39,6 +39,7 @@ REFUSED = {
     "surface, such as level=0.8, inside='positive'": FAR + 0.5 - FAR.min(),
     "no value is above 0 (the largest is -1): they look like densities: give the level of their "
     "surface, such as level=-3.5, inside='positive'": (-1 - np.indices((3, 3, 3)).sum(0)),
+    "every value is False: a constant field has no surface": np.zeros((5, 5, 5), bool),
     "no value is finite: there is no surface": np.full((3, 3, 3), np.nan),
     f"values have shape (4, 4): {AXES}": np.zeros((4, 4)),
     f"values have shape (4, 1, 4): {AXES}": np.zeros((4, 1, 4)),

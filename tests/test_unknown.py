@@ -187,11 +187,6 @@ def test_two_values_beside_unknown_samples_are_a_mask(low, high):
     assert make_grid(values, **PLACE, inside="positive").field.kind == "mask"
 
 
-def test_labels_beside_unknown_samples_are_labels():
-    values = np.where(box() < -3, 2, np.where(box() < 0, 1, np.nan))
-    assert "they look like labels (1, 2)" in refusal(GridError, make_grid, values, **PLACE)
-
-
 @pytest.mark.parametrize("cut", [0.2, 1, 3])
 @pytest.mark.parametrize("make", [box, thin_frame])
 def test_values_that_are_cut_off_were_seen(cut, make):
