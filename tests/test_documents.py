@@ -123,6 +123,17 @@ def test_the_python_of_the_readme_and_the_quick_start_runs(grids):
         assert Path("field.ply").exists()
 
 
+def test_the_python_of_the_page_on_other_tools_runs(grids):
+    with_pyvista, with_xarray = blocks("python", ROOT / "docs" / "guides" / "tools.md")
+    names: dict = {}
+    exec(compile(with_pyvista, "tools.md", "exec"), names)
+    points = trimesh.load("ball.ply").vertices - names["image"].center
+    assert np.abs(np.linalg.norm(points, axis=1) - 1.2).max() < 0.01
+    exec(compile(with_xarray, "tools.md", "exec"), names)
+    points = names["mesh"].vertices - (12, 0, 0)
+    assert np.abs(np.linalg.norm(points, axis=1) - 1.5).max() < 0.02
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_have_the_arguments_that_a_page_gives_them(page):
     """Files are not looked for; options and their values are checked."""

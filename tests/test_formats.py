@@ -107,8 +107,8 @@ def test_what_is_no_grid_is_refused_with_the_way_out(command):
         os.mkdir(name)
     first = "super-sdf sample part.stl part.npz -n 64"
     for name, said in {
-        "part.stl": f"is a mesh, not a grid: sample it first with {first}",
-        "part.step": f"is a CAD model: export it as part.stl, then {first}",
+        "part.stl": f"is a mesh, not a grid: sample it first, {first}",
+        "part.step": f"is a CAD model, not a grid: sample it first, export part.stl, then {first}",
         "a.nii": "is a folder: give a file",
         "a.zarr": "cannot be read as Zarr: No group found in store",
         "no.zarr": "does not exist",

@@ -20,15 +20,12 @@ from super_sdf.errors import GridError, OptionError, SuperSdfWarning
 VALUES = ball(20, 6.0).values
 
 
-def test_values_of_the_other_sign_are_refused():
-    with pytest.raises(GridError) as caught:
-        SdfGrid(-VALUES, 1.0)
-    assert str(caught.value) == (
-        "100% of the grid's border is negative, which is inside: make the grid with "
-        "make_grid(values, spacing=..., inside='positive'), or inside='negative' if the solid does "
-        "run out of the grid there"
-    )
-    assert reconstruct(make_grid(-VALUES, spacing=1), trilinear, 2).volume() > 0
+def test_the_constructor_infers_what_make_grid_does():
+    made = make_grid(-VALUES, spacing=1, origin=(1, 2, 3))
+    for grid in (SdfGrid(-VALUES, 1.0, (1, 2, 3)), SdfGrid(VALUES, 1.0, (1, 2, 3))):
+        np.testing.assert_array_equal(grid.values, made.values)
+        assert (grid.spacing, grid.origin, grid.low) == (made.spacing, made.origin, made.low)
+    assert reconstruct(made, trilinear, 2).volume() > 0
 
 
 @pytest.mark.parametrize("make", [make_grid, lambda values: SdfGrid(values, 1.0)])
@@ -154,6 +151,7 @@ SAID = {
     "--labels has 'lung': choose fewer (--labels 1,2)": "labels has 'lung': choose fewer "
     "(labels=(1,2))",
     "end it there (--open), or use --force": "end it there (cap=False), or use force=True",
+    "leave it out, or --offset and --open": "leave it out, or offset= and cap=False",
     "pip install --force-reinstall onnxruntime": "pip install --force-reinstall onnxruntime",
 }
 

@@ -37,16 +37,16 @@ ROOMS = [
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
-    TOP: 1310,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
-    "grid": 2486,  # 1,800
+    TOP: 1311,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
+    "grid": 2307,  # 1,800
     "network": 500,
-    "refine": 1300,
+    "refine": 1293,
     "surface": 2321,  # 2,200; and features that bring no gain are dropped, what is noted of a mesh
     "tiles": 300,
-    "files": 2718,  # 2,700; and readers and writers of other packages
+    "files": 2714,  # 2,700; and readers and writers of other packages
     "functions": 729,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached
     "labels": 900,
-    "simplify check truth evaluation": 1527,  # 1,100; and the evaluation, which lab imports
+    "simplify check truth evaluation": 1530,  # 1,100; and the evaluation, which lab imports
     "batch": 900,
     "pages": 400,
     "cli": 839,  # 800; and standard input and output
@@ -164,7 +164,7 @@ def test_a_room_is_within_its_budget(rooms):
 def test_the_house_is_small():
     assert len(MODULES) <= MOST_MODULES
     assert lines_of(iter(MODULES.values())) <= MOST_LINES
-    folders = (ROOT / name for name in ("src", "lab", "export", "tests", "examples"))
+    folders = (ROOT / name for name in ("src", "lab", "export", "tests", "examples", "plugins"))
     assert lines_of(path for folder in folders for path in folder.rglob("*.py")) <= MOST_OF_ALL
 
 
@@ -183,7 +183,7 @@ def test_what_every_conversion_needs_is_few_packages(module):
 
 def test_onnxruntime_is_imported_in_one_place():
     """There its telemetry is switched off before."""
-    folders = [ROOT / name for name in ("src", "tests", "export", "lab", "examples")]
+    folders = [ROOT / name for name in ("src", "tests", "export", "lab", "examples", "plugins")]
     paths = [path for folder in folders for path in folder.rglob("*.py")]
     assert {path.name for path in paths if "onnxruntime" in imported(path)} == {"onnx.py"}
 

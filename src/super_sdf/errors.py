@@ -71,7 +71,8 @@ def in_a_line(error: BaseException) -> str:
 
 def _keyword(found: re.Match[str]) -> str:
     """Return the keyword of Python for a flag and the word behind it, which may be its value."""
-    name, value, more = found[1].replace("-", "_"), found[2], ", " if found[3] else ""
+    name, value = found[1].replace("-", "_"), found[2]
+    more = (" " if value in WORDS else ", ") if found[3] else ""
     if call := SWITCHES.get(f"{name} {value}"):
         return call + more
     if value in VERBS:

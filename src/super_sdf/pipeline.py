@@ -264,7 +264,7 @@ class Result:
 
     def said(self, grid: SdfGrid) -> tuple[list[str], list[str]]:
         """Return what was inferred of a grid, and what may be wrong with its mesh, in sentences."""
-        notes, warnings, field = list(self.lattice.notes), list[str](), grid.field
+        notes, warnings, field = list(self.lattice.flagged), list[str](), grid.field
         if self.capped:
             closed = "its surface is closed along the border (leave it open with --open)"
             notes.append(f"the solid runs out of the grid: {closed}")

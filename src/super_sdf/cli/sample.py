@@ -55,4 +55,4 @@ def command(source: Path, target: Path, **given: Any) -> None:
     if not given["quiet"]:
         shape, seconds = " x ".join(map(str, grid.shape)), time.perf_counter() - start
         said = f"{target}: {shape} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s"
-        main.print_stderr(*(f"Note: {note}" for note in (*notes, *grid.notes)), said)
+        main.print_stderr(*(f"Note: {note}" for note in (*notes, *grid.flagged)), said)

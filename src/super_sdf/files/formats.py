@@ -83,13 +83,10 @@ def find_format(path: str | Path) -> GridFormat:
         return format_
     if file.is_dir():
         return DICOM
-    sampled = f"{file.stem}.npz -n 64"
-    if file.suffix.lower() in CAD:
-        way_out = f"export it as {file.stem}.stl, then super-sdf sample {file.stem}.stl {sampled}"
-        raise OptionError(f"{path} is a CAD model: {way_out}")
-    if file.suffix.lower() in SURFACES:
-        way_out = f"sample it first with super-sdf sample {path} {sampled}"
-        raise OptionError(f"{path} is a mesh, not a grid: {way_out}")
+    if (kind := file.suffix.lower()) in (*SURFACES, *CAD):
+        mesh, what = (f"{file.stem}.stl", "CAD model") if kind in CAD else (path, "mesh")
+        first = f"export {mesh}, then " * (kind in CAD) + f"super-sdf sample {mesh} {file.stem}.npz"
+        raise OptionError(f"{path} is a {what}, not a grid: sample it first, {first} -n 64")
     raise OptionError(f"{path} is not a grid file: give one of {', '.join(GRID_SUFFIXES)}")
 
 
@@ -110,7 +107,7 @@ def plugin(group: str, ending: str) -> Any:
     """Return the entry point of another package for files with an ending, if there is one."""
     from importlib.metadata import entry_points  # imported here, as few files need it
 
-    return next(iter(entry_points(group=f"super_sdf.{group}", name=ending[1:])), None)
+    return next(iter(entry_points(group=f"super_sdf.{group}", name=ending[1:].lower())), None)
 
 
 def split_member(path: str | PurePath) -> tuple[Path, str | None]:

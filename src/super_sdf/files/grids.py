@@ -81,7 +81,7 @@ def read_grid(
     arrays = read_array(path, given, axes, space, max_memory)
     notes, space = arrays.pop("notes"), arrays.pop("space")
     grid = make_grid(**arrays, **values)
-    return with_fields(grid, notes=(*notes, *grid.notes), space=space)
+    return with_fields(grid, flagged=(*notes, *grid.flagged), space=space)
 
 
 def read_array(

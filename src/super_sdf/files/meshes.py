@@ -63,8 +63,7 @@ def has_parts(path: str | Path) -> bool:
 
 def check_mesh_suffix(path: Path, unit: str | None = None) -> Path:
     """Return the path of a mesh file; OptionError for another suffix, or if it states no unit."""
-    ending = path.suffix.lower()
-    if not (ending in MESH_SUFFIXES or plugin("writers", ending)):
+    if path.suffix.lower() not in MESH_SUFFIXES and not plugin("writers", path.suffix):
         raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
     if unit and not has_parts(path):
         stating = " or ".join(SCENES)

@@ -91,7 +91,7 @@ def convert_labels(
     listed = ", ".join(name for name, _ in lacking.values())
     notes += [f"no sample has a label that was asked for: {listed}"] * bool(missing)
     facts = {"labels": rows, "missing": missing, "closed": True, "warnings": warnings}
-    facts |= {"inferred": [*image.grid.notes, *notes], **describe_place(image.grid)}
+    facts |= {"inferred": [*image.grid.flagged, *notes], **describe_place(image.grid)}
     return LabelConversion(facts, watch.seconds)
 
 

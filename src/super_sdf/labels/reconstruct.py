@@ -88,7 +88,7 @@ def reconstruct_labels(
     image = find_image(values, asked, (spacing, origin, direction))
     chosen = load_network() if network is None else network
     meshes, notes, doubts = label_meshes(image, chosen, asked, progress)
-    said, doubted = tell((*image.grid.notes, *notes), doubts)
+    said, doubted = tell((*image.grid.flagged, *notes), doubts)
     meshes = [replace(mesh, notes=said, warnings=doubted) for mesh in meshes]
     return dict(zip(image.volumes, meshes))
 

@@ -60,7 +60,7 @@ def read_npz(request: Request) -> Volume:
 
 def read_plugin(request: Request) -> Volume:
     """Read a file by the function of another package, which returns the keys of an ``.npz``."""
-    found = plugin("readers", request.path.suffix.lower()).load()(request.path)
+    found = plugin("readers", request.path.suffix).load()(request.path)
     values = np.asanyarray(found["values"])
     place = placed(request, values.shape, {key: found[key] for key in PLACE if key in found})
     return Volume(*stored(values), **place)
