@@ -56,13 +56,13 @@ def beside(rows: Sequence[Row], word: str, theirs: Sequence[Row] = ()) -> str:
 def kind_table(rows: Sequence[Row]) -> str:
     """Return a row for each kind of grid: the methods' mean distances in voxels."""
     methods, body = list(dict.fromkeys(row["method"] for row in rows)), []
-    for name, kind in dict.fromkeys((row["set"], row["kind"]) for row in rows):
-        found = {row["method"]: row for row in pick(rows, set=name, kind=kind)}
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        found = {row["method"]: row for row in pick(rows, kind=kind)}
         mine, mc = found["ours"], found["mc"]
         taken = mine["taken_as"] + (f", refused {mine['refused']}" if mine["refused"] else "")
         voxels = Column("voxels", digits=4)
         body.append([
-            *(kind if name == "shapes" else f"{kind}, CAD parts", taken),
+            *(kind, taken),
             *(voxels.cell(found.get(method, {})) for method in methods),
             f"{mc['volume_most']:.1f} %, {mine['volume_most']:.1f} %",
             f"{mine['pieces_of_reference']}, {mc['pieces']}, {mine['pieces']}",
@@ -89,9 +89,15 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
     "peers.ndc": lambda rows: listed(
         among(rows, "method", "ndc"), shown_in("parts peers"), BY_SIZE),
     "kinds.distances": lambda rows: kind_table(
-        [row for row in rows if row["kind"] != "mask" and "spacing 1" not in row["kind"]]),
-    "kinds.masks": lambda rows: kind_table(pick(rows, kind="mask")),
+        [row for row in rows if "spacing 1" not in row["kind"]]),
     "kinds.unequal": lambda rows: kind_table(among(rows, "kind", "spacing 1")),
+    **{f"masks.{column.key}-{n}": lambda rows, column=column, n=n: wide(
+        [row for row in pick(rows, ratio=n) if row["set"] != "labels"], "method", (column,), "set")
+       for column in tables.OF_MASKS for n in (1, 5)},
+    "masks.costs": lambda rows: listed(
+        pick(rows, set="all masks"), tables.MASKS, ("ratio", "method")),
+    "masks.labels": lambda rows: listed(
+        pick(rows, set="labels"), tables.WALLS, ("ratio", "method")),
     "speed.process": lambda rows: wide(
         [row for row in rows if row["option"] == "default" or "--" in row["option"]],
         "option", tables.COSTS),

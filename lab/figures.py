@@ -18,10 +18,11 @@ import statistics
 import subprocess
 import sys
 import tempfile
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ from . import costs, parser_of
 from .documents import FOLDER, tables_of
 from .evaluate import Results, add_jobs, progress_lines, results_of
 from .kinds import KINDS
+from .masks import PEERS, RATIOS, measure, scenes
 from .measuring import Task, digest_of_file, digest_of_ours
 from .methods import FLOOR, ON
 from .ndc import add_ndc
@@ -143,18 +145,14 @@ def peers(bench: Bench) -> list[Row]:
 
 
 def kinds(bench: Bench) -> list[Row]:
-    rows, setting = [], Setting(bench.sizes[0])
-    masks = {name: kind for name, kind in KINDS.items() if kind.group == "mask"}
-    sets = {"shapes": ("few", KINDS), **({"parts": ("parts", masks)} if bench.parts else {})}
-    for name, (paths, some) in sets.items():
-        methods = [f"{method}{ON}{kind}" for kind in some for method in some[kind].methods]
-        results = bench.results(paths, [setting], methods)
-        for title in dict.fromkeys(kind.title for kind in some.values()):
-            rows += kind_rows(results, setting, name, title)
-    return rows
+    setting = Setting(bench.sizes[0])
+    methods = [f"{method}{ON}{name}" for name, kind in KINDS.items() for method in kind.methods]
+    results = bench.results("few", [setting], methods)
+    titles = dict.fromkeys(kind.title for kind in KINDS.values())
+    return [row for title in titles for row in kind_rows(results, setting, title)]
 
 
-def kind_rows(results: Results, setting: Setting, name: str, title: str) -> list[Row]:
+def kind_rows(results: Results, setting: Setting, title: str) -> list[Row]:
     """Return a row for each method on the kinds of a title; refused grids are left out of all."""
     alike = [kind for kind in KINDS.values() if kind.title == title]
     by_method = {
@@ -166,7 +164,7 @@ def kind_rows(results: Results, setting: Setting, name: str, title: str) -> list
     for method, measured in by_method.items():
         used = [row for row, good in zip(measured, taken) if good]
         off = [100 * abs(row["volume_off"]) for row in used] or [np.nan]
-        row = {"set": name, "kind": title, "size": setting.size, "method": method}
+        row = {"kind": title, "size": setting.size, "method": method}
         row |= {"voxels": setting.size * (mean_of(used, "p2s") or np.nan), "volume_most": max(off)}
         counted = ("pieces", "pieces_of_reference", "closed")
         row |= {"grids": len(used), **{key: sum(one[key] for one in used) for key in counted}}
@@ -176,6 +174,23 @@ def kind_rows(results: Results, setting: Setting, name: str, title: str) -> list
             row["taken_as"] = ", ".join(f"{k} {n}" if several else k for k, n in kinds_of)
             row["refused"] = taken.count(False)
         rows.append(row)
+    return rows
+
+
+def masks(bench: Bench) -> list[Row]:
+    """Measure masks and labels beside other tools: means over the scenes of a set."""
+    found = defaultdict[tuple[str, int, str], list[Row]](list)
+    for scene, ratio, method in product(scenes(bench.shapes, bench.parts), RATIOS, PEERS):
+        key = {"scene": scene.name, "ratio": ratio, "method": method}
+        row = bench.timed(key, partial(measure, scene, method, ratio))
+        for name in (scene.set,) if scene.set == "labels" else ("all masks", scene.set):
+            found[name, ratio, method].append(row)
+    rows = []
+    for (name, ratio, method), some in found.items():
+        numbers = [key for key, value in some[0].items() if isinstance(value, (int, float))]
+        row = {key: mean_of(some, key) for key in numbers} | {"set": name, "ratio": ratio}
+        closed = f"{sum(not row['open'] for row in some)} of {len(some)}"
+        rows.append({**row, "method": method, "closed": closed})
     return rows
 
 
@@ -266,9 +281,10 @@ FIGURES: dict[str, tuple[Callable[[Bench], list[Row]], tuple[str, ...]]] = {
     "factors": (factors, ("base",)),
     "simplify": (simplify, ("base",)),
     "speed": (speed, ("fast", "base", "best")),
+    "masks": (masks, ("mask",)),
     "peers": (peers, ("base",)),
 }
-RARE = ("peers",)  # takes long for what few ask for
+RARE = ("masks", "peers")  # need the extra peers, and take long for what few ask for
 
 
 def write(name: str, rows: list[Row], bench: Bench, out: Path) -> Path:

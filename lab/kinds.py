@@ -30,9 +30,7 @@ Spacing = NDArray[np.float64]
 CUTS = (0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # voxels
 INTEGERS = 30_000.0  # of the diagonal, in steps of whole numbers of 16 bits
 RATIOS = (1.5, 5.0)  # of the coarse spacing to the others
-WIDTHS = (0.5, 0.8, 1.2)  # voxels, of the Gaussians by which masks are smoothed
 DISTANCES = ("mc", "bspline", "ours")
-MASKS = ("mc", "mc-distances", *(f"mc-gaussian-{width:g}" for width in WIDTHS), "ours")
 AXES = "xyz"
 
 
@@ -125,7 +123,7 @@ HALF: dict[str, Any] = {"level": 0.5, "options": {"level": 0.5}}
 PERCENT = np.float32(0.01)
 ALL_KINDS = (
     Kind("exact", "exact", lambda case: case.coarse),
-    Kind("mask", "mask", lambda case: (case.coarse <= 0).astype(np.uint8), MASKS, level=0.5),
+    Kind("mask", "mask", lambda case: (case.coarse <= 0).astype(np.uint8), level=0.5),
     *(truncated_kind(f"{cut:g}", cut, cut) for cut in CUTS),
     truncated_kind("-1 and 2.5", 1.0, 2.5),
     Kind("truncated", "unknown beyond 2", lambda case: np.where(
@@ -153,18 +151,9 @@ KINDS = {kind.name: kind for kind in ALL_KINDS}
 # What is done with the values of a kind.
 
 
-def coarse_surface(
-    kind: Kind, case: Case, network: Decoder, change: Callable[[Array], FloatArray] | None = None
-) -> Surface:
+def coarse_surface(kind: Kind, case: Case, network: Decoder) -> Surface:
     values, spacing, origin = samples_of(kind, case)
-    found = change(values) if change else level_set(kind, values)
-    return Surface(closed_isosurface(found, spacing, origin))
-
-
-def transformed(mask: Array) -> FloatArray:
-    """Return SciPy's distances of a mask, in voxels, half a voxel less on either side."""
-    out, into = (ndimage.distance_transform_edt(side) for side in (mask == 0, mask > 0))
-    return np.where(mask > 0, 0.5 - into, out - 0.5).astype(np.float32)
+    return Surface(closed_isosurface(level_set(kind, values), spacing, origin))
 
 
 def spline_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
@@ -191,10 +180,6 @@ def our_surface_of_kind(kind: Kind, case: Case, network: Decoder) -> Surface:
 
 BY_METHOD: dict[str, Callable[[Kind, Case, Decoder], Surface]] = {
     "mc": coarse_surface,
-    "mc-distances": partial(coarse_surface, change=transformed),
-    **{f"mc-gaussian-{width:g}": partial(coarse_surface, change=lambda mask, width=width: (
-        0.5 - ndimage.gaussian_filter(mask.astype(np.float32), width, mode="nearest")))
-       for width in WIDTHS},
     "bspline": spline_of_kind,
     "ours": our_surface_of_kind,
-}  # fmt: skip
+}

@@ -19,7 +19,6 @@ from super_sdf.network.contract import Decoder
 from super_sdf.network.network import KIND_MODELS, find_model, load_network, shipped_models
 from super_sdf.options import DEFAULT_QUALITY
 
-from .kinds import MASKS
 from .methods import FLOOR, ON, make_surface
 from .metrics import METRICS, OF_KINDS, Comparison, Measure
 from .shapes import Case, Setting, Shape
@@ -31,10 +30,7 @@ Measurement = dict[str, Any]
 PROTOCOL = 3  # increase it when a figure changes its meaning: older measurements do not count then
 NO_SETTING = Setting(0, 0)  # of the floor: nothing is sampled
 # Methods whose results do not depend on the code and the networks of this package.
-OF_OTHERS = (
-    *(*MASKS[:-1], "mc-lewiner", "trilinear", "bspline", "bound"),
-    *(FLOOR, "dual-contouring", "ndc"),
-)
+OF_OTHERS = ("mc", "mc-lewiner", "trilinear", "bspline", "bound", FLOOR, "dual-contouring", "ndc")
 # Folders and modules of the package whose code does not change any surface.
 NOT_THE_METHOD = {"batch", "check.py", "cli", "evaluation.py", "labels", "pages"}
 

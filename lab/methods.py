@@ -38,11 +38,10 @@ ON = " on "
 WITHIN, ERROR = "within", 0.02  # simplified within this error, in voxels
 
 Method = Callable[[Case, Decoder], Surface]
-# What tables call each method; kinds of a method follow its name: "mc-gaussian-0.5".
+# What tables call each method; kinds of a method follow its name: "slicer-0.5".
 LABELS = {
     "mc": "marching cubes",
     "mc-lewiner": "marching cubes, Lewiner's table",
-    "mc-distances": "marching cubes of SciPy's distance transform",
     "trilinear": "trilinear + marching cubes",
     "bspline": "B-spline + marching cubes",
     OURS: "super-sdf",
@@ -50,6 +49,9 @@ LABELS = {
     FLOOR: "floor: the reference against itself",
     "dual-contouring": "dual contouring of distances",
     "ndc": "neural dual contouring",
+    "surfacenets": "VTK's SurfaceNets3D",
+    "slicer": "Slicer's pipeline",
+    "serra": "serra-mesh",
 }
 
 

@@ -3,6 +3,7 @@
     python -m lab picture PARTS                      # the CAD parts of README and "Sharp edges"
     python -m lab picture case.nii.gz                # all labels of an image, each in a colour
     python -m lab picture                            # a level set: a splash
+    python -m lab picture --masks                    # a mask beside other tools
     python -m lab picture grid.npz --out grid.png    # any other grid
 
 PARTS is the folder of ``python -m export.parts PARTS``. Lengths in a picture can be compared.
@@ -15,7 +16,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ from super_sdf import Mesh, SdfGrid, load_network, make_grid, read_grid, reconst
 from super_sdf.errors import DeviceError
 from super_sdf.labels.reconstruct import reconstruct_labels
 
-from . import parser_of
+from . import masks, parser_of
 from .methods import make_surface
 from .shapes import Case, Setting, Shape, turn_of
 from .surfaces import closed_isosurface
@@ -39,6 +40,8 @@ AXES = np.array([[5, 3, 0], [-2.7, 4.5, 6.8]])  # of a panel, in the world: to t
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
 MARGIN, PIXELS = 1.06, (640, 480)
 SEED, CAPTION, PALETTE = 0, 36, 96  # of the turn; pixels above a panel; colours of the file
+MASKED = ("mc", "surfacenets", "slicer-0.5", "serra-faired", "ours")
+BALL = ((3, 0, 12), (3, 0, 12), 13)  # beside the vessels
 SPLASH_SIZE, ARMS = 48, 11  # samples a side; jets of the splash
 SHADED = {"ambient": 0.25, "diffuse": 1.0, "specular": 0.25, "specular_power": 20}
 DRAW = (  # what VTK does before it draws anything
@@ -143,19 +146,28 @@ def panels_of_labels(source: Path) -> list[Panel]:
     return compared([("marching cubes", steps), ("super-sdf", list(meshes.values()))])
 
 
+def panels_of_mask() -> list[Panel]:
+    """Return a ball with vessels, and what is made of its mask."""
+    form = masks.union([BALL, *masks.VESSELS])
+    scene = masks.Scene("", "ball with vessels", (partial(masks.surface_of, form),))
+    image, spacing, _ = masks.image_of(scene, 1)
+    found = {"true surface": [solid.mesh for solid in masks.solids_of(scene)]}
+    found |= {label_of(name): [masks.PEERS[name](image, spacing)[1]] for name in MASKED}
+    return compared(found.items(), turn_of(scene.name, masks.TURN))
+
+
 def splash() -> SdfGrid:
     """Return a level set, cut off at three voxels: a ring of jets that end in drops."""
     h = 2 / SPLASH_SIZE
     points = np.stack(np.indices([SPLASH_SIZE] * 3), -1) * h - 1 + h / 2
     x, y, z = np.moveaxis(points, -1, 0)
-    found = [np.hypot(np.hypot(x, y) - 0.45, z + 0.45) - 0.09]
+    ring, forms = np.hypot(np.hypot(x, y) - 0.45, z + 0.45) - 0.09, list[masks.Form]()
     for angle in 2 * np.pi * np.arange(ARMS) / ARMS:
         out = np.array([np.cos(angle), np.sin(angle), 0])
         low, top = 0.45 * out - [0, 0, 0.45], 0.72 * out + [0, 0, 0.15 * np.cos(3 * angle)]
-        along = np.clip((points - low) @ (top - low) / ((top - low) ** 2).sum(), 0, 1)
-        jet = np.linalg.norm(points - low - along[..., None] * (top - low), axis=-1)
-        found += [jet - 0.045, np.linalg.norm(points - top - 0.16 * out, axis=-1) - 0.075]
-    return make_grid(np.clip(np.min(found, 0), -3 * h, 3 * h), spacing=h)
+        forms += [(low, top, 0.045), (top + 0.16 * out, top + 0.16 * out, 0.075)]
+    found = np.minimum(ring, masks.union(forms)(points))
+    return make_grid(np.clip(found, -3 * h, 3 * h), spacing=h)
 
 
 def main() -> None:
@@ -163,9 +175,12 @@ def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("source", nargs="?", type=Path, help="a grid, labels, or a folder of parts")
     parser.add_argument("--out", type=Path, help="PNG file; default: the picture in the documents")
+    parser.add_argument("--masks", action="store_true", help="draw a mask beside other tools")
     words = parser.parse_args()
     source = words.source
-    if source is None:
+    if words.masks:
+        draw(panels_of_mask(), words.out or IMAGES / "masks.png", 3, (400, 340))
+    elif source is None:
         draw(panels_of_grid(splash()), words.out or IMAGES / "level-set.png", 2)
     elif source.is_dir():
         first = panels_of_part(source, FIRST, FIRST_SIZE, METHODS[::2])

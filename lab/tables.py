@@ -17,6 +17,13 @@ DENSE = (*COSTS, Column("over_seconds", "time over ours", digits=1),
          Column("over_peak_mb", "memory over ours", digits=1))  # fmt: skip
 LARGE = (Column("tiles", "tiles", digits=0), Column("band_voxels", "band voxels", digits=0),
          Column("triangles", "triangles", digits=0), *COSTS)  # fmt: skip
+OF_MASKS = (Column("voxels"), Column("bias"), Column("volume", digits=2))
+MASKS = (Column("faces", "triangles", digits=0), Column("closed", "closed"),
+         Column("seconds", "ms", 1000, 1))  # fmt: skip
+WALLS = (Column("voxels", "distance"), Column("most", "worst label"), Column("bias", "bias"),
+         Column("gaps", "gaps %", 100), Column("overlaps", "overlaps %", 100), *MASKS[:1],
+         Column("open", "open edges", digits=0), Column("megabytes", "MB", digits=1),
+         MASKS[2])  # fmt: skip
 
 
 def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], align: str = "---:") -> str:
@@ -41,11 +48,11 @@ def meanings(tables: str, but: str = "") -> str:
     return markdown(("figure", "better", "meaning"), rows, "---")
 
 
-def wide(rows: Iterable[Row], word: str, columns: Sequence[Column]) -> str:
+def wide(rows: Iterable[Row], word: str, columns: Sequence[Column], across: str = "size") -> str:
     """Return a line for each method or other word, with the columns of each size side by side."""
-    found = {(word_of(row, word), row["size"]): row for row in rows}
+    found = {(word_of(row, word), word_of(row, across)): row for row in rows}
     names, sizes = (list(dict.fromkeys(keys)) for keys in zip(*found))
-    heads = [f"{n}^3, {c.title}" if len(columns) > 1 else f"{n}^3" for n in sizes for c in columns]
+    heads = [f"{n}, {c.title}" if len(columns) > 1 else n for n in sizes for c in columns]
     body = [[name, *(c.cell(found.get((name, n), {})) for n in sizes for c in columns)]
             for name in names]  # fmt: skip
     return markdown([word, *heads], body)
