@@ -31,7 +31,6 @@ MOST_LABELS = 1000  # different values that are listed
 TELLING = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
 AS_GOOD = 0.9  # of the largest mean step of neighbours over a level
-GROWS = 2.0  # times the share of all samples, that of the border above a level of unsigned values
 SHARE, LEAST = 0.01, 20  # of the most steps over any level, and steps, that count
 MOST_OUTSIDE = 0.65  # of the border, above a level: maps of noise to .55, distances from .76
 MOST_NAMED = 8  # labels that a message lists
@@ -145,8 +144,6 @@ def look_at(samples: SampleArray) -> Look:
         faces += [x.copy() for x in (*ends, plane[0], plane[-1], plane[:, 0], plane[:, -1])]
         if i % 16 == 0:
             let_go(samples)
-    if high <= 0:
-        changes = np.array([np.count_nonzero(plane < 0) for plane in samples])
     part, own = _part_of(samples, changes)
     shape, together = tuple(map(int, samples.shape)), np.concatenate(faces)
     is_two = _has_two([part], low, high) and _has_two(samples, low, high)
@@ -352,7 +349,7 @@ def steps_by_axis(gradients: Floats) -> Floats:
 # What a refusal names
 
 
-def which_level(look: Look, *, signed: bool = False) -> str:
+def which_level(look: Look) -> str:
     """Return the advice to give a level: that over which neighbours differ most.
 
     It is the shortest number among those that are about as good, and never a value of a sample.
@@ -364,13 +361,6 @@ def which_level(look: Look, *, signed: bool = False) -> str:
     total = over.sum(0)
     steps = np.where(total >= max(LEAST, SHARE * total.max()), (high - low) @ over, 0)
     steps = steps / total.clip(1)
-    faces = np.sort(look.faces[np.isfinite(look.faces)])
-    share = np.searchsorted(faces, levels) / max(len(faces), 1)  # of the border, below a level
-    inner = (look.lines[:, 0, 2][:, None] < levels).mean(0) if len(look.lines) else share
-    # values that grow outwards: above are only the corners of the grid
-    grows = (1 - share > GROWS * (1 - inner)) & (share > 0.5)
-    if grows[steps.argmax()] and (all_above := share < 0.1).any():
-        steps = np.where(all_above, steps, 0)
     good = levels[steps >= AS_GOOD * steps.max()]
     least, middle, most = np.quantile(good, [0.4, 0.5, 0.6]).tolist()
     short = (float(f"{middle:.{digits}g}") for digits in (1, 2, 3))
@@ -383,20 +373,17 @@ def which_level(look: Look, *, signed: bool = False) -> str:
         level = float(values[at - 1 if at else 1] + level) / 2
     outside = border_share(look, lambda x: x > level) > MOST_OUTSIDE
     option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
-    other = " (or --field smooth, if it is at 0)" if signed else ""
+    other = " (or --field smooth, if it is at 0)" if look.low < 0 < look.high else ""
     return f"they look like densities: give the level of their surface, such as {option}{other}"
 
 
-def which_label(samples: SampleArray) -> str:
-    """Return the advice to choose a label: the most frequent but 0 that is not the border's."""
-    samples = as_labels(samples)
-    found = different_values(samples)
+def which_label(found: tuple[NDArray[Any], NDArray[np.int64]] | None) -> str:
+    """Return the advice to choose a label: the most frequent after that of the background."""
     if found is None:
         return "they are labels: choose one with --label, or some with --labels"
     distinct, counts = found
-    values, frequent = np.unique(np.stack([samples[0], samples[-1]]), return_counts=True)
-    at = np.flatnonzero((distinct != values[frequent.argmax()]) & (distinct != 0))
-    best = distinct[at[counts[at].argmax()] if len(at) else 0]
+    ordered = distinct[np.argsort(counts, kind="stable")[::-1]]
+    best = next((x for x in ordered[1:] if x), ordered[0])
     return (
         f"they look like labels ({named(distinct.tolist())}): choose one with "
         f"--label {round(best.item())}, or mesh all with --labels all"

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
 from ..errors import GridError, OptionTypeError, seen
 from ..options import FieldKind, Inside, Options
-from .interpret import NONE_EXACT, Field, interpret
+from .interpret import NONE_EXACT, Field, check_size, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
 from .samples import (
     AXES,
@@ -103,8 +103,6 @@ class SdfGrid:
     ) -> None:
         samples, _, origin = placed(values, spacing, origin)
         h, look = max(check_spacing(spacing)), _look_at_finite(samples)
-        if look.low == look.high:
-            raise GridError(f"every value is {look.low:.6g}: a constant field has no surface")
         if look.is_two and min(look.shape) > 2:
             raise GridError(f"the only values are {look.low:.6g} and {look.high:.6g}: {NO_MASK}")
         below = border_share(look, lambda x: x < 0)
@@ -141,7 +139,7 @@ class SdfGrid:
         """
         steps, axes, field = check_spacing(spacing), check_direction(direction), field or Field()
         is_sheared = np.abs(np.transpose(axes) @ np.array(axes) - np.eye(3)).max() > 2 * SKEW
-        are_distances = field.network in ("distance", "noisy")
+        are_distances = field.kind in ("distance", "noisy")
         if is_sheared and are_distances and not field.own_lattice:
             raise GridError(
                 f"direction is {in_rows(axes)}: its axes are not at right angles, and there "
@@ -245,6 +243,7 @@ def _look_at_finite(samples: SampleArray) -> Look:
             f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}: every sample must be finite; "
             "replace unknown far samples by a large distance of the right sign"
         )
+    check_size(look)
     return look
 
 
