@@ -172,38 +172,31 @@ def _labels(samples: SampleArray, look: Look, hint: str, facts: dict[str, Any]) 
 
 
 def _step_of_transform(look: Look, given: Floats | None) -> float:
-    """Return the typical size beside the surface of values that follow from their signs, else 0.
+    """Return the typical size beside the surface of values that follow from their sides, else 0.
 
-    Samples are equal wherever the 27 signs round them are; of most transforms they all have one
-    size. So have distances to faces along the axes, which differ by their steps.
+    Samples are equal wherever the other side is beside them along as many axes; of most transforms
+    they all have one size. So have distances to faces along the axes, which differ by their steps.
     """
     fine = np.ones(3, bool) if given is None else given < 1.01 * given.min()
-    middle, largest = look.boxes[:, 2, 2, 2], max(abs(look.low), abs(look.high))
-    known = np.isfinite(look.boxes[:, 1:4, 1:4, 1:4]).all((1, 2, 3)) & (middle != 0)
+    around, middle = look.boxes[:, 1:4, 1:4, 1:4].reshape(-1, 27), look.boxes[:, 2, 2, 2]
     cut = [value for value in look.cut if value]
+    known = np.isfinite(around).all(1) & (middle != 0)
     best, step, is_stepped = (FOLLOW, 0), 0.0, False
     for sign in (1, -1):  # 0 may be on either side
-        signs = (sign * look.boxes[:, 1:4, 1:4, 1:4] > 0).reshape(-1, 27)
-        along = (signs != signs[:, 13:14])[:, FACES].any(2)[:, fine]
-        ring = known & along.any(1)
-        free = ring & ~np.isin(middle, cut)
-        x = middle[free]
-        if len(x) < max(ENOUGH, ring.sum() / 2):
+        sides = sign * around > 0
+        axes = (sides != sides[:, 13:14])[:, FACES].any(2)[:, fine].sum(1)
+        beside = known & (axes > 0)
+        free = beside & ~np.isin(middle, cut)
+        if free.sum() < max(ENOUGH, beside.sum() / 2):
             continue
+        x, patterns = middle[free], np.packbits(sides[free], axis=1)
         typical = float(np.quantile(np.abs(x), 0.5))
-        alike = np.abs(np.abs(x) - typical) <= 0.01 * typical
-        share = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
-        key = np.ascontiguousarray(np.packbits(signs[free], axis=1)).view(np.uint32).ravel()
-        order = np.argsort(key, kind="stable")
-        same = np.diff(key[order]) == 0
-        if same.sum() >= 5 * ENOUGH:
-            equal = np.abs(np.diff(x[order])[same]) <= 0.01 * typical
-            share = max(share, float(equal.mean()))
-        if (share, len(x)) > best and typical > NOTHING * largest:
+        many, share = _share_alike(x, patterns)
+        share = max(share, _share_alike(x, (axes[free] * np.sign(x))[:, None])[1])
+        if (share, len(x)) > best:
             best, step = (share, len(x)), typical
-            is_many = np.count_nonzero(~same) >= min(PATTERNS, OF_ALL * len(x))
-            has_stairs = (along[free].sum(1) > 1).mean() > STAIRS
-            is_stepped = bool(has_stairs and is_many and len(cut) < 2)
+            is_stepped = (axes[free] > 1).mean() > STAIRS and len(cut) < 2
+            is_stepped &= many >= min(PATTERNS, OF_ALL * len(x))
     if not (step and (is_stepped or _jump_over_0(look))):
         return 0.0
     whole = look.pairs / np.abs(look.pairs[look.pairs != 0]).min()
@@ -214,6 +207,15 @@ def _step_of_transform(look: Look, given: Floats | None) -> float:
     rise = np.abs(np.diff(look.box_lines[..., 1::2])[..., 0]).sum(1) / 2
     rough, rise = (x[np.isfinite(rough + rise)] for x in (rough, rise))
     return step if not len(rise) or np.median(rough) >= ROUGH * np.median(rise) else 0.0
+
+
+def _share_alike(values: Floats, keys: NDArray[Any]) -> tuple[int, float]:
+    """Return how many different keys (n, k) there are, and the share of equal values for these."""
+    found, which = np.unique(keys, axis=0, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    same = np.diff(which.ravel()[order]) == 0
+    alike = np.abs(np.diff(values[order])[same]) <= 0.01 * np.quantile(np.abs(values), 0.5)
+    return len(found), float(alike.mean()) if len(alike) >= ENOUGH else 0.0
 
 
 def _counts_steps(boxes: Floats) -> bool:
