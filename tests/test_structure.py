@@ -37,7 +37,7 @@ ROOMS = [
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
     TOP: 1250,
-    "grid": 2480,  # 1,800
+    "grid": 2383,  # 1,800
     "network": 500,
     "refine": 1300,
     "surface": 2200,

@@ -22,6 +22,7 @@ from .look import (
     Extremes,
     Look,
     as_labels,
+    beside_surface,
     border_share,
     look_at,
     named,
@@ -44,7 +45,9 @@ INNER = 0.25  # spacings: as deep at least samples inside are, where parts of a 
 NONE_EXACT: Extremes = (0.0, 0.0)
 FILLED = 1.75  # voxels from the surface: where distances are cut off nearer, the rest is filled in
 STEEPER = 1.3  # than between any neighbours: slopes to 1.22, beside edges of cut off ones 1.43
-SATURATED = 1.0  # voxels from the surface within which densities that level off are distances
+# Densities that level off within a voxel of the surface are distances: share of the values between
+# their ends that are beside it. Volume fractions from .87, ramps over two voxels .74, blurred .33.
+BESIDE = 0.6
 APPROXIMATE = "from the values, so the size of the mesh is approximate (give --spacing)"
 ORDINARY = 1e-100, 1e100  # sizes whose squares are numbers, too
 
@@ -148,7 +151,7 @@ class Case:
             return
         from .unknown import with_known  # imported where it is needed, as few need it
 
-        filled = with_known(self.samples, values, self.notes)
+        filled = with_known(self.samples, self.look, values, self.notes)
         self.samples, self.unseen, self.why_open = filled
         self.look = look_at(self.samples)
         self.facts = self.facts | {"cut": [self.look.low, self.look.high]}
@@ -196,10 +199,12 @@ def interpret(
         answer = recognise(samples, look, h, hint)
     if wanted.field != "auto":
         facts = {name: answer.facts.get(name) for name in ("cut", "spacing", "unit")}
-        answer = Answer("mask" if look.is_two else wanted.field, "two values", facts)
+        answer = Answer("mask" if look.is_two else wanted.field, "", facts)
     is_shell = answer.kind == "distance" and look.is_one_sided and wanted.inside != "auto"
-    if answer.refusal and not is_shell:
-        raise _refused(case, answer)
+    if answer.kind == "labels":
+        raise GridError(answer.refusal)
+    if answer.kind == "density" or (answer.refusal and not is_shell):
+        raise _refused(case, answer.refusal)
     return _as_recognised(case, answer)
 
 
@@ -216,18 +221,15 @@ def check_size(look: Look) -> None:
         raise GridError(f"the largest value is {end:.6g}: {said}")
 
 
-def _refused(case: Case, answer: Answer) -> GridError:
-    """Return the error for values that cannot be meshed."""
-    said, side, look = answer.refusal, "", case.look
-    if answer.kind == "density" and case.wanted.scale:  # a level is a value without the scale
-        said = which_level(look_at(case.given))
-    if answer.kind == "labels":
-        side = "no solid is chosen: "
-    elif look.low >= 0:
-        side = f"no value is below 0 (the smallest is {look.low:.6g}): "
-    elif look.high <= 0:
-        side = f"no value is above 0 (the largest is {look.high:.6g}): "
-    return GridError(side + said)
+def _refused(case: Case, said: str = "") -> GridError:
+    """Return the error for values that cannot be meshed; by default they need a level."""
+    before, level, side = look_at(case.given), case.wanted.level or 0.0, ""
+    value = "finite value" if before.infinite else "value"
+    if case.look.low >= 0:
+        side = f"no {value} is below {level:g} (the smallest is {before.low:.6g}): "
+    elif case.look.high <= 0:
+        side = f"no {value} is above {level:g} (the largest is {before.high:.6g}): "
+    return GridError(side + (said or which_level(before)))
 
 
 def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
@@ -235,8 +237,6 @@ def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
     case.facts = facts = answer.facts
     case.fill_in(facts.get("unknown_values", ()))
     if answer.kind == "mask":
-        if "two values" not in answer.why:
-            case.notes.append(f"the values are {answer.why}")
         return _of_sides(case)
     if answer.kind == "smooth":
         if answer.why:
@@ -283,11 +283,9 @@ def _of_sides(case: Case) -> dict[str, Any]:
     if look.is_two:
         return _of_mask(case, partial(np.less, look.low))
     if look.low > 0 or look.high < 0:
-        raise GridError(
-            f"every value is {'above' if look.low > 0 else 'below'} 0 (they go from {look.low:.6g} "
-            f"to {look.high:.6g}), so their signs make no mask: {which_level(look_at(case.given))}"
-        )
+        raise _refused(case)
     if "step" in facts:
+        case.notes.append("they are a distance transform, so only their signs say something")
         case.set_spacing(facts["step"], "the step of the transform")
     below, zeros = border_share(look, lambda x: x < 0), facts.get("zeros", 0)
     is_positive = below > 0.5 if inside == "auto" else inside == "positive"
@@ -317,12 +315,8 @@ def _of_mask(case: Case, above: Above) -> dict[str, Any]:
 def _of_level(case: Case) -> dict[str, Any]:
     """Return values from which a level was taken, above it positive."""
     look, wanted = case.look, case.wanted
-    if look.low >= 0 or look.high <= 0:
-        before = look_at(case.given)
-        raise GridError(
-            f"no value is {'above' if look.high <= 0 else 'below'} the level {wanted.level:g} "
-            f"(they go from {before.low:.6g} to {before.high:.6g}): {which_level(before)}"
-        )
+    if look.is_one_sided:
+        raise _refused(case)
     if look.is_two or wanted.field == "mask":
         return _of_mask(case, partial(np.less, 0))
     case.fill_in()
@@ -333,13 +327,12 @@ def _of_level(case: Case) -> dict[str, Any]:
 def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     """Return values in steps of their slope beside the surface, to be meshed by their spline."""
     if case.look.is_one_sided:
-        raise GridError(f"no value is on the other side of 0: {which_level(look_at(case.given))}")
+        raise _refused(case)
     case.spacing = spacing = case.spacing or _estimated(case)
-    steps, cut = steps_of(spacing), case.look.cut
+    steps = steps_of(spacing)
     slope = 1.0 if case.wanted.scale else _slope_at_surface(case.look, steps)
-    levels_off = is_cubic(spacing) and len(cut) == 2
-    if kind == "density" and levels_off and min(map(abs, cut)) <= SATURATED * slope * steps[0]:
-        case.facts = {"cut": cut}
+    if kind == "density" and is_cubic(spacing) and _levels_off(case.look):
+        case.facts = {"cut": [case.look.low, case.look.high]}
         case.scaled(slope)
         return _of_distances(case, spacing, "density")
     case.scaled(slope)
@@ -351,6 +344,11 @@ def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     has_jumps = bool(case.facts.get("cut")) and kind == "smooth"
     own = Field(kind, exact=NONE_EXACT, network=None, has_jumps=has_jumps)
     return case.taken(own, case.choose_side())
+
+
+def _levels_off(look: Look) -> bool:
+    between = (look.part > look.low) & (look.part < look.high)
+    return bool(beside_surface(look.part)[between].mean() > BESIDE)
 
 
 def _slope_at_surface(look: Look, steps: ArrayLike) -> float:

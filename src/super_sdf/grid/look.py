@@ -31,6 +31,7 @@ MOST_LABELS = 1000  # different values that are listed
 TELLING = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
 AS_GOOD = 0.9  # of the largest mean step of neighbours over a level
+GROWS = 2.0  # times the share of all samples, that of the border above a level of unsigned values
 SHARE, LEAST = 0.01, 20  # of the most steps over any level, and steps, that count
 MOST_OUTSIDE = 0.65  # of the border, above a level: maps of noise to .55, distances from .76
 MOST_NAMED = 8  # labels that a message lists
@@ -302,13 +303,6 @@ def side_of_zeros(look: Look) -> int:
     return int(np.sign(lone[1] - lone[0]))
 
 
-def parting_level(values: Floats) -> float:
-    """Return the level that parts the values into two of least variance (Otsu's)."""
-    ordered, below = np.sort(values), np.arange(1, len(values))
-    apart = np.cumsum(ordered - ordered.mean())[:-1] ** 2 / (below * below[::-1])
-    return float(ordered[apart.argmax()])
-
-
 def last_digit(look: Look) -> float:
     """Return by how much values beside the surface typically differ at least."""
     largest = max(abs(look.low), abs(look.high))
@@ -361,6 +355,13 @@ def which_level(look: Look) -> str:
     total = over.sum(0)
     steps = np.where(total >= max(LEAST, SHARE * total.max()), (high - low) @ over, 0)
     steps = steps / total.clip(1)
+    faces = np.sort(look.faces[np.isfinite(look.faces)])
+    share = np.searchsorted(faces, levels) / max(len(faces), 1)  # of the border, below a level
+    inner = (look.lines[:, 0, 2][:, None] < levels).mean(0) if len(look.lines) else share
+    # values that grow outwards: above are only the corners of the grid
+    grows = (1 - share > GROWS * (1 - inner)) & (share > 0.5)
+    if grows[steps.argmax()] and (all_above := share < 0.1).any():
+        steps = np.where(all_above, steps, 0)
     good = levels[steps >= AS_GOOD * steps.max()]
     least, middle, most = np.quantile(good, [0.4, 0.5, 0.6]).tolist()
     short = (float(f"{middle:.{digits}g}") for digits in (1, 2, 3))
@@ -380,12 +381,12 @@ def which_level(look: Look) -> str:
 def which_label(found: tuple[NDArray[Any], NDArray[np.int64]] | None) -> str:
     """Return the advice to choose a label: the most frequent after that of the background."""
     if found is None:
-        return "they are labels: choose one with --label, or some with --labels"
+        return "no solid is chosen: they are labels: choose one with --label, or some with --labels"
     distinct, counts = found
     ordered = distinct[np.argsort(counts, kind="stable")[::-1]]
     best = next((x for x in ordered[1:] if x), ordered[0])
     return (
-        f"they look like labels ({named(distinct.tolist())}): choose one with "
+        f"no solid is chosen: they look like labels ({named(distinct.tolist())}): choose one with "
         f"--label {round(best.item())}, or mesh all with --labels all"
     )
 

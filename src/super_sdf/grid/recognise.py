@@ -35,13 +35,11 @@ from .look import (
     different_values,
     equal_neighbours,
     last_digit,
-    parting_level,
     side_of_zeros,
     smooth_gradients,
     steps_by_axis,
     typical_slope,
     which_label,
-    which_level,
     whole_factor,
 )
 from .samples import SampleArray
@@ -58,7 +56,6 @@ FEW_LABELS = 8  # different values: rounded distances and images from 11, lesion
 FOLLOW = 0.953  # distances to .9502 (but where faces are along the axes), transforms from .957
 STAIRS = 0.2  # solids along the axes to .18, masks of others from .26
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
-NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
 ROUGH = 1.0  # fourth differences over slopes: lattices of short periods to .5, transforms from 1.5
 COUNTED = 0.98  # that are 1 where they are beside the other side: steps 1, rounded to .96
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
@@ -77,7 +74,6 @@ NARROW = 4.5  # spacings up to which values that are cut off have too few slopes
 NEVER = 5e-4  # contradictions of these: cut off 0, fused depth images from .0018
 SLOPE_NEAR = 0.5, 1.25  # of these: cut off at half a voxel .55 to 1.05, in half the unit .5 and 2
 SLOPE_OFF = 0.25  # of rounded distances from 1
-CROWDED = 0.7  # of the uncut samples, those in the last tenth: cut off to .55, tanh from .85
 SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
 THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
 STEEP = 0.25  # spacings
@@ -88,7 +84,6 @@ ROUNDED = 1.0
 IMAGE = 1 << 17  # 16 bits have 65,535, floats 1e6 and more
 ALIKE = 0.05  # by which ends differ between which distances were cut off: .004, images .2 to 1
 CENTRED = 0.13  # maps of density and statistics to .11, fields from .15
-AREA = 1.0  # fields to 1.11 and d^3 1.02 with centres from .15, maps from 1.14
 # 7. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
 # samples of all.
 NOISE = 0.05  # uniform noise of .05 to .5 voxel and Gaussian to .033; logits .087, networks .096
@@ -124,10 +119,9 @@ def recognise(
     if may_be_labels and (answer := _labels(samples, look, hint, facts)) is not None:
         return answer
     if is_mask:
-        return Answer("mask", "there are two values", facts)
+        return Answer("mask", "", facts)
     if not hint and (step := _step_of_transform(look, given)):
-        why = "a distance transform, so only their sign says something"
-        return Answer("mask", why, facts | {"step": step, "zeros": side_of_zeros(look)})
+        return Answer("mask", "", facts | {"step": step, "zeros": side_of_zeros(look)})
     look = _without_sentinels(look, facts)
     if (answer := _distances(look, given, facts)) is not None:
         return answer
@@ -136,7 +130,7 @@ def recognise(
         if (answer := _distances(look.without(0.0), given, known)) is not None:
             return answer
     if hint == "density" or look.is_one_sided:
-        return _density(look, facts)
+        return Answer("density", "", facts)
     if (steps := _steps_of_cut(look, given, facts)) is not None:
         return Answer("distance", "", facts | {"spacing": steps})
     return _of_both_sides(look, given, facts)
@@ -275,8 +269,7 @@ def _distances(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answe
     """Return distances, or why they are none to a surface in the grid; None if they are none."""
     facts["digit"] = last_digit(look)
     unit = _find_unit(np.where(np.isin(look.lines, look.cut), np.nan, look.lines), given, facts)
-    enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
-    if unit is None or not enough or facts["slopes"] < SLOPES:
+    if unit is None or facts["slopes"] < SLOPES:
         return None
     steps = unit * (np.ones(3) if given is None else given)
     facts["contradictions"] = _contradictions(look, steps, facts["digit"])
@@ -357,7 +350,7 @@ def _of_one_sign(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
     on either side leave of the way between two samples is how thick it is.
     """
     if (look.low if look.low >= 0 else look.high) in look.cut:
-        return _density(look, facts)
+        return Answer("density", "", facts)
     thickness = list[NDArray[Any]]()
     for axis in range(3):
         lines = np.abs(np.moveaxis(look.part, axis, 0)) / steps[axis]
@@ -381,9 +374,7 @@ def _steps_of_cut(look: Look, given: Floats | None, facts: dict[str, Any]) -> Fl
     nearest = min(map(abs, look.cut), default=known)
     if nearest >= NARROW * steps.max():
         return None
-    size = np.abs(look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]) / nearest
     is_even = SLOPE_NEAR[0] < typical_slope(look, steps, look.cut) < SLOPE_NEAR[1]
-    is_even &= not size.size or float((size > 0.9).mean()) < CROWDED
     return steps if is_even and _contradictions(look, steps, facts["digit"]) <= NEVER else None
 
 
@@ -403,15 +394,13 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
             why = f"distances rounded to {digit:.3g}"
             return Answer("noisy", why, facts | {"spacing": steps})
         if not look.cut or abs(look.low + look.high) >= ALIKE * look.high:
-            return _density(look, facts)
+            return Answer("density", "", facts)
     middle = look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]
     if len(middle) >= ENOUGH:
-        size, (one, other) = np.abs(middle), look.pairs
+        size = np.abs(middle)
         facts["centred"] = float(np.median(size) / np.quantile(size, 0.995))
-        at_0, best = (((one > x) != (other > x)).sum() for x in (0.0, parting_level(middle)))
-        facts["area"] = float(at_0 / max(best, 1))
-        if facts["centred"] < CENTRED and facts["area"] > AREA:
-            return _density(look, facts)
+        if facts["centred"] < CENTRED:
+            return Answer("density", "", facts)
     if given is not None and _is_noise(look, given, facts):
         return Answer("noisy", "distances with noise", facts | {"spacing": given})
     return Answer("smooth", "the slope is not that of a distance everywhere", facts)
@@ -424,9 +413,8 @@ def _before_rounding(
     steps = np.ones(3) if given is None else given
     if facts.get("by_rank", 0) >= BY_RANK and abs(steps.max() - 1) < SLOPE_OFF:
         return steps  # whole numbers, of neighbours one apart
-    slope = float(
-        np.nanmedian(np.sqrt((((look.lines[..., 4] - look.lines[..., 0]) / steps / 4) ** 2).sum(1)))
-    )
+    rise = (look.lines[..., 4] - look.lines[..., 0]) / (4 * steps)
+    slope = float(np.nanmedian(np.sqrt((rise**2).sum(1))))
     is_off = not abs(slope - 1) < SLOPE_OFF  # in another unit, if they are
     steps = steps * slope if given is None or is_off else steps
     least = MOST_DIGIT if given is not None and is_off else 0.0  # images have finer digits
@@ -450,7 +438,3 @@ def _is_noise(look: Look, steps: Floats, facts: dict[str, Any]) -> bool:
         return False
     without, allowed = (_contradictions(look, steps, facts["digit"], x) for x in (0.0, noise))
     return without > CONTRADICTIONS and allowed <= NOISE
-
-
-def _density(look: Look, facts: dict[str, Any]) -> Answer:
-    return Answer("density", "", facts, which_level(look))

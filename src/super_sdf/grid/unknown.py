@@ -18,16 +18,17 @@ from numpy.typing import NDArray
 
 from ..arrays import BoolArray
 from ..threads import check_fits
-from .look import beside_surface
+from .look import Look, beside_surface, border_share
 from .samples import SampleArray
 
+LAYERS = 3  # of unknown samples to which the surface beside them is continued
 SMALL = 8  # samples of a region between both sides that is filled in
 MOST_KNOWN = 1e-3  # of all samples: more in small regions are a pattern, and stay unknown
 BYTES = 24  # of memory per sample
 
 
 def with_known(
-    samples: SampleArray, values: Sequence[float], notes: list[str]
+    samples: SampleArray, look: Look, values: Sequence[float], notes: list[str]
 ) -> tuple[NDArray[Any], BoolArray | None, str]:
     """Return samples without unknown ones, for which some ``values`` stand, too.
 
@@ -53,9 +54,11 @@ def with_known(
     is_open = unsure & (size > SMALL)
     if size[unsure & ~is_open].sum() > MOST_KNOWN * whole.size:
         is_open = unsure
-    continued = _continued(whole)
-    whole = np.where(unknown, np.where(positive, high, low)[regions], whole)
-    whole = np.where(unsure[regions], continued, whole).clip(low, high).astype(finite.dtype)
+    of_side = np.where(unsure, np.nan, np.where(positive, high, low)).astype(whole.dtype)
+    whole = np.where(unknown, of_side[regions], whole)
+    _continue(whole)
+    outside = low if border_share(look, lambda x: x < 0) > 0.5 else high
+    whole = np.where(np.isnan(whole), outside, whole).clip(low, high).astype(of_side.dtype)
     if values:
         named, count = " or ".join(f"{value:g}" for value in values), int(size.sum())
         notes.append(
@@ -82,17 +85,16 @@ def with_known(
     return whole, unseen, why_open
 
 
-def _continued(values: NDArray[Any]) -> NDArray[Any]:
-    """Return values with each NaN replaced by what a straight line through known samples gives.
-
-    That goes through the nearest known sample, and on to as far behind it.
-    """
-    from scipy import ndimage
-
-    nearest = ndimage.distance_transform_edt(
-        np.isnan(values), return_distances=False, return_indices=True
-    )
-    behind = 2 * nearest - np.indices(values.shape)
-    within = np.reshape(values.shape, (3, 1, 1, 1)) - 1
-    near, far = values[tuple(nearest)], values[tuple(behind.clip(0, within))]
-    return np.asarray(np.where(np.isfinite(far), 2 * near - far, near))
+def _continue(values: NDArray[Any]) -> None:
+    """Fill in unknown values beside others by straight lines through these."""
+    for _ in range(LAYERS if np.isnan(values).any() else 0):
+        total, count = np.zeros(values.shape), np.zeros(values.shape, np.int8)
+        for axis in range(3):
+            for flipped in (slice(None), slice(None, None, -1)):
+                lines = np.moveaxis(values, axis, 0)[flipped]
+                line = 2 * lines[1:-1] - lines[:-2]  # at the sample after these two
+                known = np.isfinite(line)
+                np.moveaxis(total, axis, 0)[flipped][2:] += np.where(known, line, 0)
+                np.moveaxis(count, axis, 0)[flipped][2:] += known
+        new = np.isnan(values) & (count > 0)
+        values[new] = total[new] / count[new]
