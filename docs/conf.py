@@ -1,8 +1,14 @@
 """The site: ``sphinx-build -W docs site`` (extra ``docs``)."""
 
 import re
+from pathlib import Path
 
 from super_sdf import __version__ as release
+from super_sdf.cli.main import HEADINGS, cli
+
+ROOT = Path(__file__).parents[1]
+FROM_ROOT = {"index": "README.md", "develop/contributing": "CONTRIBUTING.md",
+             "develop/security": "SECURITY.md"}  # fmt: skip
 
 project, author = "super-sdf", "the authors of super-sdf"
 extensions = ["myst_parser", "sphinx_click", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
@@ -19,7 +25,40 @@ def escape(app, ctx, lines):
     lines[:] = [re.sub("[*:]", r"\\\g<0>", line) for line in lines]
 
 
+def helps(command):
+    """Return the options of a command, with their helps."""
+    return {(name, getattr(each, "help", "")) for each in command.params for name in each.opts}
+
+
+def sort_options(app, ctx, lines):
+    """Put options under the headings of the help; leave out those that upsample has, too."""
+    others = helps(cli.get_command(ctx, "upsample")) if ctx.command.name != "upsample" else set()
+    shared, rows = {name for name, _ in helps(ctx.command) & others}, {}
+    for part in re.split(r"^(?=\.\. option::)", "\n".join(lines), flags=re.MULTILINE):
+        names = re.findall(r"--[a-z-]+", part.split("\n")[0])
+        if names and names[0] not in shared:
+            heading = HEADINGS.get(names[0][2:].replace("-", "_"), "Output")
+            rows.setdefault(f".. rubric:: {heading}\n", []).append(part)
+    texts = ["\n".join([heading, *parts]) for heading, parts in rows.items()]
+    lines[:] = "\n\n".join(texts).split("\n")
+
+
+def put_from_root(app, docname, source):
+    """Put a page of the root in the place of the link to that page; its links are from the root."""
+    if docname not in FROM_ROOT:
+        return
+    name, up = FROM_ROOT[docname], "../" * docname.count("/")
+    text = re.sub(r"\]\((?!https?:)", f"](../{up}", (ROOT / name).read_text())
+    moved = {"docs/": "", "src/super_sdf/models/": "models/"}
+    moved |= {path: f"{page}.md" for page, path in FROM_ROOT.items()}
+    for path, page in moved.items():
+        text = text.replace(f"](../{up}{path}", f"]({up}{page}")
+    source[0] = source[0].replace(f"[{name}](../{up}{name})", text, 1)
+
+
 def setup(app):
-    """Have ``escape`` called for the text of each command."""
+    """Have the functions above called."""
+    app.connect("source-read", put_from_root)
+    app.connect("sphinx-click-process-options", sort_options)
     for part in ("description", "epilog"):
         app.connect(f"sphinx-click-process-{part}", escape)

@@ -1,19 +1,22 @@
-"""From an array to a mesh in three lines, with the array of a real part.
+"""From an array to a mesh in a line, with the array of a real part.
 
 python examples/array_to_mesh.py [OUT.ply]
 """
 
-import sys
+from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
 
-from super_sdf import make_grid, reconstruct, write_mesh
+from super_sdf import reconstruct, write_mesh
+
+options = ArgumentParser(description=__doc__)
+options.add_argument("out", nargs="?", default="part.ply", help="mesh file")
+out = options.parse_args().out
 
 part = np.load(Path(__file__).parent / "part.npz")
 
-grid = make_grid(part["values"], spacing=part["spacing"], origin=part["origin"])
-mesh = reconstruct(grid)
-write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "part.ply", force=True)
+mesh = reconstruct(part["values"], spacing=part["spacing"], origin=part["origin"])
+write_mesh(mesh, out, force=True)
 
 print(f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {mesh.volume():.0f} mm^3")

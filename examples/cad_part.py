@@ -5,11 +5,15 @@
 The grid is made up: a plate of 40 x 25 x 8 mm with two holes, turned, sampled every millimetre.
 """
 
-import sys
+from argparse import ArgumentParser
 
 import numpy as np
 
 from super_sdf import make_grid, reconstruct, simplify_mesh, write_mesh
+
+options = ArgumentParser(description=__doc__)
+options.add_argument("out", nargs="?", default="plate.3mf", help="mesh file")
+out = options.parse_args().out
 
 TOLERANCE = 0.01  # mm
 TURN = np.deg2rad(20)
@@ -22,8 +26,8 @@ holes = 4 - np.hypot(np.abs(x) - 10, y)
 distances = np.maximum(plate, holes)
 
 fine = reconstruct(make_grid(distances, spacing=1.0))
-mesh = simplify_mesh(fine, error=TOLERANCE).mesh
-write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "plate.3mf", unit="mm", force=True)
+mesh = simplify_mesh(fine, error=TOLERANCE)
+write_mesh(mesh, out, unit="mm", force=True)
 
 exact = 40 * 25 * 8 - 2 * np.pi * 4**2 * 8
 print(f"{len(fine.faces):,} triangles, {len(mesh.faces):,} within {TOLERANCE} mm of them")

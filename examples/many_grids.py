@@ -6,11 +6,14 @@ Writes the part and its surface moved outwards by 1, 2 and 3 mm, at factor 2.
 """
 
 import sys
+from argparse import ArgumentParser
 from pathlib import Path
 
 from super_sdf import SuperSdfError, extract_mesh, load_network, read_grid, upsample, write_mesh
 
-out = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
+options = ArgumentParser(description=__doc__)
+options.add_argument("folder", nargs="?", default=".", help="folder for the meshes")
+out = Path(options.parse_args().folder)
 grid = read_grid(Path(__file__).parent / "part.npz")
 network = load_network(threads=2)  # loaded once; threads may share it
 

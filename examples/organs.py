@@ -6,8 +6,8 @@ The segmentation is made up: two balls that touch, and a tube through one of the
 with thick slices. Neighbours share their walls, vertex for vertex.
 """
 
-import sys
 import tempfile
+from argparse import ArgumentParser
 from pathlib import Path
 
 import nibabel
@@ -23,6 +23,10 @@ TABLE = """\
 """
 SPACING = 1.5, 1.5, 4.0  # mm
 
+options = ArgumentParser(description=__doc__)
+options.add_argument("target", nargs="?", default="organs.glb", help="mesh file, .glb or .3mf")
+target = options.parse_args().target
+
 x, y, z = (s * (i + 0.5) for s, i in zip(SPACING, np.indices((56, 40, 16))))
 labels = np.zeros(x.shape, np.uint8)
 labels[np.sqrt((x - 30) ** 2 + (y - 30) ** 2 + (z - 32) ** 2) < 22] = 1
@@ -33,7 +37,6 @@ with tempfile.TemporaryDirectory() as folder:
     image, table = Path(folder, "organs.nii.gz"), Path(folder, "organs.ctbl")
     nibabel.save(nibabel.Nifti1Image(labels, np.diag([*SPACING, 1.0])), image)
     table.write_text(TABLE)
-    target = sys.argv[1] if len(sys.argv) > 1 else "organs.glb"
     made = convert_labels(image, target, load_network(), names=read_names(table), force=True)
 
 for row in made.facts["labels"]:

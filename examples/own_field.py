@@ -5,7 +5,7 @@
 A bowl: the upper half cut off a sphere, hollowed by an offset of the field.
 """
 
-import sys
+from argparse import ArgumentParser
 
 import numpy as np
 
@@ -19,9 +19,13 @@ def bowl(points):
     return np.maximum(shell, points[:, 2] - 0.3)
 
 
+options = ArgumentParser(description=__doc__)
+options.add_argument("out", nargs="?", default="bowl.stl", help="mesh file")
+out = options.parse_args().out
+
 function = DistanceFunction(bowl)
 mesh = reconstruct(function=function, bounds=(-1.5, 1.5), spacing=0.1)
-write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "bowl.stl", force=True)
+write_mesh(mesh, out, force=True)
 
 off = np.abs(bowl(mesh.vertices)).mean() / 0.1
 print(f"{len(mesh.faces):,} triangles, closed: {mesh.is_closed()}")

@@ -35,7 +35,7 @@ from export.shapes.solid import FAMILIES, random_solid
 from super_sdf import Mesh
 from super_sdf.errors import FileError
 from super_sdf.refine import band, nodes
-from super_sdf.truth import sampling, solid
+from super_sdf.truth import Solid, read_mesh, sample_solid
 
 CORNERS, FINE_NODES, ANYWHERE = 5, 4, 4  # queries: 4 per corner, 28 in all
 SIZES = 7.0, 100.0  # voxels along a shape's diagonal
@@ -110,8 +110,8 @@ def make_sample(
     """
     posed = draw_pose(rng, mesh, sizes, slices)
     shape, first = draw_window(rng, posed)
-    truth = solid.Solid(posed)
-    values = sampling.sample_solid(truth, (shape, 1.0, first)).values
+    truth = Solid(posed)
+    values = sample_solid(truth, (shape, 1.0, first)).values
     window = 2 * values
     voxel_ijk = np.argwhere(np.abs(window) <= band.DECODE_LIMIT)
     if not lowest[0] < values.min() < lowest[1] or not len(voxel_ijk) or (values < 0).all():
@@ -161,7 +161,7 @@ def sample_field(
     return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets)
 
 
-def signed_distance(rng: np.random.Generator, truth: solid.Solid, points: np.ndarray) -> np.ndarray:
+def signed_distance(rng: np.random.Generator, truth: Solid, points: np.ndarray) -> np.ndarray:
     """Return the signed distance, (n,), of points (n, 3).
 
     The nearest triangle gives the sign quickly, but wrongly on meshes that intersect themselves.
@@ -233,7 +233,7 @@ def mesh_order(folder: Path | None, count: int, seed: int) -> list[Path]:
 
 def draw_mesh(rng: np.random.Generator, path: Path) -> Mesh:
     """Read a mesh; some are bent by smooth waves, so that few faces stay flat or parallel."""
-    mesh = solid.read_mesh(path)
+    mesh = read_mesh(path)
     if rng.random() >= SWAYED:
         return mesh
     diagonal = np.linalg.norm(np.ptp(mesh.vertices, axis=0))

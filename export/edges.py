@@ -27,7 +27,7 @@ from super_sdf.arrays import face_normals, unit
 from super_sdf.errors import SuperSdfError
 from super_sdf.surface import cap, marching
 from super_sdf.surface.sharp import features, patches, planes
-from super_sdf.truth import sampling, solid
+from super_sdf.truth import Solid, sample_solid
 
 SIZES = (24, 32, 32, 48)  # drawn from, samples along an axis
 FACTOR = 4
@@ -51,8 +51,8 @@ The loss is how far the surface there is from the true one, and turned from it, 
 
 def rows_of(mesh: Mesh, size: int, network: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return the evidence (f, e) and the losses (f, s) of all candidates of a shape."""
-    truth = solid.Solid(mesh)
-    grid = sampling.sample_solid(truth, ((size,) * 3, 1 / size, np.full(3, 0.5 / size - 0.5)))
+    truth = Solid(mesh)
+    grid = sample_solid(truth, ((size,) * 3, 1 / size, np.full(3, 0.5 / size - 0.5)))
     field = cap.close(upsample(grid, network, FACTOR), cap=True)
     every, crossings = np.ones(len(field.voxel_ijk), bool), marching.find_crossings(field)
     found, used = patches.find_patches(field, crossings, every)
@@ -69,7 +69,7 @@ def rows_of(mesh: Mesh, size: int, network: Any) -> tuple[np.ndarray, np.ndarray
     return candidates.evidence, np.stack(losses, 1)
 
 
-def errors_of(truth: solid.Solid, patch: np.ndarray, corners: np.ndarray, count: int) -> np.ndarray:
+def errors_of(truth: Solid, patch: np.ndarray, corners: np.ndarray, count: int) -> np.ndarray:
     """Return the mean distance to the true surface of each patch, and 1 - cosine, (count, 2).
 
     Triangles (t, 3, 3) belong to patches (t,); patches without any have 0.

@@ -11,8 +11,7 @@ COMMANDS = {
     "documents": "write the measured figures into them",
     "faults": "end conversions and batches at random moments, and see what is left",
     "zoo": "grids as people have them, and the ways out that refusals name",
-    "picture": "draw the pictures in README and of sharp edges",
-    "fields": "random fields: are their meshes closed manifolds",
+    "picture": "draw the pictures of the documents",
 }
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from super_sdf import Mesh, write_mesh
 from super_sdf.errors import SuperSdfError
 from super_sdf.threads import count_cores
-from super_sdf.truth.sampling import sample_solid
+from super_sdf.truth import sample_solid
 
 from .rows import Row
 from .shapes import Shape

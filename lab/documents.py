@@ -1,6 +1,6 @@
 """Write the measured figures into README, the documents and the model cards.
 
-    python -m lab documents            # rewrites what stands between the markers
+    python -m lab documents            # rewrites what stands between the markers, and plots
     python -m lab documents --check    # exit code 1 if a document differs
 
 A table stands between ``<!-- figures: NAME.TABLE -->`` and ``<!-- /figures -->``, each on a line; a
@@ -20,7 +20,7 @@ from typing import Any
 
 from super_sdf.errors import FileError
 
-from . import parser_of, published, tables
+from . import parser_of, plots, published, tables
 from .metrics import METRICS, Column, shown_in
 from .rows import Row
 from .tables import label_of, listed, meanings, wide
@@ -206,4 +206,7 @@ def main() -> int:
             print(path.relative_to(ROOT))
             if not words.check:
                 path.write_text(after, encoding="utf-8")
+    for name in () if words.check else plots.PLOTS:  # their bytes depend on matplotlib's version
+        text = plots.plot(name, read(words.figures / f"{name}.json")["rows"])
+        (ROOT / "docs" / "images" / f"{name}.svg").write_text(text, encoding="utf-8")
     return int(words.check and differ > 0)

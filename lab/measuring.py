@@ -36,7 +36,7 @@ OF_OTHERS = (
     *(FLOOR, "dual-contouring", "ndc"),
 )
 # Folders and modules of the package whose code does not change any surface.
-NOT_THE_METHOD = {"batch", "check.py", "cli", "labels", "pages"}
+NOT_THE_METHOD = {"batch", "check.py", "cli", "evaluation.py", "labels", "pages"}
 
 
 @dataclass(frozen=True)

@@ -164,8 +164,8 @@ def make_surface(method: str, case: Case, network: Decoder) -> Surface:
     surface = BY_NAME[name](case, network)
     mesh, count = surface.mesh, len(surface.mesh.faces)
     if share == WITHIN:
-        return Surface(simplify_mesh(mesh, error=ERROR * case.spacing).mesh)
+        return Surface(simplify_mesh(mesh, error=ERROR * case.spacing))
     if share:
         wanted = count // int(share) if share.isdigit() else case.triangles[share]
-        return Surface(simplify_mesh(mesh, triangles=wanted).mesh) if wanted < count else surface
+        return Surface(simplify_mesh(mesh, triangles=wanted)) if wanted < count else surface
     return surface

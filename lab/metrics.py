@@ -18,77 +18,24 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from super_sdf.arrays import BoolArray
-from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.solid import Distances, Solid
+from super_sdf.arrays import BoolArray, face_normals
+from super_sdf.evaluation import F1_DISTANCE, FIGURES, Comparison as Pair, nearest_or_dot
+from super_sdf.truth import Distances
 
-from . import samples
-from .samples import DOT, EdgeCurves, Indices, SurfacePoints, nearest_or_dot
-from .shapes import RESULT_EDGES, RESULT_POINTS, Shape
+from .shapes import Shape
 
-F1_DISTANCE, EDGE_DISTANCE = 0.003, 0.005
-VOXEL_SHARE = 0.1  # of a voxel: the distance of EFv
 SLIVER_ANGLE = 5.0  # degrees
-# Of the dot, which has no normal: the means of |n.n'| and of the angle over all directions.
-NO_NORMAL_NC, NO_NORMAL_ANGLE = 0.5, 90.0
+NO_NORMAL_ANGLE = 90.0  # of the dot, which has no normal: the mean over all directions
 
 
 @dataclass(frozen=True, eq=False)
-class Comparison:
-    """A result beside its reference, and what metrics need of both, each computed when asked for.
+class Comparison(Pair):
+    """A result beside its reference, a shape, and how it was made."""
 
-    P are the points drawn from the reference, Q those from the result. Of two arrays the first is
-    measured from the reference to the result. A mesh without faces counts as a dot at the origin.
-    """
-
-    shape: Shape
-    mesh: Mesh
-    spacing: float | None = None  # of the coarse grid; None of the floor, which has none
+    reference: Shape
     field_off: Distances | tuple[()] = ()  # errors at the fine nodes of the band, each counted once
     seconds: float = 0.0  # from the grid in memory to the mesh in memory
-
-    @cached_property
-    def drawn(self) -> SurfacePoints:
-        return samples.sample_surface(self.mesh, self.shape.seed(RESULT_POINTS))
-
-    @cached_property
-    def solid(self) -> Solid:
-        return Solid(self.mesh)
-
-    @cached_property
-    def near(self) -> tuple[tuple[Distances, Distances], tuple[Indices, Indices]]:
-        """The distances of P to the nearest of Q and of Q to P, and the indices of these points."""
-        p, q = self.shape.drawn, self.drawn
-        (there, in_q), (back, in_p) = q.tree.query(p.points), p.tree.query(q.points)
-        return (there, back), (in_q, in_p)
-
-    @cached_property
-    def cosines(self) -> tuple[Distances, Distances]:
-        """n.n' of each point and the nearest of the other set."""
-        p, q, (in_q, in_p) = self.shape.drawn.normals, self.drawn.normals, self.near[1]
-        return np.einsum("nd,nd->n", p, q[in_q]), np.einsum("nd,nd->n", q, p[in_p])
-
-    @cached_property
-    def there(self) -> Distances:
-        """Distances of P to the nearest triangles of the result."""
-        return nearest_or_dot(self.solid, self.shape.drawn.points)[0]
-
-    @cached_property
-    def back(self) -> tuple[Distances, Indices]:
-        """Distances of Q to the nearest triangles of the reference, and these."""
-        return nearest_or_dot(self.shape.solid, self.drawn.points)
-
-    @cached_property
-    def edges_apart(self) -> tuple[Distances, Distances] | None:
-        """Distances of points on the reference's edges to edge points of Q, and back to edges."""
-        if not self.shape.sharp:
-            return None
-        points = samples.edge_points(self.drawn)
-        points = points if len(points) else DOT.points
-        there = cKDTree(points).query(self.shape.sharp.drawn)[0]
-        return there, self.shape.sharp.distance(points)
 
     @cached_property
     def angles(self) -> tuple[Distances, BoolArray]:
@@ -96,13 +43,14 @@ class Comparison:
 
         Points whose triangle has no area, and so no normal, are left out.
         """
-        sharp = self.shape.sharp
+        sharp = self.reference.sharp
         if self.spacing is None:
             return np.zeros(0), np.zeros(0, bool)
         if not self.drawn.normals.any():
             near = np.array([False, True] if sharp else [False])
             return np.full(len(near), NO_NORMAL_ANGLE), near
-        vectors = samples.face_vectors(self.shape.mesh)[self.back[1]]
+        mesh = self.reference.mesh
+        vectors = face_normals(mesh.vertices, mesh.faces)[self.back[1]]
         lengths = np.linalg.norm(vectors, axis=1)
         known, points = lengths > 0, self.drawn.points
         cosines = np.einsum("nd,nd->n", vectors, self.drawn.normals)[known] / lengths[known]
@@ -122,44 +70,14 @@ def mean(values: Distances | BoolArray) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def chamfer(there: Distances, back: Distances) -> float:
-    return float(np.mean(there**2) + np.mean(back**2))
-
-
-def f1(there: Distances, back: Distances, reach: float) -> float:
-    """Return the harmonic mean of the shares of distances under a reach, 0 if both are 0."""
-    recall, precision = float(np.mean(there < reach)), float(np.mean(back < reach))
-    return 2 * recall * precision / ((recall + precision) or 1.0)
-
-
-def normal_consistency(c: Comparison) -> float:
-    there, back = (float(np.abs(cosines).mean()) for cosines in c.cosines)
-    return (there + back) / 2 if c.drawn.normals.any() else NO_NORMAL_NC
-
-
 def quantile(distances: Distances) -> float:
     return float(np.quantile(distances, 0.99))
 
 
-def edge_f1_in_voxels(c: Comparison) -> float | None:
-    """Return EFv, 0 for a result without sharp edges.
-
-    The edge points of EF1 lie up to 0.004 beside an edge: at 64^3 a perfect result would score 0.5.
-    """
-    reference = c.shape.sharp
-    if c.spacing is None or not reference:
-        return None
-    curves = EdgeCurves.of(c.solid.mesh, c.shape.seed(RESULT_EDGES))
-    if not curves:
-        return 0.0
-    there, back = curves.distance(reference.drawn), reference.distance(curves.drawn)
-    return f1(there, back, VOXEL_SHARE * c.spacing)
-
-
 def edge_distance(c: Comparison) -> float | None:
-    if c.spacing is None or not c.shape.sharp:
+    if c.spacing is None or not c.reference.sharp:
         return None
-    return float(nearest_or_dot(c.solid, c.shape.sharp.drawn)[0].mean() / c.spacing)
+    return float(nearest_or_dot(c.solid, c.reference.sharp.drawn)[0].mean() / c.spacing)
 
 
 Measure = Callable[[Comparison], "float | None"]
@@ -200,21 +118,21 @@ class Metric(Column):
 
 
 ALL_METRICS = (
-    Metric("cd", "CD x1e5", 1e5, of=lambda c: chamfer(*c.near[0]), tables="surface settings",
+    Metric("cd", "CD x1e5", 1e5, of=FIGURES["cd"], tables="surface settings",
            meaning="Chamfer distance: mean squared distance to the nearest point, both ways"),
     Metric("excess_cd", "excess CD x1e5", 1e5, tables="surface",
            meaning="CD less that of two samplings of the reference"),
-    Metric("f1", "F1", of=lambda c: f1(*c.near[0], F1_DISTANCE), better="higher", gap="F1",
+    Metric("f1", "F1", of=FIGURES["f1"], better="higher", gap="F1",
            tables="surface summary networks settings parts", meaning="harmonic mean of the shares "
            "of points that are within 0.003 of the other surface"),
     Metric("recall", of=lambda c: mean(c.near[0][0] < F1_DISTANCE)),
     Metric("precision", of=lambda c: mean(c.near[0][1] < F1_DISTANCE)),
-    Metric("nc", "NC", digits=4, of=normal_consistency, better="higher", gap="NC",
+    Metric("nc", "NC", digits=4, of=FIGURES["nc"], better="higher", gap="NC",
            tables="surface summary networks settings parts", meaning="normal consistency: mean "
            "absolute cosine between a point's normal and that of the nearest point"),
     Metric("signed_nc", "signed NC", of=lambda c: sum(map(np.mean, c.cosines)) / 2,
            tables="surface", better="higher", meaning="NC with the sign of the cosine"),
-    Metric("p2s", "p2s x1e4", 1e4, 2, of=lambda c: (c.there.mean() + c.back[0].mean()) / 2,
+    Metric("p2s", "p2s x1e4", 1e4, 2, of=FIGURES["p2s"],
            tables="surface settings", gap="point to surface",
            meaning="mean distance from point to triangle, both ways"),
     Metric("p2s_there", "ref to res", 1e4, 2, of=lambda c: mean(c.there),
@@ -227,16 +145,16 @@ ALL_METRICS = (
            tables="surface", meaning="99th percentile of these distances"),
     Metric("p99_there", of=lambda c: quantile(c.there)),
     Metric("p99_back", of=lambda c: quantile(c.back[0])),
-    Metric("max", "max x1e4", 1e4, 0, of=lambda c: max(c.there.max(), c.back[0].max()),
+    Metric("max", "max x1e4", 1e4, 0, of=FIGURES["max"],
            tables="surface", meaning="largest of these distances"),
     Metric("max_there", of=lambda c: c.there.max()),
     Metric("max_back", of=lambda c: c.back[0].max()),
-    Metric("ecd", "ECD x1e5", 1e5, 2, of=lambda c: c.edges_apart and chamfer(*c.edges_apart),
+    Metric("ecd", "ECD x1e5", 1e5, 2, of=FIGURES["ecd"],
            tables="surface", meaning="CD of points at sharp edges, those of over 30 degrees"),
-    Metric("ef1", "EF1", of=lambda c: c.edges_apart and f1(*c.edges_apart, EDGE_DISTANCE),
+    Metric("ef1", "EF1", of=FIGURES["ef1"],
            tables="surface networks edges parts", better="higher",
            meaning="F1 of points at sharp edges, within 0.005"),
-    Metric("efv", "EFv", of=edge_f1_in_voxels, tables="edges parts", better="higher",
+    Metric("efv", "EFv", of=FIGURES["efv"], tables="edges parts", better="higher",
            meaning="F1 of points on the sharp edges of both meshes, within a tenth of a voxel"),
     Metric("edge_distance", "edge distance", of=edge_distance, tables="edges parts",
            meaning="mean distance of the true sharp edges to the mesh, in voxels"),
@@ -272,9 +190,9 @@ METRICS = {metric.key: metric for metric in ALL_METRICS}
 OF_KINDS: dict[str, Measure] = {
     "p2s": METRICS["p2s"].of,
     "closed": METRICS["closed"].of,
-    "volume_off": lambda c: c.mesh.volume() / c.shape.mesh.volume() - 1,
+    "volume_off": lambda c: c.mesh.volume() / c.reference.mesh.volume() - 1,
     "pieces": lambda c: c.mesh.components()[0],
-    "pieces_of_reference": lambda c: c.shape.pieces,
+    "pieces_of_reference": lambda c: c.reference.pieces,
 }
 
 

@@ -1,16 +1,19 @@
 """Draw meshes side by side, off screen: flat shading, one camera, one parallel projection.
 
-    python -m lab picture                            # README's picture, of examples/part.npz
-    python -m lab picture PARTS                      # three CAD parts at 32^3, and their edges
+    python -m lab picture PARTS                      # the CAD parts of README and "Sharp edges"
+    python -m lab picture case.nii.gz                # all labels of an image, each in a colour
+    python -m lab picture                            # a level set: a splash
+    python -m lab picture grid.npz --out grid.png    # any other grid
 
 PARTS is the folder of ``python -m export.parts PARTS``. Lengths in a picture can be compared.
 """
 
 from __future__ import annotations
 
+import colorsys
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -18,28 +21,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from super_sdf import Mesh, load_network, read_grid, reconstruct
+from super_sdf import Mesh, SdfGrid, load_network, make_grid, read_grid, reconstruct
 from super_sdf.errors import DeviceError
+from super_sdf.labels.reconstruct import reconstruct_labels
 
 from . import parser_of
 from .methods import make_surface
 from .shapes import Case, Setting, Shape, turn_of
-from .surfaces import isosurface
+from .surfaces import closed_isosurface
 from .tables import label_of
 
-EXAMPLE, PARTS_TARGET = Path("examples/part.npz"), Path("docs/images/sharp.png")
+IMAGES = Path("docs/images")
+FIRST, FIRST_SIZE = "part-06-housing", 48  # README's part
+PARTS, PARTS_SIZE = ("part-03-clevis", "part-02-rod", "part-16-slide"), 32
 METHODS = ("mc", "ours-marching", "ours")
-# Of each part: the direction to the viewer and the middle of the close-up, upright, diagonal 1.
-PLACES = {
-    "part-03-clevis": ((0.6, -1.0, 0.5), (0.0, -0.1, 0.2)),
-    "part-02-rod": ((0.6, -1.0, 0.7), (0.2, 0.0, 0.1)),
-    "part-16-slide": ((0.6, -1.0, 0.6), (0.0, -0.3, 0.03)),
-}
-EXAMPLE_VIEW, EXAMPLE_MIDDLE = (1.0, 1.4, 1.1), (0.22, 0.4, 0.2)  # in boxes, from the middle
-VIEW, CLOSE, MARGIN, PIXELS = (0.6, -1.0, 0.5), 0.14, 1.06, 440
-SEED, CAPTION = 0, 36  # of the turn; pixels above a panel
-SHADED = {"color": "#b9c7df", "ambient": 0.25, "diffuse": 1.0, "specular": 0.25,
-          "specular_power": 20}  # fmt: skip
+AXES = np.array([[5, 3, 0], [-2.7, 4.5, 6.8]])  # of a panel, in the world: to the right, and up
+AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
+MARGIN, PIXELS = 1.06, (640, 480)
+SEED, CAPTION, PALETTE = 0, 36, 96  # of the turn; pixels above a panel; colours of the file
+SPLASH_SIZE, ARMS = 48, 11  # samples a side; jets of the splash
+SHADED = {"ambient": 0.25, "diffuse": 1.0, "specular": 0.25, "specular_power": 20}
 DRAW = (  # what VTK does before it draws anything
     "from vtkmodules.vtkRenderingOpenGL2 import vtkOpenGLRenderer;"
     "from vtkmodules.vtkRenderingCore import vtkRenderWindow;"
@@ -49,14 +50,11 @@ DRAW = (  # what VTK does before it draws anything
 
 @dataclass(frozen=True, eq=False)
 class Panel:
-    """A mesh, and what of it is seen."""
+    """Meshes, each in a colour, as seen from one direction."""
 
-    mesh: Mesh
+    meshes: Sequence[Mesh]
     title: str
-    view: tuple[float, float, float] = VIEW  # from the mesh to the viewer
-    middle: NDArray[np.float64] | None = None  # (3,), world; default: the middle of the mesh
-    half: float | None = None  # half the height of the panel, world; default: all of the mesh
-    turn: NDArray[np.float64] | None = None  # (3, 3), that turned the mesh; it is drawn upright
+    turn: NDArray[np.float64] | None = None  # (3, 3), that turned them; they are drawn upright
 
 
 @cache
@@ -65,7 +63,9 @@ def can_draw() -> bool:
     return not subprocess.run([sys.executable, "-c", DRAW], capture_output=True).returncode
 
 
-def draw(panels: Sequence[Panel], target: Path, columns: int, pixels: int = PIXELS) -> None:
+def draw(
+    panels: Sequence[Panel], target: Path, columns: int, pixels: tuple[int, int] = PIXELS
+) -> None:
     """Draw panels row by row, as a PNG file with a palette; DeviceError without OpenGL."""
     if not can_draw():
         raise DeviceError(
@@ -73,71 +73,106 @@ def draw(panels: Sequence[Panel], target: Path, columns: int, pixels: int = PIXE
             "apt-get install libegl1 libgl1-mesa-dri"
         )
     import pyvista  # takes a second
-    from PIL import Image, ImageDraw
+    from PIL import Image, ImageDraw, ImageFont
 
-    rows = -(-len(panels) // columns)
-    tall = pixels + CAPTION
-    page = Image.new("RGB", (columns * pixels, rows * tall), "white")
+    (wide, high), rows = pixels, -(-len(panels) // columns)
+    page = Image.new("RGB", (columns * wide, rows * (high + CAPTION)), "white")
     for number, panel in enumerate(panels):
-        plotter = pyvista.Plotter(off_screen=True, window_size=[2 * pixels] * 2)
+        plotter = pyvista.Plotter(off_screen=True, window_size=[2 * wide, 2 * high])
         plotter.set_background("white")
-        points = panel.mesh.vertices.astype(np.float64)
-        points = points if panel.turn is None else points @ panel.turn  # upright
-        if len(panel.mesh.faces):
-            surface = pyvista.PolyData.from_regular_faces(points, panel.mesh.faces)
-            plotter.add_mesh(surface, show_scalar_bar=False, smooth_shading=False, **SHADED)
-            middle = (points.min(0) + points.max(0)) / 2 if panel.middle is None else panel.middle
-            towards = np.array(panel.view) / np.linalg.norm(panel.view)
-            size = float(np.linalg.norm(np.ptp(points, axis=0)))
-            plotter.camera_position = [middle + 4 * size * towards, middle, (0, 0, 1)]
-            plotter.camera.parallel_projection = True
-            plotter.camera.parallel_scale = panel.half or size / 2 * MARGIN
-            plotter.reset_camera_clipping_range()
+        turn = np.eye(3) if panel.turn is None else panel.turn
+        upright = [mesh.vertices.astype(np.float64) @ turn for mesh in panel.meshes]
+        for points, mesh, colour in zip(upright, panel.meshes, colours(len(upright))):
+            surface = pyvista.PolyData.from_regular_faces(points, mesh.faces)
+            plotter.add_mesh(surface, color=colour, smooth_shading=False, **SHADED)
+        flat = np.concatenate(upright) @ AXES.T
+        low, top = flat.min(0), flat.max(0)
+        middle, size = (low + top) / 2 @ AXES, top - low
+        plotter.camera_position = [middle + 9 * size.max() * np.cross(*AXES), middle, (0, 0, 1)]
+        plotter.camera.parallel_projection = True
+        plotter.camera.parallel_scale = MARGIN / 2 * max(size[1], size[0] * high / wide)
+        plotter.reset_camera_clipping_range()
         image = Image.fromarray(plotter.screenshot(return_img=True)[..., :3])
         plotter.close()
-        corner = (number % columns * pixels, number // columns * tall)
-        page.paste(image.resize((pixels, pixels)), (corner[0], corner[1] + CAPTION))
-        ImageDraw.Draw(page).text((corner[0] + 8, corner[1] + 12), panel.title, fill="black")
-    page.quantize(96).save(target, optimize=True)
+        corner = (number % columns * wide, number // columns * (high + CAPTION))
+        page.paste(image.resize(pixels), (corner[0], corner[1] + CAPTION))
+        font = ImageFont.load_default(size=16)
+        place = (corner[0] + 8, corner[1] + 8)
+        ImageDraw.Draw(page).text(place, panel.title, fill="black", font=font)
+    page.quantize(PALETTE).save(target, optimize=True)
 
 
-def panels_of_part(folder: Path, name: str) -> list[Panel]:
-    """Return a part at 32^3, turned: whole, and a place of it by each of ``METHODS``."""
-    case, network = Case(Shape.read(folder / f"{name}.ply", SEED), Setting(32)), load_network()
-    (view, middle), turn = PLACES[name], turn_of(name, SEED)
-    meshes = [make_surface(method, case, network).mesh for method in METHODS]
-    close = [
-        Panel(mesh, label_of(method), view, np.array(middle), CLOSE, turn)
-        for method, mesh in zip(METHODS, meshes)
+def colours(count: int) -> list[tuple[float, ...]]:
+    """Return a colour for each mesh: grey blue for a single one, else around the circle of hues."""
+    hues = 0.62 + 0.618 * np.arange(count)  # neighbours in the list differ most
+    return [colorsys.hsv_to_rgb(hue % 1, 0.16 if count == 1 else 0.42, 0.87) for hue in hues]
+
+
+def panels_of_part(folder: Path, name: str, size: int, methods: Sequence[str]) -> list[Panel]:
+    """Return a part, turned, sampled, and meshed by some methods."""
+    case = Case(Shape.read(folder / f"{name}.ply", SEED), Setting(size))
+    meshes = [make_surface(method, case, load_network()).mesh for method in methods]
+    titles = [f"{label_of(method)}, {size}^3" for method in methods]
+    return compared(zip(titles, ([mesh] for mesh in meshes)), turn_of(name, SEED))
+
+
+def compared(
+    found: Iterable[tuple[str, Sequence[Mesh]]], turn: NDArray[np.float64] | None = None
+) -> list[Panel]:
+    """Return a panel for each title and its meshes, with the number of triangles."""
+    return [
+        Panel(meshes, f"{title}: {sum(len(mesh.faces) for mesh in meshes):,} triangles", turn)
+        for title, meshes in found
     ]
-    return [Panel(meshes[-1], name, view, turn=turn), *close]
 
 
-def panels_of_grid(source: Path) -> list[Panel]:
-    """Return a grid's mesh, and a place of it by marching cubes of the grid and by super-sdf."""
-    grid = read_grid(source)
-    coarse = isosurface(np.array(grid.values, np.float32), grid.voxel_size, 0.0)
-    ours = reconstruct(grid)
-    low, high = ours.vertices.min(0), ours.vertices.max(0)
-    middle, half = (low + high) / 2 + (high - low) * EXAMPLE_MIDDLE, 0.15 * (high - low).max()
-    pair = {"mc": coarse.transformed(np.eye(3), np.array(grid.origin)), "ours": ours}
-    close = [
-        Panel(
-            mesh, f"{label_of(method)}, {len(mesh.faces):,} triangles", EXAMPLE_VIEW, middle, half
-        )
-        for method, mesh in pair.items()
-    ]
-    return [Panel(ours, "super-sdf", EXAMPLE_VIEW), *close]
+def coarse(grid: SdfGrid) -> Mesh:
+    """Return marching cubes of the samples of a grid whose axes are those of the world."""
+    return closed_isosurface(np.array(grid.values, np.float32), grid.spacing, grid.origin)
+
+
+def panels_of_grid(grid: SdfGrid) -> list[Panel]:
+    """Return a grid's mesh by marching cubes of the samples and by super-sdf."""
+    return compared([("marching cubes", [coarse(grid)]), ("super-sdf", [reconstruct(grid)])])
+
+
+def panels_of_labels(source: Path) -> list[Panel]:
+    """Return all labels of an image by marching cubes of each label, and by super-sdf."""
+    meshes = reconstruct_labels(source)
+    steps = [coarse(read_grid(source, label=label)) for label in meshes]
+    return compared([("marching cubes", steps), ("super-sdf", list(meshes.values()))])
+
+
+def splash() -> SdfGrid:
+    """Return a level set, cut off at three voxels: a ring of jets that end in drops."""
+    h = 2 / SPLASH_SIZE
+    points = np.stack(np.indices([SPLASH_SIZE] * 3), -1) * h - 1 + h / 2
+    x, y, z = np.moveaxis(points, -1, 0)
+    found = [np.hypot(np.hypot(x, y) - 0.45, z + 0.45) - 0.09]
+    for angle in 2 * np.pi * np.arange(ARMS) / ARMS:
+        out = np.array([np.cos(angle), np.sin(angle), 0])
+        low, top = 0.45 * out - [0, 0, 0.45], 0.72 * out + [0, 0, 0.15 * np.cos(3 * angle)]
+        along = np.clip((points - low) @ (top - low) / ((top - low) ** 2).sum(), 0, 1)
+        jet = np.linalg.norm(points - low - along[..., None] * (top - low), axis=-1)
+        found += [jet - 0.045, np.linalg.norm(points - top - 0.16 * out, axis=-1) - 0.075]
+    return make_grid(np.clip(np.min(found, 0), -3 * h, 3 * h), spacing=h)
 
 
 def main() -> None:
-    """Draw a grid, or a folder of parts."""
+    """Draw a grid, the labels of an image, or a folder of parts."""
     parser = parser_of(__doc__)
-    parser.add_argument("source", nargs="?", type=Path, default=EXAMPLE, help=".npz, or a folder")
+    parser.add_argument("source", nargs="?", type=Path, help="a grid, labels, or a folder of parts")
     parser.add_argument("--out", type=Path, help="PNG file; default: the picture in the documents")
     words = parser.parse_args()
-    if words.source.is_dir():
-        panels = [panel for name in PLACES for panel in panels_of_part(words.source, name)]
-        draw(panels, words.out or PARTS_TARGET, 4, 340)
+    source = words.source
+    if source is None:
+        draw(panels_of_grid(splash()), words.out or IMAGES / "level-set.png", 2)
+    elif source.is_dir():
+        first = panels_of_part(source, FIRST, FIRST_SIZE, METHODS[::2])
+        draw(first, words.out or IMAGES / "part.png", 2)
+        parts = [panels_of_part(source, name, PARTS_SIZE, METHODS) for name in PARTS]
+        draw([panel for row in parts for panel in row], IMAGES / "sharp.png", 3, (400, 340))
+    elif source.name.endswith((".nii.gz", ".nii", ".seg.nrrd")):
+        draw(panels_of_labels(source), words.out or IMAGES / "organs.png", 2)
     else:
-        draw(panels_of_grid(words.source), words.out or words.source.with_suffix(".png"), 3)
+        draw(panels_of_grid(read_grid(source)), words.out or source.with_suffix(".png"), 2)

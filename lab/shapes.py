@@ -18,18 +18,15 @@ from numpy.typing import NDArray
 
 from super_sdf.arrays import BoolArray, FloatArray, IntArray
 from super_sdf.errors import FileError, OptionError, seen
+from super_sdf.evaluation import Reference, frame_of, in_frame
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.options import OPTIONS
 from super_sdf.refine.band import is_active, rescale
 from super_sdf.surface.mesh import Mesh
-from super_sdf.truth.sampling import sample_solid
-from super_sdf.truth.solid import Distances, Solid, load_solid
+from super_sdf.truth import Distances, Solid, load_solid, sample_solid
 
-from .samples import EdgeCurves, sample_surface
-
-# Streams of random numbers, each seeded by the shape's name and its own number.
-REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, NOISE, RESULT_EDGES, TURN, FIELD_NOISE = range(7)
+NOISE, TURN, FIELD_NOISE = 3, 5, 6  # streams of random numbers, beside those of ``Reference``
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
 SUFFIXES = (*MESH_SUFFIXES, ".gltf")
 
@@ -54,14 +51,12 @@ class Setting:
         return f"{self.size}^3, factor {self.factor}{more}" if self.size else "reference"
 
 
-class Shape:
+class Shape(Reference):
     """A reference mesh in its frame, and the points that are drawn from it for all methods."""
 
     def __init__(self, name: str, mesh: Mesh) -> None:
-        self.name, self.solid = name, Solid(mesh)
-        self.mesh = self.solid.mesh
-        self.drawn = sample_surface(self.mesh, self.seed(REFERENCE_POINTS))
-        self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
+        self.name = name
+        super().__init__(mesh)
         self.pieces = self.mesh.components()[0]
 
     @classmethod
@@ -76,14 +71,13 @@ class Shape:
         return cls(path.stem, normalise(mesh.transformed(turn, np.zeros(3))))
 
     def seed(self, stream: int) -> tuple[int, int]:
+        """Return the seed of a stream of random numbers, by the shape's name."""
         return name_seed(self.name, stream)
 
 
 def normalise(mesh: Mesh) -> Mesh:
     """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
-    vertices = mesh.vertices.astype(np.float64)
-    low, high = vertices.min(0), vertices.max(0)
-    return Mesh((vertices - (low + high) / 2) / np.linalg.norm(high - low), mesh.faces)
+    return in_frame(mesh, *frame_of(mesh))
 
 
 def name_seed(name: str, stream: int) -> tuple[int, int]:

@@ -23,11 +23,13 @@ from scipy import ndimage
 
 from super_sdf import load_network, make_grid, reconstruct
 from super_sdf.errors import SuperSdfError
+from super_sdf.evaluation import sample_surface
 from super_sdf.network.contract import Decoder
+from super_sdf.surface.mesh import Mesh
+from super_sdf.truth import Solid
 
 from . import parser_of
 from .kinds import without_unknown
-from .samples import distance
 from .surfaces import closed_isosurface
 
 Array = np.ndarray
@@ -498,6 +500,23 @@ def advised(message: str) -> dict[str, Any]:
         elif name in ("label", "level", "scale", "offset", "unknown"):
             found[name] = int(word) if name == "label" else float(word)
     return found
+
+
+def distance(truth: Mesh, mesh: Mesh, count: int, within: Array | None = None) -> float:
+    """Return the mean distance between two surfaces, both ways, at points drawn from each.
+
+    NaN without a mesh. ``within``, (3,), leaves out caps: points beside the border of the box from
+    the origin to there.
+    """
+    if not len(mesh.faces):
+        return float("nan")
+    total = 0.0
+    for seed, (one, other) in enumerate(((truth, mesh), (mesh, truth)), 1):
+        points = sample_surface(one, (1, seed), count).points
+        if within is not None:
+            points = points[((points > 0.1) & (points < within - 0.1)).all(1)]
+        total += float(Solid(other).distance(points).mean()) / 2 if len(points) else np.inf
+    return total
 
 
 def call(sample: Kind, options: dict[str, Any], network: Decoder) -> Outcome:

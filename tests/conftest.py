@@ -15,7 +15,7 @@ from super_sdf.arrays import NEIGHBOURHOOD
 from super_sdf.errors import SuperSdfError
 from super_sdf.network import onnx
 from super_sdf.network.onnx import ort
-from super_sdf.truth.solid import Solid
+from super_sdf.truth import Solid
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -178,9 +178,19 @@ def test_patterns_keep_the_folders_below_their_fixed_part_and_links_in_a_circle_
     Path("in/.hidden").mkdir()
     shutil.copy("in/a.npy", "in/.hidden/a.npy")
     assert len(batch("in/**", "--dry-run")[1]["to_do"]) == 4
-    jobs = find_jobs(["in/de*/er/*.npy", "in/.h*/*.npy"], ".ply", Options())
+    jobs = find_jobs(["in/de*/er/*.npy", "in/.h*/*.npy"], ".ply", Options(), None)
     assert [job.target for job in jobs] == ["deep/er/c.d.ply", ".hidden/a.ply"]
-    assert len(find_jobs(["in"], ".ply", Options())) == 5
+    assert len(find_jobs(["in"], ".ply", Options(), None)) == 5
+
+
+def test_a_name_chooses_among_the_arrays_of_each_file(batch):
+    Path("frames").mkdir()
+    for name in ("1.npz", "2.npz"):
+        values = ball(12, 3.0).values
+        np.savez(f"frames/{name}", density=-values, speed=values)
+    facts = batch("frames", "--grid", "density", "--level", 0)[1]
+    assert facts["done"] == 2 and contents().keys() == {"1-density.ply", "2-density.ply"}
+    assert "holds several arrays" in batch("frames/1.npz", out="other")[2]
 
 
 def test_lists_name_files_from_where_they_lie_and_objects_have_options_of_their_own(batch, command):
@@ -200,8 +210,9 @@ def test_lists_name_files_from_where_they_lie_and_objects_have_options_of_their_
 
 LISTS = {
     "": "list.jsonl names no file: give a path a line",
-    "{": "list.jsonl, line 1: no JSON: Expecting property name enclosed in double quotes",
-    "[1]": 'list.jsonl, line 1: [1]: give an object, {"in": "a.npy"}',
+    '{"in": "a",}': "list.jsonl, line 1: no JSON from character 12 on, '}': give an object such as",
+    "[]": 'list.jsonl, line 1: it is []: give an object such as {"in": "a.npy"}\n',
+    '{"in": "a.npy", "labels": 2}': "list.jsonl, line 1: labels is 2: give all, or some labels",
     '{"out": "a.ply"}': "list.jsonl, line 1: 'in' is None: give the path of a grid",
     '{"in": "a\\u0000.npy"}': "list.jsonl, line 1: 'in' is 'a\\x00.npy': give the path of a grid",
     '\n{"in": "a.npy", "factor": 3}': "list.jsonl, line 2: factor is 3: give an even number",
@@ -213,7 +224,7 @@ LISTS = {
 }
 KINDS = ", ".join(GRID_SUFFIXES)
 NO_GRIDS = {
-    "none.npy": "none.npy does not exist: give grids, folders, patterns or a list\n",
+    "none.npy": "none.npy does not exist: give grids, folders or lists\n",
     "in/*.raw": f"in/*.raw holds no grid ({KINDS})\n",
     "empty": f"empty holds no grid ({KINDS})\n",
     "odd.raw": f"odd.raw is neither a grid ({KINDS}) nor a list (.txt, .jsonl)\n",
@@ -310,8 +321,6 @@ def test_a_death_is_the_result_of_its_task_alone():
     assert worked([1, *deaths, 2, 3]) == {1: 1, 2: 4, 3: 9, **deaths}
     with pytest.raises(SuperSdfError, match="no network"):
         worked([1, "no network"])
-    with pytest.raises(SuperSdfError, match="5 processes in a row ended; the last one ended with"):
-        worked(5 * ["ended"], 1)
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])

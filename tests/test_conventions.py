@@ -1,5 +1,7 @@
 """What an array shows: spacing, sign, and what it is not."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from conftest import refusal
@@ -22,15 +24,22 @@ def test_exact_distances_show_their_spacing(unit):
 
 
 FAR = np.abs(torus(8))
+AXES = "give three axes (x, y, z), with at least 2 samples on each"
 REFUSED = {
     "every value is 3: a constant field has no surface": np.full((4, 4, 4), 3.0),
     "no value is below 0 (the smallest is 0.5): they look like densities: give the level of their "
     "surface, such as level=0.8, inside='positive'": FAR + 0.5 - FAR.min(),
     "no value is above 0 (the largest is -1): they look like densities: give the level of their "
     "surface, such as level=-3.5, inside='positive'": (-1 - np.indices((3, 3, 3)).sum(0)),
+    "every value is False: a constant field has no surface": np.zeros((5, 5, 5), bool),
     "no value is finite: there is no surface": np.full((3, 3, 3), np.nan),
-    "values have shape (4, 4): give three axes (x, y, z)": np.zeros((4, 4)),
-    "values have shape (4, 1, 4): give at least 2 samples on each axis": np.zeros((4, 1, 4)),
+    f"values have shape (4, 4): {AXES}": np.zeros((4, 4)),
+    f"values have shape (4, 1, 4): {AXES}": np.zeros((4, 1, 4)),
+    f"values have shape (nan, 4, 4): {AXES}": SimpleNamespace(
+        shape=(np.nan, 4, 4), dtype=np.dtype(float), chunks=((np.nan,), (4,), (4,))
+    ),
+    "the largest value is 1e+200: if it stands for unknown ones, unknown=9.9999999999999997e+199, "
+    "else multiply them, scale=": np.where(FAR > 0.1, 1e200, -1.0),
 }
 
 
@@ -39,11 +48,14 @@ def test_what_is_no_signed_distance_grid_is_refused(message):
     assert refusal(GridError, make_grid, REFUSED[message]) == message
 
 
+LENGTHS = "give lengths from 1e-60 to 1e+60, the largest at most 50 times the smallest"
+
+
 @pytest.mark.parametrize(
     "spacing, said",
     [
-        ((1, 1, 51), "spacing is 1, 1, 51: the largest may be 50 times the smallest"),
-        (0, "spacing is 0, 0, 0: it must be greater than 0"),
+        ((1, 1, 51), f"spacing is 1, 1, 51: {LENGTHS}"),
+        (0, f"spacing is 0, 0, 0: {LENGTHS}"),
         (float("nan"), "spacing is nan: it must be finite"),
         ((1, 2), "spacing is (1, 2): give one number or three"),
     ],

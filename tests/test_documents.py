@@ -19,7 +19,7 @@ from super_sdf.cli.main import cli
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
 CARDS = sorted((ROOT / "src" / "super_sdf" / "models").glob("*.md"))
-PAGES = [README, ROOT / "CHANGELOG.md", ROOT / "examples" / "README.md", *CARDS,
+PAGES = [*sorted(ROOT.glob("*.md")), ROOT / "examples" / "README.md", *CARDS,
          *sorted((ROOT / "docs").rglob("*.md"))]  # fmt: skip
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 # Documents speak of today: what was, and what it was like, is in the history of the repository.
@@ -123,6 +123,17 @@ def test_the_python_of_the_readme_and_the_quick_start_runs(grids):
         assert Path("field.ply").exists()
 
 
+def test_the_python_of_the_page_on_other_tools_runs(grids):
+    with_pyvista, with_xarray = blocks("python", ROOT / "docs" / "guides" / "tools.md")
+    names: dict = {}
+    exec(compile(with_pyvista, "tools.md", "exec"), names)
+    points = trimesh.load("ball.ply").vertices - names["image"].center
+    assert np.abs(np.linalg.norm(points, axis=1) - 1.2).max() < 0.01
+    exec(compile(with_xarray, "tools.md", "exec"), names)
+    points = names["mesh"].vertices - (12, 0, 0)
+    assert np.abs(np.linalg.norm(points, axis=1) - 1.5).max() < 0.02
+
+
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_commands_have_the_arguments_that_a_page_gives_them(page):
     """Files are not looked for; options and their values are checked."""
@@ -167,9 +178,12 @@ def test_the_keys_of_json_are_as_documented(grids):
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_examples_run(example, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", [example.name, "--help"])
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_path(str(example), run_name="__main__")
     monkeypatch.setattr(sys, "argv", [example.name])
     runpy.run_path(str(example), run_name="__main__")
-    assert capsys.readouterr().out
+    assert capsys.readouterr().out.startswith("usage: ")
     scenes = [trimesh.load_scene(path) for path in tmp_path.iterdir() if path.suffix != ".vdb"]
     assert all(part.is_watertight for scene in scenes for part in scene.geometry.values())
 
@@ -179,5 +193,5 @@ def test_the_tour_names_all_rooms_and_modules_that_are_there():
     linked = [tour.parent / link for link in re.findall(r"\]\(([^)]+)", tour.read_text())]
     assert all(path.is_file() for path in linked)
     package = ROOT / "src" / "super_sdf"
-    rooms = {path.parent for path in package.glob("*/__init__.py")} - {package / "models"}
+    rooms = {path.parent for path in package.glob("*/__init__.py")}
     assert rooms <= {path.resolve().parent for path in linked}

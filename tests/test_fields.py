@@ -123,7 +123,7 @@ def damage(good: dict[str, np.ndarray], **changed: ArrayLike | None) -> str:
 WRONG = {
     "its version is 1, and this program reads 2": {"version": 1},
     "factor is 3: give an even number from 2 to 16": {"factor": 3},
-    "spacing is 0, 0, 0: it must be greater than 0": {"spacing": np.zeros(3)},
+    "spacing is 0, 0, 0: give lengths from 1e-60 to 1e+60": {"spacing": np.zeros(3)},
     "its voxels are not in order": {"samples": np.ones(2, int)},
     "cannot reshape array": {"factor": 4},
     "": {"factor": None},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 import h5py
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import SimpleITK as sitk  # noqa: N813
 import tifffile
+import trimesh
 from conftest import ball, refusal
 from placed import (
     CUBES,
@@ -28,9 +30,9 @@ from placed import (
 )
 
 from super_sdf import read_grid
-from super_sdf.errors import GridError, SuperSdfError
+from super_sdf.errors import FileError, GridError, SuperSdfError
 from super_sdf.files import formats
-from super_sdf.files.formats import find_format
+from super_sdf.files.formats import find_format, is_grid
 
 pytestmark = pytest.mark.usefixtures("folder")
 
@@ -105,8 +107,8 @@ def test_what_is_no_grid_is_refused_with_the_way_out(command):
         os.mkdir(name)
     first = "super-sdf sample part.stl part.npz -n 64"
     for name, said in {
-        "part.stl": f"is a mesh, not a grid: sample it first with {first}",
-        "part.step": f"is a CAD model: export it as part.stl, then {first}",
+        "part.stl": f"is a mesh, not a grid: sample it first, {first}",
+        "part.step": f"is a CAD model, not a grid: sample it first, export part.stl, then {first}",
         "a.nii": "is a folder: give a file",
         "a.zarr": "cannot be read as Zarr: No group found in store",
         "no.zarr": "does not exist",
@@ -130,6 +132,28 @@ def test_the_page_on_formats_lists_those_of_the_table():
     for format_ in (*formats.FORMATS, formats.DICOM):
         start = f"| {format_.name} | `{'`, `'.join(format_.suffixes)}` | "
         assert start + (f"`{format_.extra}`" if format_.extra else "none") in page
+
+
+def test_another_package_brings_formats(monkeypatch, command):
+    """The package is that of the page on formats."""
+    page = (Path(__file__).parent.parent / "docs" / "guides" / "formats.md").read_text()
+    table, code = (re.search(rf"```{kind}\n(.*?)```", page, re.S)[1] for kind in ("toml", "python"))
+    table = re.sub(r'project\.entry-points\.|"', "", table)
+    Path("my_formats.py").write_text(code)
+    Path("my_formats-1.0.dist-info").mkdir()
+    Path("my_formats-1.0.dist-info/entry_points.txt").write_text(table)
+    monkeypatch.syspath_prepend(Path.cwd())
+    (0.5 * ball(64, 20.0).values).astype("f4").tofile("in.raw64")
+    grid = read_grid("in.raw64")
+    assert grid.shape == (64, 64, 64) and grid.spacing == (0.5,) * 3 and is_grid("in.raw64")
+    words = "--factor", 2, "--quality", "fast", "-q"
+    assert command("batch", "in.raw64", "--out", ".", *words)[0] == 0
+    assert command("upsample", "in.raw64", "out.pts", *words)[0] == 0
+    vertices = np.loadtxt("out.pts")
+    assert np.allclose(vertices, trimesh.load("in.ply", process=False).vertices, atol=1e-5)
+    Path("bad.raw64").write_bytes(b"1234")
+    said = "bad.raw64 cannot be read as .raw64: cannot reshape array"
+    assert refusal(FileError, read_grid, "bad.raw64").startswith(said)
 
 
 SUFFIXES = [

@@ -1,7 +1,5 @@
 """A function in, a mesh out: vertices lie where it is 0, and on its edges."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from conftest import refusal, trilinear
@@ -9,7 +7,7 @@ from solids import box_distance
 
 from super_sdf import DistanceFunction, reconstruct
 from super_sdf.check import check_mesh
-from super_sdf.errors import GridError, OptionError, OptionTypeError
+from super_sdf.errors import GridError, OptionError, OptionTypeError, SuperSdfWarning
 
 H = 2 / 19
 BOX = (-1.0, 1.0)
@@ -106,15 +104,42 @@ def test_an_offset_is_where_the_function_has_it(sign):
     assert is_on(lambda points: torus(points) - 0.1, mesh)
 
 
-def test_tensors_are_taken():
-    """Of PyTorch: NumPy takes one only without gradients, from the CPU."""
+@pytest.mark.parametrize("columns", [(), (1,)])
+def test_a_module_of_pytorch_is_taken(columns):
+    """It gets tensors of the type of its parameters; NumPy takes none that has gradients."""
+    torch = pytest.importorskip("torch")
 
-    def function(points):
-        detached = SimpleNamespace(cpu=lambda: torus(points))
-        return SimpleNamespace(dtype="torch.float32", detach=lambda: detached)
+    class Ball(torch.nn.Linear):
+        def forward(self, points):
+            assert points.dtype == torch.float32 and not torch.is_grad_enabled()
+            return (super().forward(points).norm(dim=1) - 0.6).reshape(-1, *columns)
 
-    mesh = reconstruct(None, trilinear, function=function, bounds=BOX, spacing=H)
-    assert is_on(torus, mesh)
+    module = Ball(3, 3, bias=False)
+    module.weight.data = torch.eye(3)
+    mesh = reconstruct(None, trilinear, function=module, bounds=BOX, spacing=H)
+    assert off(lambda points: np.linalg.norm(points, axis=1) - 0.6, mesh).max() < 1e-4
+    assert (
+        off(
+            torus,
+            reconstruct(
+                None,
+                trilinear,
+                function=lambda p: torch.tensor(torus(p), dtype=torch.bfloat16, requires_grad=True),
+                bounds=BOX,
+                spacing=H,
+            ),
+        ).mean()
+        < 0.05
+    )
+
+
+def test_vertices_that_do_not_reach_the_surface_are_counted():
+    """The cube of a distance is 0 there, and so is its slope."""
+    with pytest.warns(SuperSdfWarning, match=r"vertices did not reach the surface of the functi"):
+        mesh = reconstruct(None, trilinear, function=lambda p: torus(p) ** 3, bounds=BOX, spacing=H)
+    count = int(mesh.warnings[0].split(" of ")[0].replace(",", ""))
+    assert 0.9 * count < (off(torus, mesh) > 0.0125).sum() < 1.1 * count
+    assert mesh.notes[0].startswith("values taken as smooth (field='smooth'), since the slope is ")
 
 
 ASKED = {"function": torus, "bounds": BOX, "spacing": H}
@@ -132,7 +157,7 @@ ASKED = {"function": torus, "bounds": BOX, "spacing": H}
     ({**ASKED, "function": lambda p: np.tanh(8 * torus(p)), "offset": 0.01}, OptionError,
      "offset is 0.01: the function is no distance, leave it out"),
     ({**ASKED, "function": lambda p: p[:, 0] + 9}, GridError,
-     "the function goes from 8 to 10 at 8,000 samples, and its surface is where it is 0: "),
+     "the function goes from 8 to 10 at all 8,000 samples, and its surface is where it is 0: "),
 ])  # fmt: skip
 def test_errors(arguments, kind, message):
     said = refusal(kind, reconstruct, network=trilinear, **arguments)

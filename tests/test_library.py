@@ -15,20 +15,17 @@ from super_sdf import (
     upsample,
     write_mesh,
 )
-from super_sdf.errors import GridError, OptionError
+from super_sdf.errors import GridError, OptionError, SuperSdfWarning
 
 VALUES = ball(20, 6.0).values
 
 
-def test_values_of_the_other_sign_are_refused():
-    with pytest.raises(GridError) as caught:
-        SdfGrid(-VALUES, 1.0)
-    assert str(caught.value) == (
-        "100% of the grid's border is negative, which is inside: make the grid with "
-        "make_grid(values, spacing=..., inside='positive'), or inside='negative' if the solid does "
-        "run out of the grid there"
-    )
-    assert reconstruct(make_grid(-VALUES, spacing=1), trilinear, 2).volume() > 0
+def test_the_constructor_infers_what_make_grid_does():
+    made = make_grid(-VALUES, spacing=1, origin=(1, 2, 3))
+    for grid in (SdfGrid(-VALUES, 1.0, (1, 2, 3)), SdfGrid(VALUES, 1.0, (1, 2, 3))):
+        np.testing.assert_array_equal(grid.values, made.values)
+        assert (grid.spacing, grid.origin, grid.low) == (made.spacing, made.origin, made.low)
+    assert reconstruct(made, trilinear, 2).volume() > 0
 
 
 @pytest.mark.parametrize("make", [make_grid, lambda values: SdfGrid(values, 1.0)])
@@ -52,7 +49,6 @@ BOOLEAN = "give True or False, in JSON true or false"
 MAKE_ONE = "make one with make_grid(values, spacing=...) or read_grid(path)"
 # of the wrong type, and of the right type with a wrong value
 OF_OTHER_TYPES = {
-    f"grid is an array of shape (20, 20, 20): {MAKE_ONE}": {"grid": VALUES},
     f"grid is 'part.npz': {MAKE_ONE}": {"grid": "part.npz"},
     "network is 3: give one from load_network()": {"network": 3},
     "offset is [1]: give a finite number, in world units": {"offset": [1]},
@@ -109,12 +105,53 @@ def test_grid_field_mesh_and_network_say_what_they_are_in_a_line():
         assert said.startswith(f"{type(thing).__name__}(") and "\n" not in said and len(said) < 160
 
 
+def stored(kind):
+    """Return the values as an array of some library."""
+    library = pytest.importorskip(kind)
+    if kind == "h5py":
+        return library.File("a.h5", "w").create_dataset("a", data=VALUES[None, None])
+    if kind == "numpy":
+        np.save("a.npy", VALUES)
+        return np.load("a.npy", mmap_mode="r")
+    make = {"torch": "tensor", "dask.array": "from_array", "zarr": "array", "xarray": "DataArray"}
+    return getattr(library, make[kind])(
+        VALUES if kind in ("zarr", "xarray") else VALUES[None, None]
+    )
+
+
+@pytest.mark.parametrize("kind", ["numpy", "h5py", "torch", "dask.array", "zarr", "xarray"])
+def test_an_array_of_any_library_goes_in_with_its_place(folder, kind):
+    place = {"spacing": 0.5, "origin": (1, 2, 3)}
+    want = reconstruct(make_grid(VALUES / 2, **place), trilinear, 2)
+    mesh = reconstruct(stored(kind), trilinear, 2, scale=0.5, **place)
+    np.testing.assert_allclose(mesh.vertices, want.vertices, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, want.faces)
+
+
+def test_a_grid_has_its_own_place():
+    said = refusal(OptionError, reconstruct, GRID, trilinear, level=0.5)
+    assert said == "level is given with a grid, which has its own: leave it out"
+
+
+def test_notes_are_logged_and_warnings_issued_in_the_words_of_python(caplog, command, folder):
+    caplog.set_level("INFO", "super_sdf")
+    with pytest.warns(SuperSdfWarning) as caught:
+        mesh = reconstruct(VALUES[:10], trilinear, cap=False)
+    where = "the surface runs out of the grid and is open there (close it with cap=True)"
+    assert mesh.warnings == (where,) == tuple(str(each.message) for each in caught)
+    assert mesh.notes == tuple(caplog.messages) and mesh.notes[0].startswith("spacing not given: ")
+    np.save("a.npy", VALUES[:10])
+    err = command("upsample", "a.npy", "a.ply", "--open", "--quality", "fast")[2]
+    assert f"Warning: {where[:-9]}--cap)\n" in err and f"Note: {mesh.notes[0]}\n" in err
+
+
 SAID = {
     "give a --level, such as --level -4 --inside negative": "give a level=, such as level=-4, "
     "inside='negative'",
     "--labels has 'lung': choose fewer (--labels 1,2)": "labels has 'lung': choose fewer "
     "(labels=(1,2))",
     "end it there (--open), or use --force": "end it there (cap=False), or use force=True",
+    "leave it out, or --offset and --open": "leave it out, or offset= and cap=False",
     "pip install --force-reinstall onnxruntime": "pip install --force-reinstall onnxruntime",
 }
 

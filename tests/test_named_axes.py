@@ -63,23 +63,20 @@ def test_arrays_of_dask_are_computed_if_they_fit(monkeypatch):
     assert make_grid(sphere("zyx")).shape == SHAPE  # what is in memory already fits
 
 
+NAMES = "name them 'x', 'y' and 'z' (array.rename), with coordinates of all or none"
 REFUSED = {
-    "coordinates of 'y' are not evenly spaced: 13 is followed by 13.6, a step of 0.6 among steps "
-    "of 0.5; resample the array (array.interp(y=...))": (
+    "coordinates of 'y' are not evenly spaced, but in steps of 0.4 to 0.6: resample the array "
+    "(array.interp(y=...))": (
         sphere().assign_coords(y=np.where(np.arange(20) == 7, 13.6, sphere().y))
     ),
-    "coordinates of 'z' have dtype datetime64[s]: give numbers, in the unit of the distances": (
-        sphere().assign_coords(z=np.arange(22).astype("datetime64[s]"))
+    "coordinates of 'z' is array([False, False, False, False, False, False, False, F...: give n"
+    "umbers, in the unit of the distances": sphere().assign_coords(z=np.arange(22) == 0),
+    f"dimensions are 'lon', 'lat', 'z', with coordinates of 'lon', 'lat', 'z': {NAMES}": (
+        sphere().rename(x="lon", y="lat")
     ),
-    "dimensions are 'lon', 'lat', 'z': name those of the axes 'x', 'y' and 'z', with "
-    "array.rename(...)": sphere().rename(x="lon", y="lat"),
-    "values have shape (2, 18, 20, 22): give three axes (x, y, z)": (
-        sphere().expand_dims(time=[1.0, 2.0])
-    ),
-    "only 'x', 'z' has coordinates: give those of all axes, or of none (array.drop_vars(...))": (
-        sphere().drop_vars("y")
-    ),
-    "values are a Dataset: give one of its arrays (sdf)": sphere().to_dataset(),
+    f"dimensions are 'x', 'y', 'z', with coordinates of 'x', 'z': {NAMES}": sphere().drop_vars("y"),
+    "values have shape (2, 18, 20, 22): give three axes (x, y, z), with at least 2 samples on "
+    "each": sphere().expand_dims(time=[1.0, 2.0]),
 }
 
 

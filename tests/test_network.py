@@ -76,8 +76,6 @@ REFUSED = [
     (OptionError, "precision is 'int4': give one of auto, float32, int8", {"precision": "int4"}),
     (DeviceError, "int8 is for the CPU: use precision='float32'",
      {"precision": "int8", "device": "cuda"}),
-    (FileError, "no model 'other': give an ONNX file or one of: fast, base, best",
-     {"model": "other"}),
     (ModelError, r"bad\.onnx is no ONNX file that onnxruntime can run", {"model": "bad.onnx"}),
     (OptionError, "device is 'tpu': give one of auto, cpu, cuda", {"device": "tpu"}),
 ]  # fmt: skip

@@ -63,8 +63,6 @@ def test_truncated_distances_are_filled_in_for_an_offset(fast):
     for offset in (-0.3, 0.4, 0.8):
         mesh = reconstruct(grid, fast, 2, offset=offset)
         assert mesh.volume() == pytest.approx(cube_volume(offset), rel=0.01)
-    with pytest.raises(GridError, match=r"but they end at 2\.6: the farthest that works is 1\.1$"):
-        reconstruct(grid, fast, 2, offset=1.2)
 
 
 @pytest.mark.parametrize("fill", [3, 1000])

@@ -2,8 +2,6 @@
 
 import os
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -63,20 +61,3 @@ def test_a_file_that_is_replaced_keeps_its_mode_and_a_protected_one_stays(name):
         make(name, force=True, meanwhile=lambda: os.chmod(name, 0o444))
     assert "is write-protected" in why(name, force=True)  # also for root
     assert Path(name).read_text() == "old" and os.listdir() == [name]
-
-
-@pytest.mark.parametrize("target", ["out.ply", "x" * 250 + ".ply"])
-def test_what_a_killed_process_left_goes_with_the_next_run(target):
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    with replacing(Path(target)) as part:
-        part.write_text("whole")
-    own = str(os.getpid())
-    lives, others = (
-        part.name.replace(own, "1"),
-        [".other.ply.1.part", ".out.ply.part", ".out.ply.1"],
-    )
-    for name in (part.name.replace(own, str(ended.pid)), part.name, lives, *others):
-        Path(name).write_text("half")
-    make(target, force=True)
-    assert sorted(os.listdir()) == sorted([target, lives, *others])

@@ -99,7 +99,7 @@ def test_symmetries_of_the_cube_map_the_vertices_along(monkeypatch):
     values = np.minimum(values, np.linalg.norm(ijk - 1.4, axis=0) - 2.6)
 
     def vertices_of(values):
-        grid = SdfGrid(values, (1.0,) * 3, (-5.5,) * 3)
+        grid = SdfGrid.trusted(values, (1.0,) * 3, (-5.5,) * 3)
         return reconstruct(grid, trilinear, mesher="marching").vertices
 
     base = vertices_of(values)
@@ -136,7 +136,7 @@ def test_threads_give_the_same_mesh(network):
 
 def test_two_samples_an_axis_are_enough(network):
     values = np.array([-0.5, 0.5])[:, None, None] + np.zeros((2, 2, 2))
-    mesh = reconstruct(SdfGrid(values, (1.0,) * 3), network, cap=False)
+    mesh = reconstruct(SdfGrid.trusted(values, (1.0,) * 3), network, cap=False)
     np.testing.assert_allclose(mesh.vertices[:, 0], 0.5, atol=0.05)
 
 
@@ -146,6 +146,6 @@ def test_a_field_without_a_surface_is_refused(low, high):
     values = np.repeat(np.linspace(low, high, 8), 64).reshape(8, 8, 8)
     with pytest.raises(GridError, match=f"no surface at 0: the values go from {low:g} to {high:g}"):
         reconstruct(
-            SdfGrid(values, (1.0,) * 3),
+            SdfGrid.trusted(values, (1.0,) * 3),
             lambda patches, table, voxels, offsets: np.ones((len(voxels), 125), np.float32),
         )

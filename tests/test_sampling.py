@@ -9,9 +9,7 @@ import pytest
 from solids import TORUS, box_distance, cube, inverted, joined, saved, sphere, torus
 
 from super_sdf import Mesh, SdfGrid, SuperSdfError, load_network, reconstruct
-from super_sdf.truth import sampling
-from super_sdf.truth.sampling import fitted_layout, sample_solid
-from super_sdf.truth.solid import Solid, load_solid
+from super_sdf.truth import Solid, fitted_layout, load_solid, sample_solid
 
 CENTRES = (24, 24, 24), 1 / 24, np.full(3, 0.5 / 24 - 0.5)
 
@@ -48,7 +46,7 @@ def test_big_grids_are_cut_off_and_make_the_same_mesh(monkeypatch):
     exact = sample_solid(solid, layout)
     expected = np.clip(exact.values, -limit, limit)
     np.testing.assert_allclose(sample_solid(solid, layout, band=2).values, expected, atol=1e-7)
-    monkeypatch.setattr(sampling, "EXACT_SAMPLES", 1000)
+    monkeypatch.setattr("super_sdf.truth.EXACT_SAMPLES", 1000)
     cut = sample_solid(solid, layout)
     assert not exact.notes and "clamped" in cut.notes[0]
     assert cut.values.max() == pytest.approx(4 / 24)

@@ -13,7 +13,7 @@ from test_isosurface import dense_field
 from lab.methods import sharp_isosurface
 from super_sdf import SdfGrid, extract_mesh, load_network, make_grid, reconstruct, upsample
 from super_sdf.surface.sharp import features
-from super_sdf.truth.solid import Solid, read_mesh
+from super_sdf.truth import Solid, read_mesh
 
 extract_sharp = partial(extract_mesh, mesher="sharp")
 TURN = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]

@@ -68,7 +68,7 @@ def test_different_units_are_told():
     save_ome(X=0.5, Y=0.5, Z=0.5, ZUnit="pixel")
     assert read_grid("a.ome.tif", spacing=STEPS).notes[0] == (
         "its axes have different units (µm, pixel): spacing and origin are not taken from it (give "
-        "--spacing)"
+        "spacing=)"
     )
 
 

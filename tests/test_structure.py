@@ -19,8 +19,9 @@ ROOMS = [
     "pages",
     "convert",
     "functions.pyvista",
+    "functions.scikit_image",
     "labels",
-    "simplify check",
+    "simplify check evaluation",
     "pipeline",
     "tiles",
     "functions",
@@ -32,25 +33,25 @@ ROOMS = [
     "grid",
     "options threads",
     "errors arrays",
-    "__init__ __main__ models",
+    "__init__ __main__",
 ]
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
-    TOP: 1250,
-    "grid": 2383,  # 1,800
+    TOP: 1311,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
+    "grid": 2254,  # 1,800
     "network": 500,
-    "refine": 1300,
-    "surface": 2200,
+    "refine": 1293,
+    "surface": 2207,  # 2,200; and what is noted of a mesh
     "tiles": 300,
-    "files": 2700,
-    "functions": 600,
+    "files": 2714,  # 2,700; and readers and writers of other packages
+    "functions": 729,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached
     "labels": 900,
-    "simplify check truth": 1170,  # 1,100; and the walls between labels, which are simplified, too
+    "simplify check truth evaluation": 1530,  # 1,100; and the evaluation, which lab imports
     "batch": 900,
     "pages": 400,
-    "cli": 800,
+    "cli": 839,  # 800; and standard input and output
 }
-MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 95, 45, 110  # 95, 45, 110 in the design
+MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 90, 45, 114  # 90, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 17_800, 36_000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {
@@ -163,7 +164,7 @@ def test_a_room_is_within_its_budget(rooms):
 def test_the_house_is_small():
     assert len(MODULES) <= MOST_MODULES
     assert lines_of(iter(MODULES.values())) <= MOST_LINES
-    folders = (ROOT / name for name in ("src", "lab", "export", "tests", "examples"))
+    folders = (ROOT / name for name in ("src", "lab", "export", "tests", "examples", "plugins"))
     assert lines_of(path for folder in folders for path in folder.rglob("*.py")) <= MOST_OF_ALL
 
 
@@ -174,13 +175,15 @@ def test_what_every_conversion_needs_is_few_packages(module):
     names = {a.name for node in at_once if isinstance(node, ast.Import) for a in node.names}
     names |= {str(n.module) for n in at_once if isinstance(n, ast.ImportFrom) and not n.level}
     others = {name.split(".")[0] for name in names} - LIBRARIES - set(sys.stdlib_module_names)
-    is_extra = module.startswith(("files.readers.", "simplify.", "check.", "truth.", "pages."))
+    is_extra = module.startswith(
+        ("files.readers.", "simplify.", "check.", "truth", "evaluation", "pages.")
+    )
     assert not others or is_extra or module in ("batch.cluster", "functions.pyvista")
 
 
 def test_onnxruntime_is_imported_in_one_place():
     """There its telemetry is switched off before."""
-    folders = [ROOT / name for name in ("src", "tests", "export", "lab", "examples")]
+    folders = [ROOT / name for name in ("src", "tests", "export", "lab", "examples", "plugins")]
     paths = [path for folder in folders for path in folder.rglob("*.py")]
     assert {path.name for path in paths if "onnxruntime" in imported(path)} == {"onnx.py"}
 

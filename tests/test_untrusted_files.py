@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import os
+import re
 import zlib
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from placed import CUBES, sampled, save
 
 from super_sdf import read_grid
 from super_sdf.errors import FileError
-from super_sdf.truth.solid import read_mesh
+from super_sdf.truth import read_mesh
 
 VALUES = sampled(CUBES)
 RAW = VALUES.ravel("F").tobytes()
@@ -92,6 +93,12 @@ def test_sizes_that_no_file_has_are_refused_at_once(huge):
     write("a.vti", Path("a.vti").read_bytes().replace(b"7 23", b"7 99999999"))
     for name in ("a.mha", "a.nrrd", "a.sdf", "b.sdf", "a.vti"):
         assert said_of(name).startswith(name)
+
+
+def test_a_spacing_of_vtk_that_is_no_number_is_refused():
+    save("a.vti", CUBES)
+    text = re.sub(rb'Spacing="\S+', b'Spacing="nan', Path("a.vti").read_bytes())
+    assert said_of(write("a.vti", text)).startswith("a.vti: Spacing is [nan, ")
 
 
 def test_what_is_loaded_whole_is_refused_if_it_would_not_fit():

@@ -31,7 +31,7 @@ for _ in range(600):
     optimiser.step()
     schedule.step()
 
-field = DistanceFunction(lambda points: model(torch.as_tensor(points, dtype=torch.float32)))
+field = DistanceFunction(model)
 mesh = reconstruct(function=field, bounds=(-1, 1), spacing=2 / 31)
 write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "ring.ply", force=True)
 

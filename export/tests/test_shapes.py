@@ -9,7 +9,7 @@ from export.shapes.smooth import draw_smooth, ellipsoid, foot_points, settle, to
 from export.shapes.solid import FAMILIES, MAX_FACES, draw_family, random_solid
 from super_sdf import Mesh
 from super_sdf.check import examine_surface
-from super_sdf.truth import solid
+from super_sdf.truth import Solid
 
 
 def check_solid(mesh: Mesh) -> None:
@@ -74,7 +74,7 @@ def test_signs_are_right_where_a_mesh_intersects_itself():
     both, rng = trimesh.util.concatenate(boxes), np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.7, (4000, 3))
     inside = ((points[:, None] > low) & (points[:, None] < high)).all(2).any(1)
-    truth = solid.Solid(Mesh(np.array(both.vertices), np.array(both.faces, np.int32)))
+    truth = Solid(Mesh(np.array(both.vertices), np.array(both.faces, np.int32)))
     np.testing.assert_array_equal(dataset.signed_distance(rng, truth, points) < 0, inside)
 
 

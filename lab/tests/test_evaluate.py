@@ -100,10 +100,6 @@ def test_a_process_is_timed(tmp_path):
         costs.run_python(costs.upsample_words(Path("none.npz")))
 
 
-def test_random_fields_are_closed_manifolds(command):
-    assert command("fields", "--count", 28) == (0, "28 fields, 0 faults\n", "\n")
-
-
 @pytest.fixture
 def speeds(tmp_path):
     rows = [

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from solids import CUBE_FACES, cube, inverted, sphere, square
 
-from lab import samples
 from lab.measuring import Task, measure_method
-from lab.metrics import EDGE_DISTANCE, F1_DISTANCE, METRICS, VOXEL_SHARE, Comparison
+from lab.metrics import METRICS, Comparison
 from lab.shapes import Case, Setting, Shape, normalise
 from lab.surfaces import EMPTY
-from super_sdf import Mesh
+from super_sdf import Mesh, evaluation as samples
+from super_sdf.evaluation import EDGE_DISTANCE, F1_DISTANCE, VOXEL_SHARE
 
 N = samples.SAMPLE_COUNT
 H = 0.05  # spacing of a coarse grid

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 
 from .arrays import CENTRE, BoolArray, FloatArray, length, sums_at
 from .files.grids import read_grid
+from .grid.derived import ON_SAMPLE
 from .grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from .options import LENGTHS, Options
 from .refine.band import Band, no_surface, survey
 from .refine.nodes import VoxelIndex
 from .surface.mesh import Mesh
 from .threads import check_fits, give_back, memory_bound, useful_threads
-from .truth.solid import Points, Solid, merged, read_mesh, smallest_angles
+from .truth import Points, Solid, merged, read_mesh, smallest_angles
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
 BYTES_PER_TRIANGLE, BYTES_PER_SAMPLE = 650, 150
@@ -125,7 +126,7 @@ class Certificate:
             "sample_volume": self.sample_volume,
             "volume_ml": self.volume_ml,
             "faults": self.faults(),
-            "inferred": list(self.grid.notes),
+            "inferred": list(self.grid.flagged),
         }
 
     def faults(self) -> list[str]:
@@ -227,7 +228,7 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certif
     need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
     what, most = f"checking {len(mesh.faces):,} triangles", memory_bound(options.max_memory)
     check_fits(need, what, "allow more (--max-memory)", most)
-    surface, touched = examine_surface(mesh), touch(Solid(mesh), band, lattice)
+    surface, touched = examine_surface(mesh), touch(Solid(mesh), band, grid)
     is_mask, nearest = lattice.field.sides_only, np.rint(lattice.to_index(mesh.vertices))
     beyond = ((nearest < 0) | (nearest >= lattice.shape)).any(1)
     away = VoxelIndex(band.voxel_ijk, lattice.shape).find(nearest.astype(np.int64)) < 0
@@ -277,11 +278,13 @@ def touch(
     values = band.patches[:, CENTRE]
     # ``exact`` keeps truncated samples beside the surface, whose neighbours are steep
     trusted = band.exact & (values > values.min()) & (values < values.max())
-    rows = np.flatnonzero(trusted & band.sampled)  # what is interpolated promises nothing
-    sampled = int(np.count_nonzero(band.sampled))
+    places = grid.to_index(points := band.grid.to_world(band.voxel_ijk))
+    is_sample = (np.abs(places - np.rint(places)) <= ON_SAMPLE).all(1)
+    rows = np.flatnonzero(trusted & is_sample)  # what is interpolated promises nothing
+    sampled = int(np.count_nonzero(is_sample))
     # if none is exact, too many are no distances for any to be taken for one
-    noisy = int(np.count_nonzero(band.sampled & ~band.lipschitz)) if len(rows) else sampled
-    points, values = grid.to_world(band.voxel_ijk[rows]), values[rows] * np.float32(0.5)
+    noisy = int(np.count_nonzero(is_sample & ~band.lipschitz)) if len(rows) else sampled
+    points, values = points[rows], values[rows] * np.float32(0.5)
     found, _, feet = solid.nearest(points)
     distances, size = found / grid.voxel_size, np.abs(values)
     apart = np.flatnonzero(distances + size > NOTICEABLE)  # where the side matters

@@ -77,8 +77,8 @@ def convert(
         facts = _facts(grid, made, options)
         mesh = _finished(made.mesh, grid, options, facts)
         steps.lap("simplify" if options.goals() else "isosurface")
-        world, beside = World(options.unit, grid.space), [Path(save_field)] if save_field else []
-        write_meshes({Path(target): {"": mesh}}, force=force, world=world, beside=beside)
+        world = World(options.unit, grid.space)
+        write_meshes({Path(target): {"": mesh}}, force=force, world=world)
         steps.lap("write")
     if saved:
         facts["saved_field"] = saved
@@ -87,12 +87,7 @@ def convert(
 
 def _facts(grid: SdfGrid, made: Result, options: Options) -> dict[str, Any]:
     """Return what is known of how a mesh was made, for JSON."""
-    notes, capped = list(made.lattice.notes), options.cap and made.whole.leaves
-    if capped:
-        closed = "its surface is closed along the border (leave it open with --open)"
-        notes.append(f"the solid runs out of the grid: {closed}")
-    if options.mesher == "sharp" and not made.lattice.field.has_exact:
-        notes.append(f"{grid.field.kind} values show no edges: the mesh is that of marching cubes")
+    notes, warnings = made.said(grid)
     return {
         **describe_place(grid),
         "band_voxels": made.whole.count,
@@ -100,10 +95,10 @@ def _facts(grid: SdfGrid, made: Result, options: Options) -> dict[str, Any]:
         "tiles": made.tiles,
         "factor": options.factor_for(mask=grid.field.sides_only),
         "closed": not made.open_edges,
-        "capped": capped,
+        "capped": made.capped,
         "field": grid.field.report(),
         "inferred": notes,
-        "warnings": _warnings(grid, made, options.offset),
+        "warnings": warnings,
     }
 
 
@@ -115,32 +110,14 @@ def _finished(mesh: Mesh, grid: SdfGrid, options: Options, facts: dict[str, Any]
 
         mesh = keep_volume(mesh, volume, mean_spacing(grid))
     if options.goals():
-        from .simplify.simplify import simplify_mesh
+        from .simplify.simplify import simplified
 
-        goal: Any = {"error": options.error(grid.voxel_size), "triangles": options.triangles}
-        made = simplify_mesh(mesh, **goal, max_memory=options.max_memory)
-        mesh, facts["simplified"] = made.mesh, made.report(grid.voxel_size)
-        facts["closed"] = mesh.is_closed()
+        error = options.error(grid.voxel_size)
+        mesh = made = simplified(mesh, error, options.triangles, options.max_memory)
+        facts["simplified"], facts["closed"] = made.report(grid.voxel_size), made.is_closed()
         facts["warnings"] += made.warnings
     if volume is not None:
         facts["inferred"] += volume_notes({"the mesh": (mesh.volume(), volume)})
     facts |= {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
     facts["bounds"] = [[end(x).item() for x in mesh.vertices.T] for end in (np.min, np.max)]
     return mesh
-
-
-def _warnings(grid: SdfGrid, made: Result, offset: float) -> list[str]:
-    """Return a sentence on each thing that may be wrong with the mesh of a grid."""
-    warnings = list[str]()
-    if made.open_edges and grid.field.unseen is not None:
-        warnings.append("the surface ends where samples are unknown, and is open there")
-    elif made.open_edges:
-        warnings.append("the surface runs out of the grid and is open there (close it with --cap)")
-    if grid.low >= offset:
-        thin = "no sample lies inside: the solid is thinner than the spacing"
-        warnings.append(f"{thin}, and its mesh may have holes")
-    if made.whole.noisy and grid.field.network and not grid.field.sides_only:
-        share = 100 * made.whole.noisy / made.whole.count
-        differ = f"in {share:.3g} % of the band the values differ by more than distances can"
-        warnings.append(f"{differ}: they are taken as noisy there, and corrected")
-    return warnings

@@ -7,11 +7,14 @@ optional library is missing.
 
 from __future__ import annotations
 
+import logging
 import re
+import warnings
+from collections.abc import Iterable
 from importlib.util import find_spec
 
 FLAG = re.compile(r"(?<!install )--([a-z-]+)(?: ('[^']*'|[\w.,+-]*\w))?( (?=--))?")
-VERBS = ("is", "are", "has", "does", "needs")
+VERBS = ("is", "are", "has", "does", "needs", "takes")
 WORDS = ("and", "or", "if", "out", "to", "with", "for")
 SWITCHES = {"open": "cap=False", "cap": "cap=True", "force": "force=True"}
 SWITCHES |= {"labels all": "reconstruct_labels(values)"}
@@ -30,12 +33,31 @@ class SuperSdfError(Exception):
         return str(self.args[0]) if self.args else ""
 
     def __str__(self) -> str:
-        return FLAG.sub(_keyword, self.flagged)
+        return in_python(self.flagged)
+
+
+class SuperSdfWarning(UserWarning):
+    """What may be wrong with a mesh; it is also in the ``warnings`` of the mesh."""
 
 
 def flag(name: str) -> str:
     """Return an option as messages name it."""
     return f"--{name.replace('_', '-')}"
+
+
+def in_python(flagged: str) -> str:
+    """Return a message with keywords in place of flags."""
+    return FLAG.sub(_keyword, flagged)
+
+
+def tell(notes: Iterable[str], doubts: Iterable[str]) -> list[tuple[str, ...]]:
+    """Log notes and warn whoever called a public function; return both as Python says them."""
+    told = [tuple(map(in_python, sentences)) for sentences in (notes, doubts)]
+    for note in told[0]:
+        logging.getLogger("super_sdf").info(note)
+    for doubt in told[1]:
+        warnings.warn(doubt, SuperSdfWarning, stacklevel=3)
+    return told
 
 
 def in_a_line(error: BaseException) -> str:
@@ -49,14 +71,15 @@ def in_a_line(error: BaseException) -> str:
 
 def _keyword(found: re.Match[str]) -> str:
     """Return the keyword of Python for a flag and the word behind it, which may be its value."""
-    name, value, more = found[1].replace("-", "_"), found[2], ", " if found[3] else ""
+    name, value = found[1].replace("-", "_"), found[2]
+    more = (" " if value in WORDS else ", ") if found[3] else ""
     if call := SWITCHES.get(f"{name} {value}"):
         return call + more
     if value in VERBS:
         return f"{name} {value}"
     if value is None or value in WORDS:
         return SWITCHES.get(name, f"{name}=") + (f" {value}" if value else "") + more
-    if value.isalnum() and value[0].islower():
+    if value.isidentifier():
         value = repr(value)
     return f"{name}=({value})" if "," in value else f"{name}={value}{more}"
 

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 
 from . import options
 from .arrays import CENTRE
-from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen
-from .grid.sdf_grid import SdfGrid, check_grid, crop, cubic_grid
+from .errors import OptionError, OptionTypeError, OutOfMemoryError, seen, tell
+from .grid.sdf_grid import SdfGrid, as_grid, crop, cubic_grid
 from .network.contract import Adapter, Decoder, adapt
 from .network.network import load_network, network_for
 from .options import Options
@@ -135,20 +135,28 @@ def extract_mesh(
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
-    grid, asked = check_grid(field.grid if grid is None else grid), Options(mesher=mesher, cap=cap)
+    grid, asked = as_grid(field.grid if grid is None else grid), Options(mesher=mesher, cap=cap)
     chosen = asked.mesher_for(exact=len(field.spheres.distance) > 0)
     check_can_close(grid, cap=cap)
     return extract(field, cubic_grid(grid), mesher=chosen, cap=cap)[0]
 
 
 def reconstruct(
-    grid: SdfGrid | None = None,
+    grid: SdfGrid | ArrayLike | None = None,
     network: Decoder | None = None,
     factor: int | None = None,
     *,
     function: Callable[[Any], Any] | None = None,
     bounds: ArrayLike | None = None,
     spacing: ArrayLike | None = None,
+    origin: ArrayLike | None = None,
+    direction: ArrayLike | None = None,
+    inside: options.Inside = "auto",
+    field: options.FieldKind = "auto",
+    label: int | None = None,
+    level: float | None = None,
+    scale: float | None = None,
+    unknown: float | None = None,
     quality: options.Quality | str | Path | None = None,
     device: options.Device | None = None,
     precision: options.Precision | None = None,
@@ -159,21 +167,25 @@ def reconstruct(
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> Mesh:
-    """Turn a coarse grid, or a function, into a fine mesh.
+    """Turn an array, a grid or a function into a fine mesh.
 
     Parameters
     ----------
-    grid : SdfGrid, optional
-        Coarse signed distances. Without a grid the function is sampled.
+    grid : SdfGrid or (nx, ny, nz) array_like, optional
+        Coarse signed distances, or other values: see ``make_grid``. An array may be of NumPy, of
+        PyTorch on any device, a memory map, of h5py, Zarr, Dask or xarray; it may have further
+        axes of length 1 in front. Without a grid the function is sampled.
     network : Network, optional
         From ``load_network``, to load it once for many grids.
     factor : int, optional
         How many times finer per axis, K: an even number from 2 to 16; by default 2 for masks,
         else 4.
-    function : callable or DistanceFunction, optional
+    function : callable, torch.nn.Module or DistanceFunction, optional
         What the grid has samples of; vertices are then put where it is 0.
     bounds, spacing : optional
         The box and the distance of the samples, without a grid; see ``DistanceFunction.sample``.
+    spacing, origin, direction, inside, field, label, level, scale, unknown : optional
+        Where the values of an array lie and what they are; see ``make_grid``.
     quality, device, precision, threads : optional
         Which network to load, and where it runs, if none is given: see ``load_network``.
     offset : float
@@ -188,7 +200,9 @@ def reconstruct(
     Returns
     -------
     Mesh
-        In world units; closed, unless the surface leaves the grid and ``cap`` is False.
+        In world units; closed, unless the surface leaves the grid and ``cap`` is False. Its
+        ``notes`` say what was inferred; they are logged, level INFO, to "super_sdf". Its
+        ``warnings`` say what may be wrong; each is also a ``SuperSdfWarning``.
 
     Raises
     ------
@@ -197,29 +211,36 @@ def reconstruct(
         values that are not finite; if not even small tiles of the grid fit in the memory.
     """
     chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
-    if function is not None or bounds is not None or spacing is not None:
+    told = {"spacing": spacing, "origin": origin, "direction": direction, "inside": inside}
+    told |= {"field": field, "label": label, "level": level, "scale": scale, "unknown": unknown}
+    if (grid is None and function is not None) or bounds is not None:
         from .functions.function import sampled  # imported here, as few need it
 
-        grid = sampled(grid, function, bounds, spacing, chosen.offset)
-    grid = check_grid(grid)
+        grid = sampled(grid, function, bounds, told, chosen.offset)
+    else:
+        grid = as_grid(grid, **told)
     where = {"quality": quality, "device": device, "precision": precision, "threads": threads}
     asked: dict[str, Any] = {name: value for name, value in where.items() if value is not None}
     if network is None:
         network = load_network(asked.pop("quality", options.DEFAULT_QUALITY), **asked)
     elif asked:
         raise OptionError(f"a network and {next(iter(asked))} are given: give only one of them")
-    mesh = mesh_grid(grid, network, chosen, steps=Steps(progress)).mesh
-    if function is None:
-        return mesh
-    from .functions.zero import put_on_zero
+    made = mesh_grid(grid, network, chosen, steps=Steps(progress))
+    mesh, (notes, warnings) = made.mesh, made.said(grid)
+    if function is not None:
+        from .functions.zero import put_on_zero
 
-    return put_on_zero(mesh, function, grid, chosen.factor_for(mask=grid.field.sides_only), offset)
+        factor = chosen.factor_for(mask=grid.field.sides_only)
+        mesh, doubts = put_on_zero(mesh, function, grid, factor, offset)
+        warnings += doubts
+    said, doubted = tell(notes, warnings)
+    return replace(mesh, notes=said, warnings=doubted)
 
 
 def _prepared(grid: SdfGrid, network: Decoder, chosen: Options) -> tuple[SdfGrid, Adapter, int]:
     """Check what is given; return the cubic lattice of a grid, its field's network and factor."""
     options.NETWORK.check(network, "network")
-    lattice = cubic_grid(check_grid(grid), chosen.offset)
+    lattice = cubic_grid(as_grid(grid), chosen.offset)
     factor = chosen.factor_for(mask=grid.field.sides_only)
     vertex_type(lattice, factor)  # raises if not even float64 resolves the vertices
     return lattice, adapt(network_for(network, grid.field.network)), factor
@@ -234,6 +255,34 @@ class Result:
     whole: BandSummary
     open_edges: int
     tiles: int
+    options: Options
+
+    @property
+    def capped(self) -> bool:
+        """Whether the surface leaves the grid and is closed along its border."""
+        return self.options.cap and self.whole.leaves
+
+    def said(self, grid: SdfGrid) -> tuple[list[str], list[str]]:
+        """Return what was inferred of a grid, and what may be wrong with its mesh, in sentences."""
+        notes, warnings, field = list(self.lattice.flagged), list[str](), grid.field
+        if self.capped:
+            closed = "its surface is closed along the border (leave it open with --open)"
+            notes.append(f"the solid runs out of the grid: {closed}")
+        if self.options.mesher == "sharp" and not self.lattice.field.has_exact:
+            notes.append(f"{field.kind} values show no edges: the mesh is that of marching cubes")
+        if self.open_edges and field.unseen is not None:
+            warnings.append("the surface ends where samples are unknown, and is open there")
+        elif self.open_edges:
+            where = "the surface runs out of the grid and is open there"
+            warnings.append(f"{where} (close it with --cap)")
+        if grid.low >= self.options.offset:
+            thin = "no sample lies inside: the solid is thinner than the spacing"
+            warnings.append(f"{thin}, and its mesh may have holes")
+        if self.whole.noisy and field.network and not field.sides_only:
+            share = 100 * self.whole.noisy / self.whole.count
+            differ = f"in {share:.3g} % of the band the values differ by more than distances can"
+            warnings.append(f"{differ}: they are taken as noisy there, and corrected")
+        return notes, warnings
 
 
 @dataclass(frozen=True, eq=False)
@@ -303,7 +352,7 @@ def mesh_grid(
         raise no_surface(grid, chosen.offset)
     edges = check_closed(mesh, lattice, names, cap=chosen.cap)
     steps.finish("isosurface")
-    return Result(mesh, lattice, whole, edges, len(names))
+    return Result(mesh, lattice, whole, edges, len(names), chosen)
 
 
 def make_tile(

@@ -22,6 +22,7 @@ from ..options import BATCH_LISTS, GOALS, Options
 from .record import Row
 
 LIST_SUFFIXES = (".txt", ".jsonl")
+EXAMPLE = 'give an object such as {"in": "a.npy"}'
 
 
 @dataclass
@@ -60,17 +61,18 @@ class Job:
 
 
 def find_jobs(
-    arguments: Sequence[str], suffix: str, options: Options, names: Names | None = None
+    arguments: Sequence[str], suffix: str, options: Options, names: Names | None, member: str = ""
 ) -> list[Job]:
     """Return the jobs that the arguments name, each once: files, folders, patterns, lists.
 
     ``suffix`` is the mesh file format, such as ".ply"; a list may say otherwise, and have other
-    options. ``names`` are those of labels. OptionError if an argument names no grid, or if two
-    inputs would become one output; FileError if a list, or the only folder, cannot be read.
+    options. ``names`` are those of labels, ``member`` the array to take from files that are not in
+    lists. OptionError if an argument names no grid, or if two inputs would become one output;
+    FileError if a list, or the only folder, cannot be read.
     """
     by_target = dict[str, Job]()
     for argument in arguments:
-        for job in _expand(argument, suffix, options):
+        for job in _expand(argument, suffix, options, member):
             job.options = with_numbers(job.options, names)
             other = by_target.setdefault(os.path.normcase(job.target), job)
             same = os.path.abspath(other.source) == os.path.abspath(job.source)
@@ -81,7 +83,7 @@ def find_jobs(
     return list(by_target.values())
 
 
-def _expand(argument: str, suffix: str, options: Options) -> list[Job]:
+def _expand(argument: str, suffix: str, options: Options, member: str) -> list[Job]:
     """Return the jobs that one argument stands for, with those of folders that cannot be read."""
     path, kinds, paths = Path(argument), ", ".join(GRID_SUFFIXES), list[Path]()
     unread = list[OSError]()
@@ -105,11 +107,12 @@ def _expand(argument: str, suffix: str, options: Options) -> list[Job]:
     else:
         said = f"{argument} is neither a grid ({kinds}) nor a list ({', '.join(LIST_SUFFIXES)})"
         if not argument or not os.path.lexists(path):
-            give = "give grids, folders, patterns or a list"
-            said = f"{argument or repr(argument)} does not exist: {give}"
+            said = f"{argument or repr(argument)} does not exist: give grids, folders or lists"
         raise OptionError(said)
     # Anything with a grid's suffix counts, but slices. What is no regular file fails and is named.
     grids = sorted({p for p in paths if is_grid(p) and (is_store(p) or not p.is_dir())})
+    if member:
+        grids = [p if split_member(p)[1] else Path(f"{p}:{member}") for p in grids]
     if not grids:
         if unread:
             raise FileError(f"{unread[-1].filename} {reason_of(unread[-1])}")
@@ -138,11 +141,14 @@ def _read_list(path: Path, suffix: str, options: Options) -> Iterator[Job]:
         try:
             entry = {"in": line} if is_text else json.loads(line)
             if not isinstance(entry, dict):
-                raise OptionError(f'{seen(entry)}: give an object, {{"in": "a.npy"}}')
+                raise OptionError(f"it is {seen(entry)}: {EXAMPLE}")
             yield _job_of(entry, path.parent, suffix, options)
-        except (ValueError, RecursionError) as error:
-            kind = "" if isinstance(error, OptionError) else "no JSON: "
-            raise OptionError(f"{path}, line {number}: {kind}{error}") from None
+        except (OptionError, json.JSONDecodeError, RecursionError) as error:
+            said = str(error)
+            if not isinstance(error, OptionError):
+                at = getattr(error, "pos", 0)
+                said = f"no JSON from character {at + 1} on, {seen(line[at:])}: {EXAMPLE}"
+            raise OptionError(f"{path}, line {number}: {said}") from None
 
 
 def _job_of(entry: dict[str, Any], home: Path, suffix: str, options: Options) -> Job:

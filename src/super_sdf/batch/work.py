@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..convert import Conversion, convert
-from ..errors import FileError, GridError, OptionError, SuperSdfError, WriteError, in_a_line
+from ..errors import FileError, GridError, OptionError, WriteError, in_a_line
 from ..files.output import naming
 from ..labels.files import Names, convert_labels
 from ..network.network import load_network
@@ -26,7 +26,6 @@ from .inputs import Job
 from .record import Row, fingerprint
 
 Task = TypeVar("Task")
-MOST_DEATHS = 5  # in a row, without any result between them
 EXIT_SECONDS = 10.0  # that a broken process may take to end
 SPAWN = multiprocessing.get_context("spawn")  # forking harms the threads of onnxruntime
 load_once = lru_cache(maxsize=1)(load_network)
@@ -145,7 +144,7 @@ def work_in_processes(
 
     ``take`` returns the next task, None while there is none. What ``work`` raises is raised here.
     """
-    idle, running, deaths = list[Worker](), dict[Any, tuple[Worker, Task]](), 0
+    idle, running = list[Worker](), dict[Any, tuple[Worker, Task]]()
     try:
         while True:
             while len(running) < count and (task := take()) is not None:
@@ -160,11 +159,8 @@ def work_in_processes(
                 try:
                     result, error = worker.pipe.recv()
                     idle.append(worker)
-                    deaths = 0
                 except (EOFError, OSError):
-                    result, deaths = worker.end(EXIT_SECONDS), deaths + 1
-                    last = f"{deaths} processes in a row ended; the last one {result}"
-                    error = deaths == MOST_DEATHS and SuperSdfError(f"{last}: try --jobs 1")
+                    result, error = worker.end(EXIT_SECONDS), None
                 if error:
                     raise error
                 yield task, result

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Any
 
 from click import Argument, Choice, Option
 
-from ..errors import check_modules
 from ..options import MESH_FORMATS, OPTIONS
 from . import main
 
@@ -37,9 +36,11 @@ MOST_FAILURES = 20  # printed; the report has all
 STATES = ("done_before", "failed_before", "refused")  # of inputs that are left alone
 
 TAKES = (
-    Argument(["sources"], metavar="IN...", nargs=-1, required=True),
+    Argument(["sources"], metavar="IN...", nargs=-1, required=True, type=main.NAME),
     Option(["--out", "folder"], metavar="DIR", required=True, type=main.FILE,
         help="Folder for the meshes and report.jsonl; subfolders of IN are kept."),
+    Option(["--grid", "member"], metavar="NAME", default="",
+        help="Take the array of this name in files that hold several, as by FILE:NAME."),
     Option(["--format", "kind"], type=Choice(MESH_FORMATS), default=MESH_FORMATS[0],
         show_default=True, help="Mesh file format."),
     *OPTIONS,
@@ -92,12 +93,11 @@ def planned(folder: Path, given: dict[str, Any]) -> tuple[list[Job], Settings]:
     from ..batch.work import Settings
     from ..labels.files import check_options
 
-    jobs = find_jobs(given["sources"], f".{given['kind']}", options, given["names"])
+    how = f".{given['kind']}", options, given["names"], given["member"]
+    jobs = find_jobs(given["sources"], *how)
     for job in jobs:
         if job.options.labels is not None:
             check_options(job.options, [name for name in ("check", "report") if given[name]])
-        if job.options.goals():  # a list may say so
-            check_modules("simplify", "simplify")
     if page:
         from ..pages import html, items
 

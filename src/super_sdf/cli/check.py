@@ -57,7 +57,7 @@ def command(mesh: Path, grid: Path, **given: Any) -> None:
         main.print_stdout(said)
     elif not given["quiet"]:
         main.print_stdout(*found.lines())
-    main.print_stderr(*(f"Note: {note}" for note in found.grid.notes if not given["quiet"]))
+    main.print_stderr(*(f"Note: {note}" for note in found.grid.flagged if not given["quiet"]))
     main.print_stderr(*(f"Limit exceeded: {sentence}" for sentence in failed))
     if failed:
         sys.exit(1)

@@ -1,9 +1,8 @@
-"""Show versions, devices, networks, and extras with the command that installs those missing.
+"""Show versions, devices, networks and extras, and the command that installs missing extras.
 
 With --check, each network also refines a ball on the CPU and on CUDA. With GRID, show instead what
 that grid file states: shape, type, spacing and origin.
 
-  super-sdf info --check
   super-sdf info --check --device cuda
   super-sdf info scan.zarr
 """
@@ -27,7 +26,7 @@ SAID = {float: "{:.10g}", int: "{:,}", type(None): "not stated"}  # how facts ar
 CENTRE, RADIUS = 15.63, 12.0  # of a ball, in voxels; the centre is on no sample
 MOST_OFF, MOST_OFF_OF_MASK = 0.05, 0.6  # voxels; a mask shows the surface to half a voxel
 TAKES = (
-    Argument(["source"], metavar="[GRID]", required=False),
+    Argument(["source"], metavar="[GRID]", required=False, type=main.NAME),
     Option(["--check"], is_flag=True, help="Also run the networks."),
     main.table_option("device", "cpu skips CUDA; cuda makes it a failure if CUDA fails."),
     "json",
@@ -87,10 +86,11 @@ def run_checks(device: Device, check: bool) -> Iterator[tuple[str, str, str]]:
     for name in shipped_models() if check else ():
         for each in devices[:1] if name.endswith("-int8") else devices:
             yield check_network(name, each)
+    absent = [name for name in errors.EXTRAS if errors.to_install(name)]
     for name, modules in errors.EXTRAS.items():
-        lacking = errors.to_install(name)
-        says = f"no {lacking}" if lacking else ", ".join(modules)
-        yield MISSING if lacking else OK, f"extra {name}", says
+        yield MISSING if name in absent else OK, f"extra {name}", ", ".join(modules)
+    if absent:
+        yield MISSING, "to install", f"pip install -e '.[{','.join(absent)}]' in a clone"
 
 
 def check_network(name: str, device: Device) -> tuple[str, str, str]:

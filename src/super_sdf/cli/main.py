@@ -39,7 +39,7 @@ SIGNALS = [getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGHUP") if hasatt
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 HEADINGS = {name: row.group for name, row in OPTIONS.items()} | {"names": VALUES}
 HEADINGS |= dict.fromkeys(("cluster", "jobs", "retry", "dry_run"), WORK)
-FILE = click.Path(path_type=Path)
+FILE, NAME = click.Path(path_type=Path), click.Path(readable=False)  # the second as it is given
 
 Paths = Iterable[str | Path]
 
@@ -51,10 +51,10 @@ class Commands(click.Group):
         """Return the names of the commands, in the order of the help."""
         return list(COMMANDS)
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """Return a command; None if there is none of this name."""
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command:
+        """Return a command; UsageError if there is none of this name."""
         if cmd_name not in COMMANDS:
-            return None
+            ctx.fail(f"{cmd_name!r} is no command: give one of {', '.join(COMMANDS)}")
         module: Any = import_module(f"..{cmd_name}", __name__)
         meshes = ", ".join(f".{name}" for name in MESH_FORMATS)
         text = Template(module.__doc__ or "").substitute(grids=LISTED, several=NAMED, meshes=meshes)
@@ -226,6 +226,8 @@ def _fault(error: BaseException, heard: list[int]) -> tuple[str, int]:
         cause = error.__cause__ or error  # a command may say what it has kept
         kept = cause.args if isinstance(cause, KeyboardInterrupt) else ()
         return f"{said}: {kept[0]}" if kept else said, 128 + heard[0]
+    if isinstance(error, click.NoSuchOption):  # only the most similar: click sorts them by letters
+        del (error.possibilities or [])[1:]
     if isinstance(error, click.ClickException):
         return error.format_message(), error.exit_code
     if isinstance(error, (SuperSdfError, MemoryError)):

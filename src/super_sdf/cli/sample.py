@@ -39,8 +39,7 @@ def command(source: Path, target: Path, **given: Any) -> None:
     check_modules("sample", "eval")
     from ..files.grids import check_grid_target, write_grid
     from ..files.output import check_apart
-    from ..truth.sampling import PADDING, fitted_layout, sample_solid
-    from ..truth.solid import load_solid
+    from ..truth import PADDING, fitted_layout, load_solid, sample_solid
 
     start, count, spacing = time.perf_counter(), given["samples"], given["spacing"]
     check_grid_target(target, force=given["force"])
@@ -56,4 +55,4 @@ def command(source: Path, target: Path, **given: Any) -> None:
     if not given["quiet"]:
         shape, seconds = " x ".join(map(str, grid.shape)), time.perf_counter() - start
         said = f"{target}: {shape} samples, spacing {grid.voxel_size:g}, {seconds:.1f} s"
-        main.print_stderr(*(f"Note: {note}" for note in (*notes, *grid.notes)), said)
+        main.print_stderr(*(f"Note: {note}" for note in (*notes, *grid.flagged)), said)

@@ -3,24 +3,32 @@
 IN is a grid file: $grids. FILE:NAME names one of several arrays in a $several
 file. An .npz file has the keys values, spacing, origin and direction.
 
-OUT is a mesh file: one of $meshes.
+OUT is a mesh file: one of $meshes. A - for IN is an .npy
+file on standard input, a - for OUT a mesh on standard output.
 
   super-sdf upsample part.npz part.ply
   super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
   super-sdf upsample scan.h5:/distance part.ply --spacing 0.5
   super-sdf upsample organs.nii.gz organs.glb --labels all
+  cat field.npy | super-sdf upsample - - --format stl > part.stl
 """
 
 from __future__ import annotations
 
+import os
+import sys
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from typing import Any
 
-from click import Argument, Option
+from click import Argument, Choice, Option
 
 from .. import __version__
-from ..options import OPTIONS, Options
+from ..errors import OptionError, SuperSdfError
+from ..files.meshes import has_parts
+from ..options import MESH_FORMATS, OPTIONS, Options
 from . import main
 
 MANY = 50_000  # triangles of which simplifying is worth a hint
@@ -28,8 +36,10 @@ TILES_PER_THREAD = 2  # of a cluster: one that dies costs little
 NOT_WITH_LABELS = ("save_field", "check", "report", "cluster", "jobs")
 
 TAKES = (
-    Argument(["source"], metavar="IN"),
-    Argument(["target"], metavar="OUT"),
+    Argument(["source"], metavar="IN", type=main.NAME),
+    Argument(["target"], metavar="OUT", type=main.NAME),
+    Option(["--format", "kind"], type=Choice(MESH_FORMATS),
+        help="Mesh file format of an OUT that is -. Default: ply."),
     *OPTIONS,
     "names", "cluster", "jobs", "check",
     Option(["--save-field"], metavar="FIELD",
@@ -42,47 +52,76 @@ TAKES = (
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
     start, options, page = time.perf_counter(), main.chosen_options(given), given["report"]
-    if page:
-        outputs = [name for name in (target, given["save_field"]) if name]
-        main.check_page("--report", page, [source], outputs, force=given["force"])
-    from ..network.network import load_network
+    if target == "-" and given["as_json"]:
+        raise OptionError("--json is for standard output, too: give a file for OUT")
+    if target == "-" and options.labels is not None and not has_parts(f"-.{given['kind']}"):
+        raise OptionError("--labels makes a file for each label: give --format glb or 3mf")
+    with standard_streams(source, target, given["kind"]) as (grid, mesh):
+        if page:
+            outputs = [name for name in (target, given["save_field"]) if name]
+            main.check_page("--report", page, [source], outputs, force=given["force"])
+        from ..network.network import load_network
 
-    network, certificate = load_network(**options.network()), None
-    seconds = {"load network": time.perf_counter() - start}
-    done = converted(source, target, network, options, **given)
-    report = {
-        "input": source,
-        "output": target,
-        "version": __version__,
-        "asked": options.digest(),
-        "model": options.network()["model"],
-        "precision": network.precision,
-        "device": network.device,
-        "device_notes": list(network.notes),
-        **done.facts,
-    }
-    seconds, start = seconds | done.seconds, time.perf_counter()
-    if given["as_json"] or page:
-        from hashlib import sha256  # imported here, as it loads OpenSSL
+        network, certificate = load_network(**options.network()), None
+        seconds = {"load network": time.perf_counter() - start}
+        done = converted(grid, mesh, network, options, **given)
+        report = {
+            "input": source,
+            "output": target,
+            "version": __version__,
+            "asked": options.digest(),
+            "model": options.network()["model"],
+            "precision": network.precision,
+            "device": network.device,
+            "device_notes": list(network.notes),
+            **done.facts,
+        }
+        seconds, start = seconds | done.seconds, time.perf_counter()
+        if given["as_json"] or page:
+            from hashlib import sha256  # imported here, as it loads OpenSSL
 
-        report["network"] = sha256(network.path.read_bytes()).hexdigest()
-    if given["check"]:
-        from ..check import check_mesh, read_for_check
+            report["network"] = sha256(network.path.read_bytes()).hexdigest()
+        if given["check"]:
+            from ..check import check_mesh, read_for_check
 
-        certificate = check_mesh(*read_for_check(target, source, options, done), options)
-        report["check"] = certificate.report()
-        seconds["check"] = time.perf_counter() - start
-    report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
-    if page:
-        from ..pages.html import page_of_conversion, write_page
+            certificate = check_mesh(*read_for_check(mesh, grid, options, done), options)
+            report["check"] = certificate.report()
+            seconds["check"] = time.perf_counter() - start
+        report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
+        if page:
+            from ..pages.html import page_of_conversion, write_page
 
-        text = page_of_conversion({**report, "notes": network.notes}, options, done, certificate)
-        write_page(text, page, force=given["force"])
-    if given["as_json"]:
-        main.print_stdout(report)
-    if not given["quiet"]:
-        checked = [f"Check: {certificate.summary()}"] if certificate else []
-        main.print_stderr(*lines_of(report), *checked, *[f"Report: {page}"] * bool(page))
+            text = page_of_conversion(
+                {**report, "notes": network.notes}, options, done, certificate
+            )
+            write_page(text, page, force=given["force"])
+        if given["as_json"]:
+            main.print_stdout(report)
+        if not given["quiet"]:
+            checked = [f"Check: {certificate.summary()}"] if certificate else []
+            main.print_stderr(*lines_of(report), *checked, *[f"Report: {page}"] * bool(page))
+
+
+@contextmanager
+def standard_streams(source: str, target: str, kind: str | None) -> Iterator[tuple[str, str]]:
+    """Yield the files IN and OUT; for - those in a temporary folder, named so in messages."""
+    if kind and target != "-":
+        raise OptionError(f"--format {kind} is for an OUT that is -: leave it out for {target}")
+    if "-" not in (source, target):
+        yield source, target
+        return
+    from tempfile import TemporaryDirectory  # imported here, as few need it
+
+    with TemporaryDirectory() as folder:
+        grid, mesh = Path(folder, "stdin.npy"), Path(folder, f"stdout.{kind or MESH_FORMATS[0]}")
+        if source == "-":
+            grid.write_bytes(sys.stdin.buffer.read())
+        try:
+            yield str(grid) if source == "-" else source, str(mesh) if target == "-" else target
+        except SuperSdfError as error:
+            raise type(error)(error.flagged.replace(folder + os.sep, "")) from None
+        if target == "-":
+            sys.stdout.buffer.write(mesh.read_bytes())
 
 
 def converted(source: str, target: str, network: Any, options: Options, **given: Any) -> Any:
@@ -130,8 +169,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         shape = " x ".join(map(str, field["shape"]))
         lines.append(f"{field['path']}: the refined field, lattice {shape}")
     if few:
-        off = few["deviation"]
-        line = f"Simplified: from {few['triangles_before']:,} to {triangles:,} triangles; largest "
-        line += f"distance {off['largest']:.4f} voxels from the unsimplified mesh to this one, "
-        lines.append(f"{line}{off['largest_back']:.4f} back")
+        off = max(few["deviation"][way] for way in ("largest", "largest_back"))
+        said = f"Simplified: from {few['triangles_before']:,} to {triangles:,} triangles; largest "
+        lines.append(f"{said}distance {off:.4f} voxels")
     return lines

@@ -21,7 +21,7 @@ from ..options import OPTIONS
 from . import main
 
 TAKES = (
-    Argument(["sources"], metavar="MESH|GRID...", nargs=-1, required=True),
+    Argument(["sources"], metavar="MESH|GRID...", nargs=-1, required=True, type=main.NAME),
     Option(["--out"], type=main.FILE, metavar="PAGE.html",
         help="File for the page. Default: one in the temporary folder that only you can read."),
     "force",

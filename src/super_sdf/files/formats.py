@@ -1,7 +1,8 @@
 """Grid files by their names: the table of formats, and which files are read for a grid.
 
-A new format is a row of the table, and its reader in ``readers``. Only regular files are read:
-opening a named pipe may wait forever. Some files name others, which must lie beside them.
+A new format is a row of the table, and its reader in ``readers``. Files with other endings may be
+those of another package (docs/guides/formats.md). Only regular files are read: opening a named pipe
+may wait forever. Some files name others, which must lie beside them.
 """
 
 from __future__ import annotations
@@ -9,8 +10,9 @@ from __future__ import annotations
 import os
 import re
 import stat
+from functools import cache
 from pathlib import Path, PurePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ..errors import FileError, OptionError, seen
 from ..options import MESH_FORMATS
@@ -57,6 +59,9 @@ FORMATS = (
 DICOM = FORMATS[-1]._replace(suffixes=("a folder",))
 """A folder that is no Zarr store: the names of slices end in anything."""
 
+PLUGIN = GridFormat("plugin", "", (), "numpy", axes="xyz")
+"""That of another package, but for its ending."""
+
 LISTED = ", ".join(f"{each.name} ({', '.join(each.suffixes)})" for each in (*FORMATS, DICOM))
 NAMED = ", ".join(dict.fromkeys(each.name for each in FORMATS if each.has_members))
 """The formats whose files may hold several arrays, for help texts, as ``LISTED``."""
@@ -71,19 +76,17 @@ def find_format(path: str | Path) -> GridFormat:
     """Return the format of a grid file by its name; raise OptionError if it is none, or a mesh."""
     file, member = split_member(path)
     if ending := _ending(file):
-        format_ = next(format_ for format_ in FORMATS if ending in format_.suffixes)
+        other = PLUGIN._replace(name=ending, suffixes=(ending,))
+        format_ = next((format_ for format_ in FORMATS if ending in format_.suffixes), other)
         if member and member[0] != "[" and not format_.has_members:
             raise OptionError(f"{format_.name} files hold one array: leave out :{member}")
         return format_
     if file.is_dir():
         return DICOM
-    sampled = f"{file.stem}.npz -n 64"
-    if file.suffix.lower() in CAD:
-        way_out = f"export it as {file.stem}.stl, then super-sdf sample {file.stem}.stl {sampled}"
-        raise OptionError(f"{path} is a CAD model: {way_out}")
-    if file.suffix.lower() in SURFACES:
-        way_out = f"sample it first with super-sdf sample {path} {sampled}"
-        raise OptionError(f"{path} is a mesh, not a grid: {way_out}")
+    if (kind := file.suffix.lower()) in (*SURFACES, *CAD):
+        mesh, what = (f"{file.stem}.stl", "CAD model") if kind in CAD else (path, "mesh")
+        first = f"export {mesh}, then " * (kind in CAD) + f"super-sdf sample {mesh} {file.stem}.npz"
+        raise OptionError(f"{path} is a {what}, not a grid: sample it first, {first} -n 64")
     raise OptionError(f"{path} is not a grid file: give one of {', '.join(GRID_SUFFIXES)}")
 
 
@@ -94,9 +97,17 @@ def is_grid(path: str | Path) -> bool:
 
 
 def _ending(path: PurePath) -> str:
-    name = path.name.lower()
+    name, other = path.name.lower(), path.suffix.lower()
     ends = [end for end in GRID_SUFFIXES if name.endswith(end) and len(name) > len(end)]
-    return max(ends, key=len, default="")
+    return max(ends, key=len) if ends else other if plugin("readers", other) else ""
+
+
+@cache
+def plugin(group: str, ending: str) -> Any:
+    """Return the entry point of another package for files with an ending, if there is one."""
+    from importlib.metadata import entry_points  # imported here, as few files need it
+
+    return next(iter(entry_points(group=f"super_sdf.{group}", name=ending[1:].lower())), None)
 
 
 def split_member(path: str | PurePath) -> tuple[Path, str | None]:

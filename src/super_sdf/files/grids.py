@@ -21,7 +21,7 @@ import numpy as np
 from ..errors import FileError, OptionError, OutOfMemoryError, SuperSdfError, check_modules
 from ..grid.samples import check_kind
 from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
-from ..options import OPTIONS, PATH, AxisOrder, Options, Space, Values
+from ..options import OPTIONS, PATH, AxisOrder, FieldKind, Inside, Options, Space, Values
 from .formats import DICOM, check_regular_file, find_format, is_store, split_member
 from .output import check_free, replacing
 from .readers import Names, Request, Volume, axes_direction, find_placement
@@ -38,8 +38,13 @@ def read_grid(
     direction: Any = None,
     axes: AxisOrder | None = None,
     space: Space | None = None,
+    inside: Inside = "auto",
+    field: FieldKind = "auto",
+    label: int | None = None,
+    level: float | None = None,
+    scale: float | None = None,
+    unknown: float | None = None,
     max_memory: int | None = None,
-    **values: Unpack[Values],
 ) -> SdfGrid:
     """Read a grid from a file of any format in docs/guides/formats.md.
 
@@ -58,10 +63,10 @@ def read_grid(
         ``.npz`` and MATLAB, else z, y, x.
     space : {"RAS", "LPS"}, optional
         The anatomical space of the grid's world; for files that state theirs. Default: that one.
-    max_memory : int, optional
-        Bytes that this process may hold in all. Default: a share of the free memory.
     inside, field, label, level, scale, unknown
         What the values are; see ``make_grid``.
+    max_memory : int, optional
+        Bytes that this process may hold in all. Default: a share of the free memory.
 
     Raises
     ------
@@ -69,12 +74,14 @@ def read_grid(
         If the file cannot be read, as its library is missing, say; if there is no room for it; if
         its values are no usable grid; if an option is wrong, or the file states what is given.
     """
+    values: Values = {"inside": inside, "field": field, "label": label, "level": level}
+    values |= {"scale": scale, "unknown": unknown}
     Options(space=space, **values)  # checks them
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arrays = read_array(path, given, axes, space, max_memory)
     notes, space = arrays.pop("notes"), arrays.pop("space")
     grid = make_grid(**arrays, **values)
-    return with_fields(grid, notes=(*notes, *grid.notes), space=space)
+    return with_fields(grid, flagged=(*notes, *grid.flagged), space=space)
 
 
 def read_array(
@@ -116,7 +123,7 @@ def open_volume(
     numbers = tuple(map(int, re.findall(r"\d+", brackets)))
     axes = OPTIONS["axes"].check(axes)
     if format_.axes is None and (axes or direction is not None):
-        what = f"axes is {axes!r}" if axes else "direction is given"
+        what = f"--axes {axes}" if axes else "--direction is given"
         raise OptionError(f"{what}, but {format_.name} files state their axes: leave it out")
     order = axes or format_.axes or "xyz"
     logs = logging.root.manager.disable

@@ -11,7 +11,7 @@ A new format is a name in ``options.MESH_FORMATS`` and a function ``write_NAME``
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,6 +25,7 @@ from ..arrays import FloatArray, unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, PATH, Unit
 from ..surface.mesh import Mesh, check_mesh
+from .formats import plugin
 from .output import check_free, replacing
 
 MESH_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
@@ -34,7 +35,6 @@ STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribut
 PLY_TYPES = {"<f4": "float", "<f8": "double"}
 PLY_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 TEXT_CHUNK = 1 << 14  # rows of text at a time: Python numbers take ten times the memory
-GLB_MOST_BYTES = 2**32 - 2**22  # the length in the header has 32 bits; there are headers, too
 
 Colour: TypeAlias = tuple[int, int, int]
 """Red, green and blue, from 0 to 255."""
@@ -63,11 +63,11 @@ def has_parts(path: str | Path) -> bool:
 
 def check_mesh_suffix(path: Path, unit: str | None = None) -> Path:
     """Return the path of a mesh file; OptionError for another suffix, or if it states no unit."""
-    if path.suffix.lower() not in MESH_SUFFIXES:
+    if path.suffix.lower() not in MESH_SUFFIXES and not plugin("writers", path.suffix):
         raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
     if unit and not has_parts(path):
         stating = " or ".join(SCENES)
-        raise OptionError(f"unit is {unit}: {path} can state none, give {stating}, or no unit")
+        raise OptionError(f"--unit {unit}: {path} can state none, give {stating}, or no unit")
     return path
 
 
@@ -103,8 +103,8 @@ def write_mesh(
     ------
     OptionError, MeshError, FileError
         If the suffix is unknown, or that of a format that states no unit; if the arrays are no
-        mesh; if the file cannot be written, or its format cannot hold the mesh: a coordinate is not
-        finite, or corners of a triangle would coincide.
+        mesh, or a coordinate is not finite; if the file cannot be written, or its format cannot
+        hold the mesh: corners of a triangle would coincide.
     """
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     path = check_free(check_mesh_suffix(PATH.check(path, "path"), world.unit), force=force)
@@ -116,22 +116,19 @@ def write_meshes(
     *,
     force: bool = False,
     world: World | None = None,
-    beside: Iterable[Path] = (),
 ) -> None:
-    """Write files of meshes, by path and name: all of them, or none.
-
-    None is written, either, if a file ``beside`` them, which is to appear next, cannot be.
-    """
+    """Write files of meshes, by path and name: all of them, or none."""
     with ExitStack() as stack:
         for path, parts in files.items():
             for mesh in parts.values():
                 check_mesh(mesh)
-                if not np.isfinite(mesh.vertices).all():
-                    raise FileError(f"{path} cannot be written: a vertex of the mesh is not finite")
             part = stack.enter_context(replacing(path, force=force))
             with part.open("wb") as file:
-                WRITERS[path.suffix.lower()](file, parts, world or World())
-        for path in (*files, *beside):
+                if (ending := path.suffix.lower()) in WRITERS:
+                    WRITERS[ending](file, parts, world or World())
+                else:
+                    plugin("writers", ending).load()(file, *parts.values())
+        for path in files:
             check_free(path, force=force)  # before the first of them appears
 
 
@@ -213,8 +210,6 @@ def write_glb(file: IO[bytes], parts: Parts, world: World) -> None:
     meshes, metres, middle = list(parts.values()), LENGTHS[world.unit or "m"], np.zeros(3)
     if not all(len(mesh.faces) for mesh in meshes):
         raise FileError("a mesh without triangles cannot be .glb: give .ply")
-    if sum(12 * (len(mesh.vertices) + len(mesh.faces)) for mesh in meshes) > GLB_MOST_BYTES:
-        raise FileError("the mesh has more than the 4.29 GB that .glb holds: give .ply")
     if meshes[0].vertices.dtype != np.float32:
         ends = np.array([(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in meshes])
         middle = ends[:, 0].min(0) / 2 + ends[:, 1].max(0) / 2

@@ -1,20 +1,16 @@
 """Output files: checked before the work starts, and either complete or absent afterwards.
 
-Thread 4 of process 123 writes ``.part.ply.123.4.part`` beside ``part.ply``. What a killed process
-left is removed when the same file is written again.
+Thread 4 of process 123 writes ``.part.ply.123.4.part`` beside ``part.ply``.
 """
 
 from __future__ import annotations
 
-import glob
 import os
 import stat
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from threading import get_native_id
-
-import psutil
 
 from ..errors import SuperSdfError, WriteError
 
@@ -78,14 +74,8 @@ def replacing(path: Path, *, force: bool = True) -> Iterator[Path]:
     that exists at the end stays, which is an error.
     """
     target = Path(os.path.realpath(path)) if path.is_symlink() else path
-    start = f".{target.name[-LONGEST:]}."
-    part = target.with_name(f"{start}{os.getpid()}.{get_native_id()}.part")
+    part = target.with_name(f".{target.name[-LONGEST:]}.{os.getpid()}.{get_native_id()}.part")
     with naming(path):
-        for left in target.parent.glob(f"{glob.escape(start)}*.part"):
-            number = left.name[len(start) :].split(".")[0]
-            with suppress(OSError, OverflowError):  # of another user, gone, no number of a process
-                if number.isdigit() and not psutil.pid_exists(int(number)):
-                    left.unlink()
         try:
             yield part
             check_free(path, force=force)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from numbers import Real
@@ -14,7 +15,7 @@ from ..arrays import CORNERS, FloatArray, IntArray, Numbers, Vectors, without_de
 from ..errors import GridError, OptionError, OptionTypeError, seen
 from ..grid.interpret import ORDINARY
 from ..grid.samples import as_triple, check_spacing
-from ..grid.sdf_grid import SdfGrid, check_grid, make_grid
+from ..grid.sdf_grid import SdfGrid, make_grid
 
 BATCH = 1 << 18  # points of a call at most
 MOST_SAMPLES = 1 << 31
@@ -31,11 +32,12 @@ class DistanceFunction:
 
     Parameters
     ----------
-    function : callable
+    function : callable or torch.nn.Module
         Takes world positions, (n, 3) float64, and returns n distances, (n,) or (n, 1): an array, or
-        a tensor of PyTorch or JAX on any device, with or without gradients. Any continuous
-        function that is 0 on the surface will do; it may be positive inside. If it is much steeper
-        near a part of the surface than elsewhere, sample it with an infinite ``reach``.
+        a tensor of PyTorch or JAX on any device, with or without gradients. A module is given a
+        tensor of the type and on the device of its parameters, and makes no gradients. Any
+        continuous function that is 0 on the surface will do; it may be positive inside. If it is
+        much steeper near a part of the surface than elsewhere, sample with an infinite ``reach``.
 
     Attributes
     ----------
@@ -51,6 +53,9 @@ class DistanceFunction:
     def __init__(self, function: Callable[[Vectors], Any]) -> None:
         if not callable(function):
             raise OptionTypeError(f"function is {seen(function)}: give a function of points (n, 3)")
+        torch: Any = sys.modules.get("torch")  # whoever has a module has imported it
+        if torch and isinstance(function, torch.nn.Module):
+            function = of_module(function, torch)
         self.function, self.evaluations = function, 0
 
     def __call__(self, points: Vectors) -> Numbers:
@@ -126,10 +131,10 @@ class DistanceFunction:
             raise GridError("the function has no finite value at any sample: give other bounds")
         least, most = known.min() * scale, known.max() * scale
         if not least < 0 < most:
+            goes = f"goes from {least:.6g} to {most:.6g}" if least < most else f"is {least:.6g}"
             raise GridError(
-                f"the function goes from {least:.6g} to {most:.6g} at {len(known):,} samples, and "
-                "its surface is where it is 0: subtract a level, or give a finer spacing or other "
-                "bounds"
+                f"the function {goes} at all {len(known):,} samples, and its surface is where it "
+                "is 0: subtract a level, or give a finer spacing or other bounds"
             )
         np.clip(samples, -cut, cut, out=samples)
         place: Any = {"spacing": spacing, "origin": low}
@@ -141,19 +146,22 @@ class DistanceFunction:
             raise
 
 
-def sampled(
-    grid: SdfGrid | None,
-    function: Callable[[Vectors], Any] | None,
-    bounds: ArrayLike | None,
-    spacing: ArrayLike | None,
-    offset: float,
-) -> SdfGrid:
-    """Return the grid, or the samples that an offset needs of a function in bounds."""
-    exact = None if function is None else DistanceFunction(function)  # checks it
-    if grid is not None or exact is None:
-        if bounds is not None or spacing is not None:
-            raise OptionError("bounds and spacing are those of a function's samples: give function")
-        return check_grid(grid)
+def of_module(module: Any, torch: Any) -> Callable[[Vectors], Any]:
+    """Return a module of PyTorch as a function of arrays, on its device, without gradients."""
+    like = next(module.parameters(), torch.empty(0))  # float32, on the CPU
+
+    def function(points: Vectors) -> Any:
+        with torch.no_grad():
+            return module(torch.as_tensor(points, dtype=like.dtype, device=like.device))
+
+    return function
+
+
+def sampled(grid: Any, function: Any, bounds: Any, told: dict[str, Any], offset: float) -> SdfGrid:
+    """Return the samples that an offset needs of a function in bounds, at the ``told`` spacing."""
+    if grid is not None or function is None:
+        raise OptionError("bounds are those of a function's samples: give function, and no grid")
+    exact, spacing = DistanceFunction(function), told["spacing"]  # checks it
     if bounds is None or spacing is None:
         raise OptionError("a function needs bounds and spacing, or a grid of its samples")
     reach = REACH * max(check_spacing(spacing)) + abs(offset)

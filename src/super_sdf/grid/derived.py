@@ -9,39 +9,37 @@ point x - d n. The distance of a sample that was cut off is that to the nearest 
 others, and no less than where it was cut off.
 
 Between two samples of an axis that is resampled the values are those of a cubic polynomial
-(Hermite). The gradient has length 1, so the differences across the line bound the slope along it.
-And two distances differ by no more than their points are apart: the samples round a point bound its
-value (McShane, Whitney), unless they contradict each other, as noise does.
+(Hermite), or of a wall between them. Two distances differ by no more than their points are apart:
+the samples round a point bound its value (McShane, Whitney), unless they contradict each other.
 """
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import BoolArray, FloatArray, Triple
+from ..arrays import BoolArray, FloatArray, Triple, dot
 from .look import Extremes, Floats
-from .samples import MadePlanes, SampleArray, SamplePlanes, in_spacings, over_three
+from .samples import MadePlanes, SampleArray, SamplePlanes, over_three
 
 REACH = 4  # voxels; patches are clipped to 3 (``refine.band.PATCH_LIMIT``), half of one goes off
 
-FEET_REACH = 3  # samples from one up to which others are filled in with the help of its foot
-NO_FOOT = 2.6  # voxels: the distance of a sample without a foot point near it
+NO_FOOT = 2.6  # largest spacings: the distance of a sample without a foot point near it
+FEET_REACH = 5  # largest spacings from a sample to others that its foot point fills in
+DISC = 0.2  # finest spacings, the radius of the surface at a foot point
 LEAST_SLOPE = 0.3  # of a sample whose foot point is used
-DISC = 0.2  # voxels
 WITHIN = 1 - 1e-5  # share of the limit up to which a value is not cut off
 
 NEAR = 3.5  # new spacings from the surface, up to which values are kept within their bounds
 ACROSS = 4  # samples across the line, from which on they do not bound a value
 OFFSETS = [(j, k) for j, k in product(range(-ACROSS, ACROSS + 1), repeat=2) if j * j + k * k <= 16]
-MARGIN = 2.0  # the slope is as near to the mean of the differences along the line as they are
 STEEP_WALL = 0.25  # the least slope with which a field falls towards a wall and rises behind it
 EXTRA = 2  # samples beyond a cell, on either side, that its slopes depend on
 ON_SAMPLE = 1e-3  # spacings from a sample, up to which a new sample takes its value
-MOST = 1e12  # spacings: larger values are cut off, so that squares do not overflow
 PLACES = 32  # between samples that are worked on at a time
 
 
@@ -86,68 +84,35 @@ def without_inner_faces(values: SampleArray, inside: int, h: float) -> MadePlane
 
 def filled_planes(values: SampleArray, spacing: Triple, limits: Extremes) -> MadePlanes:
     """Return truncated distances, cut off at ``limits``, with those that are missing filled in."""
-    h = min(spacing)
-    low, high = (limit / h for limit in limits)
-    steps = np.array(spacing) / h
-    return MadePlanes(
-        values,
-        lambda planes: fill_in(in_spacings(planes, h), low, high, steps).astype(float) * h,
-        beside=2 * (int(FEET_REACH * steps.max() / steps.min()) + 1),  # once for each round
-    )
+    beside = int(FEET_REACH * max(spacing) / min(spacing)) + 1
+    return MadePlanes(values, partial(fill_in, spacing=spacing, limits=limits), beside)
 
 
-def fill_in(values: FloatArray, low: float, high: float, steps: Floats) -> FloatArray:
-    """Return distances in units of the finest spacing, (nx, ny, nz), filled in where cut off.
+def fill_in(values: NDArray[Any], spacing: Triple, limits: Extremes) -> Floats:
+    """Return distances, (nx, ny, nz), filled in where they are cut off.
 
-    The second round has better gradients: central differences to what the first one filled in.
     At a foot point the surface is taken as a disc: it goes on between them.
     """
     from scipy.spatial import cKDTree
 
-    cut = (values <= low * WITHIN) | (values >= high * WITHIN)
-    known, missing = (np.argwhere(x) * steps for x in (~cut, cut))
-    distances, signed, far = values[~cut], values[cut], NO_FOOT * float(steps.max())
-    least = np.where(signed > 0, high, -low)
-    for hidden in (cut, np.zeros_like(cut)):
-        gradient = _gradient(values, steps, hidden)[~cut]
-        slope = np.sqrt((gradient**2).sum(1))
-        steep = slope > LEAST_SLOPE
-        normal = gradient[steep] / slope[steep, None]
-        feet = known[steep] - distances[steep, None] * normal
-        found = np.full(len(missing), far)
-        if len(feet):
-            apart, which = cKDTree(feet).query(missing, distance_upper_bound=far)
-            near = np.flatnonzero(np.isfinite(apart))
-            height = ((missing[near] - feet[which[near]]) * normal[which[near]]).sum(1)
-            aside = np.sqrt(np.maximum(apart[near] ** 2 - height**2, 0))
-            found[near] = np.hypot(height, np.maximum(aside - DISC, 0))
-        values = values.copy()
-        values[cut] = np.copysign(np.maximum(found, least), signed)
-    return values
-
-
-def _gradient(values: FloatArray, steps: Floats, hidden: BoolArray) -> Floats:
-    """Return central differences, (nx, ny, nz, 3); one-sided ones beside ``hidden`` samples.
-
-    Amid two hidden ones, the larger difference is a lower bound.
-    """
-    gradient = np.empty((*values.shape, 3))
-    for axis, step in enumerate(steps):
-        (behind, ahead), numbers = _slopes_beside(values, axis, 1.0), np.arange(values.shape[axis])
-        no_behind = hidden.take(np.abs(numbers - 1), axis)
-        no_ahead = np.flip(np.flip(hidden, axis).take(np.abs(numbers - 1), axis), axis)
-        larger = np.where(np.abs(ahead) > np.abs(behind), ahead, behind)
-        one = np.where(no_ahead, np.where(no_behind, larger, behind), ahead)
-        rise = np.where(no_ahead | no_behind, one, (ahead + behind) / 2)
-        gradient[..., axis] = rise / step
-    return gradient
-
-
-def _slopes_beside(values: NDArray[Any], axis: int, step: float) -> tuple[Floats, Floats]:
-    """Return the slopes along an axis before and after each sample; at an end they are equal."""
-    slopes = np.diff(values, axis=axis) / step
-    first, last = slopes.take([0], axis), slopes.take([-1], axis)
-    return np.concatenate([first, slopes], axis), np.concatenate([slopes, last], axis)
+    filled, (low, high), far = values.astype(np.float64), limits, NO_FOOT * max(spacing)
+    cut = (filled <= low * WITHIN) | (filled >= high * WITHIN)
+    rises: Any = np.gradient(filled, *spacing)
+    gradient = np.stack(rises, -1)[~cut]
+    slope = np.linalg.norm(gradient, axis=1)
+    steep = slope > LEAST_SLOPE
+    normal = gradient[steep] / slope[steep, None]
+    feet = (np.argwhere(~cut) * spacing)[steep] - filled[~cut][steep, None] * normal
+    missing = np.argwhere(cut) * spacing
+    apart, nearest = cKDTree(feet).query(missing, distance_upper_bound=far)
+    near = np.isfinite(apart)
+    height = dot(missing[near] - feet[nearest[near]], normal[nearest[near]])
+    aside = np.sqrt(np.maximum(apart[near] ** 2 - height**2, 0))
+    apart[near] = np.hypot(height, np.maximum(aside - DISC * min(spacing), 0))
+    apart = np.float32(apart / far).astype(np.float64) * far  # alike in whatever parts are read
+    least = np.where(filled[cut] > 0, high, -low)
+    filled[cut] = np.copysign(np.clip(apart, least, far), filled[cut])
+    return filled
 
 
 # Finer planes along an axis
@@ -157,7 +122,7 @@ class Resampled(SamplePlanes):
     """Samples interpolated along one axis, from the first on, alike in whatever parts are read.
 
     ``level`` is the value at which the surface will be meshed. The new samples, at ``step``, lie at
-    ``places``, in old spacings; those ``on_sample`` are old ones.
+    ``places``, in old spacings.
     """
 
     dtype = np.dtype(np.float64)
@@ -175,7 +140,6 @@ class Resampled(SamplePlanes):
         nearest = np.rint(places)
         places = np.where(np.abs(places - nearest) <= ON_SAMPLE, nearest, places)
         self.places: Floats = np.minimum(places, count - 1)
-        self.on_sample: BoolArray = np.rint(self.places) == self.places
         shape = list(source.shape)
         shape[axis] = len(self.places)
         self.shape = tuple(shape)
@@ -189,67 +153,38 @@ class Resampled(SamplePlanes):
             low, high = int(places[first]) - EXTRA, int(places[last - 1]) + 2 + EXTRA
             low = max(low, 0)
             places = places[first:last] - low
-        block = np.asarray(self.source[low:high], np.float64)
-        block = np.clip(block, self.level - MOST * self.h, self.level + MOST * self.h)
-        lines = np.ascontiguousarray(np.moveaxis(block, self.axis, 0))
-        values = np.moveaxis(self._along(lines, places), 0, self.axis)
+        lines = np.moveaxis(np.asarray(self.source[low:high], np.float64), self.axis, 0)
+        values = np.moveaxis(self._along(np.ascontiguousarray(lines), places), 0, self.axis)
         return values if self.axis == 0 else values[first - low : last - low]
 
     def _along(self, lines: Floats, places: Floats) -> Floats:
         """Return the values at places, (m, p, q), along lines of samples, (n, p, q)."""
         wide = np.pad(lines, ((0, 0), *((ACROSS, ACROSS),) * 2), constant_values=np.nan)
-        values, beside = np.empty((len(places), *lines.shape[1:])), _slopes_beside(lines, 0, 1.0)
-        rises = self._rises(lines, *beside)
+        longer = np.pad(lines, ((2, 2), (0, 0), (0, 0)), "reflect", reflect_type="odd")
+        steps = np.diff(longer, axis=0)  # of sample n: n + 1 before it, n + 2 after it
+        rises = (7 * (steps[1:-2] + steps[2:-1]) - steps[:-3] - steps[3:]) / 12  # of fourth order
+        values = np.empty((len(places), *lines.shape[1:]))
         for start in range(0, len(places), PLACES):
             some = slice(start, start + PLACES)
             cells = np.minimum(places[some].astype(int), len(lines) - 2)
             share = (places[some] - cells)[:, None, None]
             rest, low, high = 1 - share, lines[cells], lines[cells + 1]
-            smooth = low * ((1 + 2 * share) * rest**2) + high * ((1 + 2 * rest) * share**2)
-            smooth = smooth + (rises[cells] * rest - rises[cells + 1] * share) * (share * rest)
-            slopes = -beside[0][cells], beside[1][cells + 1]
-            smooth = self._with_walls(smooth, (low, high), slopes, share)
-            reach, off = NEAR * self.step, (np.abs(x - self.level) for x in (low, high))
-            near = [x < reach + s * self.h for x, s in zip(off, (share, rest))]
-            which = np.nonzero(near[0] & near[1] & (share > 0) & (share < 1))
+            found = low * ((1 + 2 * share) * rest**2) + high * ((1 + 2 * rest) * share**2)
+            found += (rises[cells] * rest - rises[cells + 1] * share) * (share * rest)
+            # walls thinner than the spacing: the straight lines from both sides meet beyond 0
+            side = np.sign(low - self.level)
+            low, high = ((x - self.level) * side for x in (low, high))
+            falling, rising = -steps[cells + 1] * side, steps[cells + 3] * side
+            is_wall = (high > 0) & (np.minimum(falling, rising) > STEEP_WALL * self.h)
+            is_wall &= low * rising + high * falling <= falling * rising
+            wall = np.maximum(low - falling * share, high - rising * rest) * side + self.level
+            found = np.where(is_wall, wall, found)
+            near = np.abs(found - self.level) < NEAR * self.step
+            which = np.nonzero(near & (share > 0) & (share < 1))
             at = cells[which[0]], *which[1:]
-            smooth[which] = self._bounded(smooth[which], wide, at, share[which[0], 0, 0])
-            values[some] = smooth
+            found[which] = self._bounded(found[which], wide, at, share[which[0], 0, 0])
+            values[some] = found
         return values
-
-    def _rises(self, lines: Floats, behind: Floats, ahead: Floats) -> Floats:
-        """Return the slopes along the lines at samples, (n, p, q), as distances allow them.
-
-        They are per spacing, as the differences to the samples ``behind`` and ``ahead`` are.
-        """
-        least, most = np.zeros((2, *lines.shape))  # squared slopes across the lines
-        for axis, step in enumerate(self.across, 1):
-            before, after = _slopes_beside(lines, axis, step)
-            mean, half = np.abs(before + after) / 2, np.abs(before - after) / 2
-            least += np.maximum(mean - half, 0) ** 2
-            most += (mean + half) ** 2
-        low, high = (self.h * np.sqrt(np.maximum(1 - x, 0)) for x in (most, least))
-        beyond = np.concatenate([behind[:1], behind[:-1]]) + np.concatenate([ahead[1:], ahead[-1:]])
-        rise = (7 * (behind + ahead) - beyond) / 12  # of fourth order
-        rise = np.sign(rise) * np.clip(np.abs(rise), low, high)
-        mean, half = (ahead + behind) / 2, MARGIN / 2 * np.abs(ahead - behind)
-        return np.asarray(np.clip(rise, mean - half, mean + half))
-
-    def _with_walls(
-        self, smooth: Floats, ends: tuple[Floats, ...], beyond: tuple[Floats, ...], share: Floats
-    ) -> Floats:
-        """Return values between samples, with walls that are thinner than the spacing.
-
-        There is a wall if the field falls towards the surface, rises behind it, and the straight
-        lines from both sides meet beyond it.
-        """
-        side = np.sign(ends[0] - self.level)
-        low, high = ((x - self.level) * side for x in ends)
-        falling, rising = (np.minimum(x * side, self.h) for x in beyond)
-        is_wall = (high > 0) & (np.minimum(falling, rising) > STEEP_WALL * self.h)
-        is_wall &= low * rising + high * falling <= falling * rising
-        wall = np.maximum(low - falling * share, high - rising * (1 - share))
-        return np.where(is_wall, wall * side + self.level, smooth)
 
     def _bounded(
         self, values: Floats, around: Floats, at: tuple[NDArray[np.intp], ...], share: Floats

@@ -269,7 +269,8 @@ def _distances(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answe
     """Return distances, or why they are none to a surface in the grid; None if they are none."""
     facts["digit"] = last_digit(look)
     unit = _find_unit(np.where(np.isin(look.lines, look.cut), np.nan, look.lines), given, facts)
-    if unit is None or facts["slopes"] < SLOPES:
+    ends_at_0 = look.is_one_sided and (look.low if look.low >= 0 else look.high) in look.cut
+    if unit is None or facts["slopes"] < SLOPES or ends_at_0:
         return None
     steps = unit * (np.ones(3) if given is None else given)
     facts["contradictions"] = _contradictions(look, steps, facts["digit"])
@@ -349,8 +350,6 @@ def _of_one_sign(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
     Along a line of samples the field falls towards a wall and rises behind it. What the distances
     on either side leave of the way between two samples is how thick it is.
     """
-    if (look.low if look.low >= 0 else look.high) in look.cut:
-        return Answer("density", "", facts)
     thickness = list[NDArray[Any]]()
     for axis in range(3):
         lines = np.abs(np.moveaxis(look.part, axis, 0)) / steps[axis]

@@ -191,8 +191,11 @@ def over_three(values: NDArray[Any], choose: np.ufunc) -> NDArray[Any]:
 
 def as_samples(values: Any) -> SampleArray:
     """Return samples along three axes as an array; those that are read by slices are not loaded."""
+    while getattr(values, "ndim", 0) > len(AXES) and values.shape[0] == 1:  # a batch, a channel
+        values = values[0]
     samples: Any = values
     if hasattr(values, "chunks") and isinstance(getattr(values, "dtype", None), np.dtype):
+        check_kind(values.dtype, values.shape)
         samples = MadePlanes(values, dtype=values.dtype)  # of h5py, Zarr or Dask
     elif not isinstance(values, SamplePlanes):
         try:
@@ -211,10 +214,9 @@ def check_kind(dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
     """Raise GridError if an array of this type and shape cannot be a grid."""
     if dtype.kind not in "fiub":
         raise GridError(f"values have dtype {dtype}: give floating-point or integer numbers")
-    if len(shape) != 3:
-        raise GridError(f"values have shape {shape}: give three axes (x, y, z)")
-    if min(shape) < 2:
-        raise GridError(f"values have shape {shape}: give at least 2 samples on each axis")
+    if len(shape) != 3 or not all(count >= 2 for count in shape):  # nor NaN, of Dask
+        how = "give three axes (x, y, z), with at least 2 samples on each"
+        raise GridError(f"values have shape {shape}: {how}")
 
 
 # Where samples lie
@@ -245,17 +247,14 @@ def as_triple(number: ArrayLike, name: str) -> Triple:
 
 def check_spacing(spacing: ArrayLike) -> Triple:
     """Return the spacing as three floats; GridError unless they are positive and within range."""
-    triple, fault = as_triple(spacing, "spacing"), ""
-    if min(triple) <= 0:
-        fault = "it must be greater than 0"
-    elif not LEAST_SPACING <= min(triple) <= max(triple) <= MOST_SPACING:
-        between = f"between {LEAST_SPACING:g} and {MOST_SPACING:g}"
-        fault = f"give lengths in a unit in which it is {between}"
-    elif max(triple) > min(triple) * MOST_UNEQUAL:
-        most = f"the largest may be {MOST_UNEQUAL:g} times the smallest"
-        fault = f"{most}; leave out samples along the finer axes"
-    if fault:
-        raise GridError(f"spacing is {', '.join(f'{number:g}' for number in triple)}: {fault}")
+    triple = as_triple(spacing, "spacing")
+    least, most = min(triple), max(triple)
+    if not (LEAST_SPACING <= least <= most <= MOST_SPACING and most <= least * MOST_UNEQUAL):
+        raise GridError(
+            f"spacing is {', '.join(f'{number:g}' for number in triple)}: give lengths from "
+            f"{LEAST_SPACING:g} to {MOST_SPACING:g}, the largest at most {MOST_UNEQUAL:g} times "
+            "the smallest"
+        )
     return triple
 
 
@@ -275,19 +274,12 @@ def check_direction(direction: ArrayLike | None) -> Direction:
         return STRAIGHT
     what = "nine numbers, row by row, or a 3 x 3 matrix"
     matrix = as_numbers(direction, "direction", what, (9,)).reshape(3, 3)
-    lengths = np.sqrt((matrix**2).sum(0))
-    fault = f"its columns have the lengths {', '.join(f'{x:.4g}' for x in lengths)}, not 1"
-    if np.abs(lengths - 1).max() <= SKEW:
-        fault = "its columns lie in a plane" if abs(np.linalg.det(matrix)) < FLAT else ""
-    if fault:
-        raise GridError(f"direction is {in_rows(matrix)}: {fault}; give a unit vector of each axis")
-    return STRAIGHT if np.abs(matrix - np.eye(3)).max() <= DIGITS else as_direction(matrix)
-
-
-def as_direction(matrix: Any) -> Direction:
-    """Return a 3 x 3 matrix row by row, as floats."""
-    (a, b, c), (d, e, f), (g, h, i) = np.asarray(matrix, np.float64).tolist()
-    return (a, b, c), (d, e, f), (g, h, i)
+    off = np.abs(np.linalg.norm(matrix, axis=0) - 1).max()
+    if off > SKEW or abs(np.linalg.det(matrix)) < FLAT:
+        how = "give a unit vector of each axis, as columns that lie in no plane"
+        raise GridError(f"direction is {in_rows(matrix)}: {how}")
+    x, y, z = (as_triple(row, "direction") for row in matrix)
+    return STRAIGHT if np.abs(matrix - np.eye(3)).max() <= DIGITS else (x, y, z)
 
 
 def in_rows(matrix: Any) -> str:
@@ -304,50 +296,35 @@ def placed(
     any order, besides some of length 1.
     """
     xarray: Any = sys.modules.get("xarray")
-    if xarray is None or not isinstance(values, (xarray.DataArray, xarray.Dataset)):
+    if xarray is None or not isinstance(values, xarray.DataArray):
         return as_samples(values), spacing, origin
-    if isinstance(values, xarray.Dataset):
-        names = ", ".join(map(str, values.data_vars)) or "none"
-        raise GridError(f"values are a Dataset: give one of its arrays ({names})")
     array: Any = values.squeeze(drop=True) if values.ndim > len(AXES) else values
     check_kind(array.dtype, array.shape)
     wanted = UNNAMED if set(array.dims) == set(UNNAMED) else AXES
-    if set(array.dims) != set(wanted):
-        named = ", ".join(map(repr, array.dims))
-        how = "name those of the axes 'x', 'y' and 'z', with array.rename(...)"
-        raise GridError(f"dimensions are {named}: {how}")
+    found = [name for name in array.dims if name in array.coords]
+    if set(array.dims) != set(wanted) or len(found) not in (0, len(AXES)):
+        named, known = (", ".join(map(repr, names)) or "none" for names in (array.dims, found))
+        how = "name them 'x', 'y' and 'z' (array.rename), with coordinates of all or none"
+        raise GridError(f"dimensions are {named}, with coordinates of {known}: {how}")
     if array.chunks is not None:
         check_fits(array.nbytes, "the array of Dask, whole,", "save it as .npy and give its path")
-    samples: Any = np.asanyarray(array.transpose(*wanted).values)
-    found = [x for x in wanted if x in array.coords and array.coords[x].dims == (x,)]
-    if len(found) not in (0, len(AXES)):
-        how = "give those of all axes, or of none (array.drop_vars(...))"
-        raise GridError(f"only {', '.join(map(repr, found))} has coordinates: {how}")
-    steps, lowest = list[float](), list[float]()
-    for axis, name in enumerate(found):
-        first, step = even_steps(name, array.coords[name].values)
-        lowest.append(first + min(step, 0) * (samples.shape[axis] - 1))
-        steps.append(abs(step))
-        samples = np.flip(samples, axis) if step < 0 else samples
-    spacing = steps or None if spacing is None else spacing
-    return as_samples(samples), spacing, lowest or None if origin is None else origin
+    array = array.transpose(*wanted).sortby(found)  # falling coordinates rise then
+    if found:
+        first, step = zip(*(even_steps(x, array.coords[x].values) for x in wanted))
+        spacing, origin = (x if x is not None else y for x, y in ((spacing, step), (origin, first)))
+    return as_samples(array.values), spacing, origin
 
 
 def even_steps(name: str, coordinates: NDArray[Any]) -> tuple[float, float]:
     """Return the first of some coordinates, and the step; GridError unless they are even."""
-    said = f"coordinates of {name!r}"
-    if coordinates.dtype.kind not in "fiu":
-        how = "give numbers, in the unit of the distances"
-        raise GridError(f"{said} have dtype {coordinates.dtype}: {how}")
-    places = coordinates.astype(np.float64)
-    first, steps = float(places[0]), np.diff(places)
-    step = float(places[-1] - first) / len(steps)
-    off = np.abs(places - (first + step * np.arange(len(places)))).max()
-    if step == 0 or not off <= EVEN * abs(step) + np.spacing(np.abs(coordinates).max()):
-        usual = float(np.nanmedian(steps))
-        worst = int(np.nan_to_num(np.abs(steps - usual), nan=np.inf).argmax())
-        pair = f"{places[worst]:.6g} is followed by {places[worst + 1]:.6g}"
-        pair = f"{pair}, a step of {steps[worst]:.6g} among steps of {usual:.6g}"
-        how = f"resample the array (array.interp({name}=...))"
-        raise GridError(f"{said} are not evenly spaced: {pair}; {how}")
+    said, count = f"coordinates of {name!r}", len(coordinates)
+    places = as_numbers(coordinates, said, "numbers, in the unit of the distances", (count,))
+    first, step = float(places[0]), float(places[-1] - places[0]) / (count - 1)
+    off = np.abs(places - (first + step * np.arange(count))).max()
+    if step == 0 or off > EVEN * abs(step) + np.spacing(np.abs(coordinates).max()):
+        steps = np.diff(places)
+        raise GridError(
+            f"{said} are not evenly spaced, but in steps of {steps.min():.6g} to "
+            f"{steps.max():.6g}: resample the array (array.interp({name}=...))"
+        )
     return first, step

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass, replace
+from os import PathLike
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arrays import NEIGHBOURHOOD, BoolArray, IntArray, Triple
-from ..errors import GridError, OptionTypeError, seen
+from ..arrays import Triple
+from ..errors import GridError, OptionError, OptionTypeError, in_python, seen
 from ..options import FieldKind, Inside, Options
+<<<<<<< HEAD
 from .interpret import NONE_EXACT, Field, check_size, interpret
 from .look import Extremes, Look, border_share, look_at, typical_slope
+=======
+from .interpret import NONE_EXACT, Field, interpret
+from .look import Extremes
+>>>>>>> 2eaf22b10c23cc2d3dd0574ee506762e4550ed61
 from .samples import (
     AXES,
     EQUAL_SPACING,
@@ -33,31 +39,12 @@ from .samples import (
     steps_of,
 )
 
-NO_MASK = "a mask holds no distances; make a grid of it with make_grid or read_grid"
-MOST_RISE = 1.25  # spacings by which distances change from sample to sample; at most 1
-
 
 @dataclass(frozen=True, eq=False, init=False, repr=False)
 class SdfGrid:
     """Signed distances at the points ``world = origin + direction @ (spacing * (i, j, k))``.
 
-    The constructor expects values that are negative inside and a known spacing, and refuses values
-    that contradict either. ``make_grid`` infers the sign, and the spacing if it is not given.
-
-    Parameters
-    ----------
-    values : (nx, ny, nz) array_like
-        Signed distances in world units, negative inside; i runs along x, j along y, k along z
-        unless there is a direction. A memory-mapped array or ``SamplePlanes`` are not loaded.
-        Of a ``DataArray`` of xarray, the dimensions are x, y and z, in any order.
-    spacing : float or three floats
-        World distance between neighbouring samples, along each axis of the array.
-    origin : float or three floats, optional
-        World position of sample (0, 0, 0). Default: 0, 0, 0, or the lowest coordinates of a
-        ``DataArray``.
-    direction : (3, 3) array_like or nine numbers, optional
-        The columns are the world directions of the array's axes: unit vectors, mirrored or not, of
-        distances at right angles. Default: i runs along x, j along y, k along z.
+    ``SdfGrid(values, spacing, origin, direction)`` is ``make_grid`` with these, all else inferred.
 
     Attributes
     ----------
@@ -66,33 +53,22 @@ class SdfGrid:
         and stay in memory; ``planes`` reads some of them without that.
     low, high : float
         The smallest and the largest sample, negative inside.
-    notes : tuple of str
-        Sentences that say what was inferred rather than given.
     field : Field
         What the values are, and which of them can be exact.
     space : str or None
         The anatomical space of the world, "RAS" or "LPS", if a file states one.
-
-    Raises
-    ------
-    GridError
-        If the array is no finite grid of at least 2 samples along each of three axes; if most of
-        its border is negative; if the spacing is not positive, the direction no unit vectors, or
-        the values change by more than the spacing.
     """
 
     samples: SampleArray
     spacing: Triple
     origin: Triple
     direction: Direction
-    notes: tuple[str, ...]
+    flagged: tuple[str, ...]  # notes, with the flags of the command line
     low: float
     high: float
     field: Field
     space: str | None = None
-    on_sample: tuple[BoolArray, ...] | None = (
-        None  # of each axis, if resampled: which planes are samples
-    )
+    is_resampled: bool = False  # values between samples are interpolated
 
     def __init__(
         self,
@@ -101,6 +77,7 @@ class SdfGrid:
         origin: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
+<<<<<<< HEAD
         samples, _, origin = placed(values, spacing, origin)
         h, look = max(check_spacing(spacing)), _look_at_finite(samples)
         if look.is_two and min(look.shape) > 2:
@@ -118,6 +95,9 @@ class SdfGrid:
             raise GridError(f"{said}: give distances in its unit, or use make_grid")
         extremes = look.low, look.high
         grid = self.trusted(samples, spacing, origin, extremes=extremes, direction=direction)
+=======
+        grid = make_grid(values, spacing=spacing, origin=origin, direction=direction)
+>>>>>>> 2eaf22b10c23cc2d3dd0574ee506762e4550ed61
         vars(self).update(vars(grid))
 
     @classmethod
@@ -143,27 +123,17 @@ class SdfGrid:
         if is_sheared and are_distances and not field.own_lattice:
             raise GridError(
                 f"direction is {in_rows(axes)}: its axes are not at right angles, and there "
-                "distances are not refined; resample the grid, or mesh the spline of the "
-                "values (--field smooth)"
+                "distances are not refined; mesh the spline of the values (--field smooth)"
             )
         if (is_sheared or not is_cubic(steps)) and not are_distances:
             field = replace(field, own_lattice=True, exact=NONE_EXACT)
         if extremes is None:
-            look = _look_at_finite(samples)
-            extremes = look.low, look.high
-        low, high = extremes
-        grid = object.__new__(cls)
-        vars(grid).update(
-            samples=samples,
-            spacing=steps,
-            origin=as_triple(0.0 if origin is None else origin, "origin"),
-            direction=axes,
-            notes=notes,
-            low=low,
-            high=high,
-            field=field,
-        )
-        return grid
+            each = [(plane.min(), plane.max()) for plane in samples]
+            extremes = float(np.min(each)), float(np.max(each))
+        first = as_triple(0.0 if origin is None else origin, "origin")
+        place = {"spacing": steps, "origin": first, "direction": axes, "flagged": notes}
+        values = {"samples": samples, "low": extremes[0], "high": extremes[1], "field": field}
+        return with_fields(object.__new__(cls), **place, **values)
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.shape))
@@ -173,6 +143,11 @@ class SdfGrid:
             f"SdfGrid({shape} {self.samples.dtype}, spacing {spacing}, origin {origin}{turned}, "
             f"values {self.low:.6g} to {self.high:.6g})"
         )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences that say what was inferred rather than given."""
+        return tuple(map(in_python, self.flagged))
 
     @property
     def values(self) -> NDArray[Any]:
@@ -231,6 +206,7 @@ class SdfGrid:
         return places
 
 
+<<<<<<< HEAD
 def _look_at_finite(samples: SampleArray) -> Look:
     """Look at samples; GridError unless they are finite numbers."""
     look = look_at(samples)
@@ -247,6 +223,8 @@ def _look_at_finite(samples: SampleArray) -> Look:
     return look
 
 
+=======
+>>>>>>> 2eaf22b10c23cc2d3dd0574ee506762e4550ed61
 def make_grid(
     values: ArrayLike | SamplePlanes,
     *,
@@ -279,7 +257,8 @@ def make_grid(
         World position of sample (0, 0, 0). Default: the lowest coordinates of a ``DataArray``, else
         0, 0, 0.
     direction : (3, 3) array_like or nine numbers, optional
-        The columns are the world directions of the array's axes; see ``SdfGrid``.
+        The columns are the world directions of the array's axes: unit vectors, mirrored or not, of
+        distances at right angles. Default: i runs along x, j along y, k along z.
     inside : {"auto", "negative", "positive"}
         Sign of the values inside the solid; "auto" takes the border of the grid as outside.
     field : {"auto", "distance", "noisy", "mask", "smooth"}
@@ -320,13 +299,16 @@ def make_grid(
     return SdfGrid.trusted(origin=origin, direction=direction, **taken)
 
 
-def check_grid(grid: Any) -> SdfGrid:
-    """Return a grid; OptionTypeError if it is no ``SdfGrid``, but an array or a path, say."""
+def as_grid(grid: Any, **told: Any) -> SdfGrid:
+    """Return a grid, of which nothing is told, or that which ``make_grid`` makes of an array."""
+    if grid is None or isinstance(grid, (str, PathLike)):
+        make = "make one with make_grid(values, spacing=...) or read_grid(path)"
+        raise OptionTypeError(f"grid is {seen(grid)}: {make}")
     if not isinstance(grid, SdfGrid):
-        what = f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else seen(grid)
-        raise OptionTypeError(
-            f"grid is {what}: make one with make_grid(values, spacing=...) or read_grid(path)"
-        )
+        return make_grid(grid, **told)
+    for name, value in told.items():
+        if not (value is None or (isinstance(value, str) and value == "auto")):
+            raise OptionError(f"{name} is given with a grid, which has its own: leave it out")
     return grid
 
 
@@ -344,14 +326,8 @@ def crop(grid: SdfGrid, low: Index, high: Index) -> SdfGrid:
     """
     unseen = grid.field.unseen
     unseen = None if unseen is None else cropped(unseen, low, high)
-    known = grid.on_sample
-    return with_fields(
-        grid,
-        samples=cropped(grid.samples, low, high),
-        origin=as_triple(grid.to_world(low), "origin"),
-        field=replace(grid.field, unseen=unseen),
-        on_sample=known and tuple(axis[a:b] for axis, a, b in zip(known, low, high)),
-    )
+    field, origin = replace(grid.field, unseen=unseen), as_triple(grid.to_world(low), "origin")
+    return with_fields(grid, samples=cropped(grid.samples, low, high), origin=origin, field=field)
 
 
 def describe_place(grid: SdfGrid) -> dict[str, Any]:
@@ -375,13 +351,10 @@ def mean_spacing(grid: SdfGrid) -> float:
 def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     """Return a grid on the lattice that is refined: itself if cubic or on its ``own_lattice``.
 
-    A grid with the same spacing on all axes is refined as it is. Of others, the coarser axes are
-    resampled to the finest spacing, the coarsest last: the finer the others are, the better they
-    tell its slopes. Masks, and fields that are meshed by their spline, need no cubes: a solid
-    stretched along an axis is as good a solid, and the mesh gets its spacings at the end.
-
-    Other samples are made when they are read. Only values near the offset of the surface are as
-    accurate as they can be. GridError if there is an offset, and the values are no distances.
+    Of others, the coarser axes are resampled to the finest spacing when planes are read. Only
+    values near the offset of the surface are as accurate as they can be. Masks, and fields that are
+    meshed by their spline, need no cubes: the mesh gets their spacings at the end. GridError if
+    there is an offset, and the values are no distances.
     """
     if offset and grid.field.own_lattice:
         each = ", ".join(f"{h:g}" for h in grid.spacing)
@@ -401,28 +374,15 @@ def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:
     from .derived import Resampled  # imported here, as few need it
 
     samples, h, steps, coarser = grid.samples, grid.voxel_size, list(grid.spacing), list[str]()
-    known = [np.ones(count, bool) for count in grid.shape]
-    for axis in np.argsort(grid.spacing, kind="stable").tolist():
+    for axis in np.argsort(steps, kind="stable").tolist():  # finer axes bound the coarser ones
         if steps[axis] > h * (1 + EQUAL_SPACING):
             coarser.append(f"{AXES[axis]} from {steps[axis]:.6g}")
-            samples = Resampled(samples, (steps[0], steps[1], steps[2]), axis, h, offset)
-            steps[axis], known[axis] = h, samples.on_sample
+            samples = Resampled(samples, as_triple(steps, "spacing"), axis, h, offset)
+            steps[axis] = h
+    along, shape = " and ".join(sorted(coarser)), " x ".join(map(str, samples.shape))
     note = (
-        "the spacing differs between axes: the values are resampled along "
-        f"{' and '.join(sorted(coarser))} to {h:.6g}, the finest, to "
-        f"{' x '.join(map(str, samples.shape))} samples"
+        f"the spacing differs between axes: the values are resampled along {along} to {h:.6g}, the "
+        f"finest, to {shape} samples"
     )
-    more = {"notes": (*grid.notes, note), "on_sample": tuple(known)}
-    return with_fields(grid, samples=samples, spacing=(steps[0], steps[1], steps[2]), **more)
-
-
-def which_sampled(grid: SdfGrid, voxel_ijk: IntArray) -> tuple[BoolArray, NDArray[np.intp]]:
-    """Return which values of a cubic grid, at (n, 3) indices, are samples, not interpolated.
-
-    And the places of ``NEIGHBOURHOOD`` round these that hold samples, too: across resampled axes.
-    """
-    known, across = np.ones(len(voxel_ijk), bool), np.ones(27, bool)
-    for axis, is_sample in enumerate(grid.on_sample or ()):
-        known &= is_sample[voxel_ijk[:, axis]]
-        across &= is_sample.all() | (NEIGHBOURHOOD[:, axis] == 0)
-    return known, np.flatnonzero(across)
+    more = {"spacing": as_triple(steps, "spacing"), "flagged": (*grid.flagged, note)}
+    return with_fields(grid, samples=samples, is_resampled=True, **more)

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import FileError, MeshError, OptionError, flag
-from ..files.formats import check_regular_file, files_of
+from ..files.formats import check_regular_file, files_of, reason_of
 from ..files.grids import names_in
 from ..files.meshes import World, check_mesh_suffix, has_parts, write_meshes
 from ..files.output import check_apart, check_free
@@ -91,7 +91,7 @@ def convert_labels(
     listed = ", ".join(name for name, _ in lacking.values())
     notes += [f"no sample has a label that was asked for: {listed}"] * bool(missing)
     facts = {"labels": rows, "missing": missing, "closed": True, "warnings": warnings}
-    facts |= {"inferred": [*image.grid.notes, *notes], **describe_place(image.grid)}
+    facts |= {"inferred": [*image.grid.flagged, *notes], **describe_place(image.grid)}
     return LabelConversion(facts, watch.seconds)
 
 
@@ -173,9 +173,11 @@ def read_names(path: str | Path) -> Names:
             if plain := plain[:LONGEST].strip():
                 colour: Any = tuple(map(int, rgb)) if any(rgb) else None
                 names[int(label)] = plain, colour
-        if not names:
-            raise ValueError("it names none")
-    except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
-        said = f"{path} cannot be read as a table of labels: {error}"
-        raise FileError(f"{said}; give lines such as '1 liver'") from error
+    except OSError as error:
+        raise FileError(f"{path} {reason_of(error)}") from error
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        names = {}
+    if not names:
+        either = """lines such as 1 liver, or in .json {"1": "liver"}"""
+        raise FileError(f"{path} is no table of labels: give {either}")
     return names

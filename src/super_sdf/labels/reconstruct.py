@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from os import PathLike
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import options
-from ..errors import GridError, OptionError, check_modules, seen
+from ..errors import GridError, OptionError, check_modules, seen, tell
 from ..files.grids import read_array
 from ..files.readers import PLACE
 from ..grid.derived import extremes_of_masks
@@ -78,7 +78,7 @@ def reconstruct_labels(
     Returns
     -------
     dict of int to Mesh
-        The meshes by label, in ascending order, in world units.
+        The meshes by label, in ascending order, in world units, each with all notes and warnings.
 
     SuperSdfError if a value is no whole number, a label is missing, there is no surface, an
     argument is invalid, or the image does not fit in memory.
@@ -87,7 +87,10 @@ def reconstruct_labels(
     asked = options.Options(factor, keep_volume=keep_volume, tolerance=tolerance, **told)
     image = find_image(values, asked, (spacing, origin, direction))
     chosen = load_network() if network is None else network
-    return dict(zip(image.volumes, label_meshes(image, chosen, asked, progress)[0]))
+    meshes, notes, doubts = label_meshes(image, chosen, asked, progress)
+    said, doubted = tell((*image.grid.flagged, *notes), doubts)
+    meshes = [replace(mesh, notes=said, warnings=doubted) for mesh in meshes]
+    return dict(zip(image.volumes, meshes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +138,7 @@ def in_order(labels: Any) -> list[int] | None:
         return None
     chosen = sorted({options.LABEL.check(label, "--labels") for label in labels})
     if not 0 < len(chosen) <= MOST_LABELS:
-        raise OptionError(f"--labels are {len(chosen):,}: give 1 to {MOST_LABELS:,} at a time")
+        raise OptionError(f"--labels has {len(chosen):,} labels: give 1 to {MOST_LABELS:,}")
     return chosen
 
 

@@ -23,7 +23,7 @@ from ..convert import convert
 from ..errors import SuperSdfError
 from ..files.formats import is_grid
 from ..files.output import replacing
-from ..truth.solid import read_mesh
+from ..truth import read_mesh
 from . import items
 from .items import Entry, Item, entry_of_report, item_of_files
 

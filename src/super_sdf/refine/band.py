@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..arrays import CENTRE, NEIGHBOURHOOD, BoolArray, FloatArray, IntArray
 from ..errors import GridError, NoSurfaceError
 from ..grid.samples import let_go, over_three
-from ..grid.sdf_grid import SdfGrid, which_sampled
+from ..grid.sdf_grid import SdfGrid
 from ..threads import over_threads, worthwhile_threads
 from .bounds import FARTHEST, SampleSpheres
 
@@ -53,7 +53,6 @@ class BandSummary:
     side: int  # samples along the edge of each cube, of those into which the grid is cut
     cells: NDArray[np.int64]  # (a, b, c), voxels of the band in each cube
     count: int = 0  # voxels of the band
-    told: int = 0  # of them, those whose samples tell whether the field is noisy
     noisy: int = 0  # those of them round which samples differ by more than distances can
     low: float = np.inf  # the lowest and the highest sample, in half voxels
     high: float = -np.inf
@@ -61,11 +60,10 @@ class BandSummary:
 
     def add(self, found: tuple[NDArray[Any], ...]) -> None:
         """Count what ``_find`` found in some planes."""
-        voxel_ijk, patches, lipschitz, sampled, *_, leaves = found
+        voxel_ijk, patches, lipschitz, *_, leaves = found
         self.count += len(voxel_ijk)
         np.add.at(self.cells, tuple((voxel_ijk // self.side).T), 1)
-        self.told += int(np.count_nonzero(sampled))
-        self.noisy += int(np.count_nonzero(sampled & ~lipschitz))
+        self.noisy += int(np.count_nonzero(~lipschitz))
         self.low = min(self.low, float(patches[:, CENTRE].min(initial=np.inf)))
         self.high = max(self.high, float(patches[:, CENTRE].max(initial=-np.inf)))
         self.leaves |= bool(leaves.any())
@@ -80,7 +78,6 @@ class Band:
     voxel_ijk: IntArray  # (V, 3), the voxels, in C order
     patches: FloatArray  # (V, 27), the samples round each voxel, in half voxels
     lipschitz: BoolArray  # (V,), which patches can be distances
-    sampled: BoolArray  # (V,), which own values are samples, not interpolated by resampling
     decoded: BoolArray  # (V,), which voxels can hold the surface, and so are decoded
     exact: BoolArray  # (V,), which own samples can be taken as exact distances
     # samples beyond the band may be exact distances if they lie between these, in half voxels
@@ -104,12 +101,11 @@ def survey(
     """
     side = -(-max(grid.shape) // CELLS)
     summary = BandSummary(side, np.zeros([-(-n // side) for n in grid.shape], np.int64))
-    parts, limits = list[tuple[NDArray[Any], ...]](), (0.0, 0.0)
+    parts = list[tuple[NDArray[Any], ...]]()
     ends = np.array([*grid.field.exact, grid.low, grid.high])
     ends = np.clip((ends - offset) * 2 / grid.voxel_size, -FAR, FAR).astype(np.float32)
     low, high, lowest, highest = ends.tolist()
-    if grid.on_sample is None:  # what is interpolated beyond the band promises little
-        limits = max(low, lowest), min(high, highest)  # at its ends a field may be cut off
+    limits = max(low, lowest), min(high, highest)  # at its ends a field may be cut off
     step = max(BLOCK_SAMPLES // prod(grid.shape[1:]), 4, 2 * getattr(grid.samples, "beside", 0))
     blocks = [(at, min(at + step, grid.shape[0])) for at in range(0, grid.shape[0], step)]
     for found in over_threads(partial(_find, grid, offset, limits), blocks, threads):
@@ -119,8 +115,10 @@ def survey(
         parts.append(found)
         if summary.count > most:
             parts = [tuple(each[:0] for each in found)]
+    if grid.is_resampled:  # beside edges, interpolated values contradict each other without noise
+        summary.noisy = 0
     whole = whole or summary
-    ijk, patches, lipschitz, sampled, decoded, number, value, _ = map(np.concatenate, zip(*parts))
+    ijk, patches, lipschitz, decoded, number, value, _ = map(np.concatenate, zip(*parts))
     del parts, found
     exact, sample = _exact(patches, lipschitz, whole), patches[:, CENTRE]
     exact &= (sample > low) & (sample < high)
@@ -130,7 +128,7 @@ def survey(
     is_trusted = exact.any() and (limits[0] < -HALF_BAND or limits[1] > HALF_BAND)
     order = np.argsort(number, kind="stable") if is_trusted else slice(0)
     trusted = SampleSpheres(grid.shape, number[order], value[order])
-    known = ijk, patches, lipschitz, sampled, decoded, exact
+    known = ijk, patches, lipschitz, decoded, exact
     return Band(grid, offset, *known, limits, trusted, whole)
 
 
@@ -159,11 +157,7 @@ def _find(
     patches = gather_patches(rescaled, ijk + np.array([own.start, 0, 0], np.int32))
     ijk[:, 0] += first
 
-    # Samples of a resampled grid are judged by samples alone. Interpolated values that contradict
-    # no others count as exact, since thin parts need them (docs/guides/formats.md).
-    lipschitz, (sampled, places) = is_lipschitz(patches), which_sampled(grid, ijk)
-    if grid.on_sample is not None:
-        lipschitz[sampled] = is_lipschitz(patches[sampled], places)
+    lipschitz = is_lipschitz(patches)
     # Only a patch that can be distances proves, by a sample far from the surface, that the
     # voxel holds none.
     decoded: BoolArray = (np.abs(patches[:, CENTRE]) <= DECODE_LIMIT) | ~lipschitz | is_spline
@@ -177,7 +171,7 @@ def _find(
     lowest, highest = np.clip(limits, -FARTHEST, FARTHEST).astype(np.float32)
     beyond = known & (inner > lowest) & (inner < highest) & (np.abs(inner) >= HALF_BAND)
     number, value = np.flatnonzero(beyond) + first * inner[0].size, inner[beyond]
-    return ijk, patches, lipschitz, sampled, decoded, number, value, leaves
+    return ijk, patches, lipschitz, decoded, number, value, leaves
 
 
 def _exact(patches: FloatArray, lipschitz: BoolArray, whole: BandSummary) -> BoolArray:
@@ -186,7 +180,7 @@ def _exact(patches: FloatArray, lipschitz: BoolArray, whole: BandSummary) -> Boo
     A truncated sample is the lowest or the highest of the ``whole`` band, and has no neighbour
     towards which the field is as steep as a distance.
     """
-    sample, is_noisy = patches[:, CENTRE], whole.noisy >= MAX_NOISY_SHARE * whole.told
+    sample, is_noisy = patches[:, CENTRE], whole.noisy >= MAX_NOISY_SHARE * whole.count
     exact: BoolArray = lipschitz & (np.abs(sample) < MAX_DISTANCE) & (not is_noisy)
     ends = np.where(sample > 0, np.float32(whole.high), np.float32(whole.low))
     at_limit = np.flatnonzero(exact & (sample == ends))
@@ -297,11 +291,11 @@ def neighbour_table(voxel_ijk: IntArray, shape: tuple[int, int, int], threads: i
     return table
 
 
-def is_lipschitz(patches: FloatArray, places: slice | NDArray[np.intp] = slice(None)) -> BoolArray:
+def is_lipschitz(patches: FloatArray) -> BoolArray:
     """Return which patches (V, 27) can be distances, (V,) bool: those that are 1-Lipschitz.
 
     This fails nearly everywhere in a noisy field, and in many places of a field that is not a
-    distance. ``places`` are those of a patch that are compared with its centre.
+    distance.
     """
-    apart = np.abs(patches[:, places] - patches[:, CENTRE, None])
-    return np.asarray((apart <= MAX_DIFFERENCE[places]).all(1))
+    apart = np.abs(patches - patches[:, CENTRE, None])
+    return np.asarray((apart <= MAX_DIFFERENCE).all(1))

@@ -168,7 +168,7 @@ def fine_grid(field: FineField) -> SdfGrid:
         FineLattice(field),
         tuple(along / field.factor for along in grid.spacing),
         grid.to_world([-0.5, -0.5, -0.5]),
-        grid.notes,
+        grid.flagged,
         direction=grid.direction,
         extremes=(min(lowest, grid.low - field.offset), max(highest, grid.high - field.offset)),
         field=replace(kind, own_lattice=grid.field.own_lattice),

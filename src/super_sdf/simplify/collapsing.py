@@ -24,7 +24,7 @@ import numpy as np
 
 from ..arrays import BoolArray, face_normals, length
 from ..surface.mesh import Mesh, row_keys
-from ..truth.solid import Points, Solid, smallest_angles
+from ..truth import Points, Solid, smallest_angles
 from .measuring import Original, find
 from .walls import Walls, irregular, labels_apart
 

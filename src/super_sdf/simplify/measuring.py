@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import face_normals, length, unit
 from ..surface.mesh import Mesh, row_keys
-from ..truth.solid import Points, Solid
+from ..truth import Points, Solid
 
 Keys = NDArray[np.uint64]
 BETWEEN = 0.97  # of the error, which no measured point exceeds: others may be a little farther away

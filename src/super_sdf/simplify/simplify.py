@@ -1,21 +1,21 @@
 """Simplifying a mesh within a measured distance, or to a number of triangles.
 
 >>> from super_sdf import simplify_mesh
->>> simplify_mesh(mesh, error=0.02 * grid.voxel_size).mesh               # doctest: +SKIP
+>>> simplify_mesh(mesh, error=0.02 * grid.voxel_size)                    # doctest: +SKIP
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ..errors import MeshError, check_modules
+from ..errors import check_modules, tell
 from ..options import OPTIONS, check_goal
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import check_fits, give_back, memory_bound
-from ..truth.solid import Solid
+from ..truth import Solid
 from .collapsing import Unsimplified, down_to, within
 from .measuring import Deviation
 from .walls import Walls
@@ -27,21 +27,27 @@ NONE_SPARED = "the mesh was not simplified: none of its triangles can be spared 
 UNREACHED = "{:,} triangles cannot be reached while the mesh stays a manifold of the same topology"
 
 
-@dataclass(frozen=True, eq=False)
-class Simplified:
-    """A simplified mesh and its distance from the unsimplified one."""
+@dataclass(frozen=True, eq=False, repr=False)
+class SimplifiedMesh(Mesh):
+    """A mesh of fewer triangles; closed, oriented and manifold if the unsimplified mesh was.
 
-    mesh: Mesh  # closed, oriented, manifold if the unsimplified one was; open edges are the same
-    triangles_before: int  # of the unsimplified mesh
+    Attributes
+    ----------
+    triangles_before : int
+        How many triangles the unsimplified mesh has.
+    deviation : Deviation
+        The distances between the two meshes, in world units.
+    """
+
+    triangles_before: int
     deviation: Deviation
-    warnings: tuple[str, ...] = ()  # what was asked for and not reached
 
     def report(self, voxel_size: float) -> dict[str, Any]:
         """Return the figures as they stand in JSON; distances are in voxels of this size."""
         return {
             "voxel_size": voxel_size,
             "triangles_before": self.triangles_before,
-            "triangles": len(self.mesh.faces),
+            "triangles": len(self.faces),
             "deviation": {name: x / voxel_size for name, x in self.deviation._asdict().items()},
             "warnings": list(self.warnings),
         }
@@ -53,7 +59,7 @@ def simplify_mesh(
     error: float | None = None,
     triangles: int | None = None,
     max_memory: int | None = None,
-) -> Simplified:
+) -> SimplifiedMesh:
     """Simplify a mesh within a distance, or to a number of triangles.
 
     Parameters
@@ -70,18 +76,26 @@ def simplify_mesh(
 
     Returns
     -------
-    Simplified
-        With vertices of the same type. Open edges stay exactly where they are.
+    SimplifiedMesh
+        A ``Mesh`` with vertices of the same type, and how far it is from ``mesh``. Open edges stay
+        exactly where they are. If the goal is not reached, its ``warnings`` say so.
 
     Raises
     ------
     SuperSdfError
-        If not exactly one of ``error`` and ``triangles`` is given, a vertex is not finite, the
+        If not exactly one of ``error`` and ``triangles`` is given, the arrays are no mesh, the
         extra ``simplify`` is not installed, or it would not fit in memory.
     """
+    found = simplified(mesh, error, triangles, max_memory)
+    doubts = mesh.warnings + tell((), found.warnings)[1]
+    return replace(found, notes=mesh.notes, warnings=doubts)
+
+
+def simplified(
+    mesh: Mesh, error: float | None, triangles: int | None, max_memory: int | None
+) -> SimplifiedMesh:
+    """Return a simplified mesh with warnings of its own only, which are not issued."""
     check_mesh(mesh)
-    if not np.isfinite(mesh.vertices).all():
-        raise MeshError("the mesh has vertices that are not finite: repair it first")
     error, triangles = check_goal(error, triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
@@ -89,7 +103,7 @@ def simplify_mesh(
     way_out = "use a smaller factor, do not simplify, or allow more (--max-memory)"
     check_fits(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", way_out, most)
     if not count:
-        return Simplified(mesh, 0, Deviation(0.0, 0.0, 0.0, 0.0))
+        return SimplifiedMesh(mesh.vertices, mesh.faces, 0, Deviation(0.0, 0.0, 0.0, 0.0))
     of, warnings = Unsimplified(Walls.of(mesh)), tuple[str, ...]()
     if triangles is None:
         found = within(of, error or 0.0)
@@ -100,4 +114,4 @@ def simplify_mesh(
             warnings = (f"{UNREACHED.format(triangles)}: it has {few:,}",)
     result = Mesh(found.vertices, found.faces) if found else mesh
     deviation = of.originals[0].compare(Solid(result), error or np.inf)[1]
-    return Simplified(result, count, deviation, warnings)
+    return SimplifiedMesh(result.vertices, result.faces, count, deviation, warnings=warnings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,10 +29,15 @@ class Mesh:
         World positions; float64 where float32 does not resolve neighbouring vertices.
     faces : (m, 3) int32
         Indices of the corners in ``vertices``.
+    notes, warnings : tuple of str
+        What was inferred when the mesh was made, and what may be wrong with it.
     """
 
     vertices: NDArray[Any]
     faces: IntArray
+    _: KW_ONLY
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         text = f"{len(self.vertices):,} vertices {self.vertices.dtype}, {len(self.faces):,} faces"
@@ -44,7 +49,7 @@ class Mesh:
 
     def transformed(self, linear: NDArray[Any], shift: NDArray[Any]) -> Mesh:
         """Return the mesh with ``vertices @ linear.T + shift`` (``linear`` keeps orientation)."""
-        return Mesh(self.vertices @ linear.T + shift, self.faces)
+        return replace(self, vertices=self.vertices @ linear.T + shift)
 
     def volume(self) -> float:
         """Return the enclosed volume, in cubic world units; positive if normals point outward."""
@@ -169,6 +174,8 @@ def check_mesh(mesh: Any) -> None:
     if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
         worst = int(faces.min() if faces.min() < 0 else faces.max())
         raise MeshError(f"a face of the mesh names vertex {worst} of {len(vertices):,}: repair it")
+    if not np.isfinite(vertices).all():
+        raise MeshError("a vertex of the mesh is not finite: repair it")
 
 
 def row_keys(rows: NDArray[np.float64]) -> NDArray[np.uint64]:

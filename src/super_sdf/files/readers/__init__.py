@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ...arrays import Triple
 from ...errors import FileError, GridError, OptionError
-from ...grid.samples import AXES, UNNAMED, as_direction, as_triple, check_direction, even_steps
+from ...grid.samples import AXES, UNNAMED, as_triple, check_direction, even_steps
 from ...threads import check_fits, memory_bound
 
 STRAIGHT = 1e-4  # an axis that is off by less than this from a world axis counts as along it
@@ -140,7 +140,7 @@ class Volume:
         if space in (None, self.space):
             return self
         if self.space is None:
-            raise OptionError(f"space is {space}: {name} states neither RAS nor LPS, leave it out")
+            raise OptionError(f"--space {space}: {name} states neither RAS nor LPS, leave it out")
         turn = np.array([-1.0, -1.0, 1.0])  # between the two
         origin = None if self.origin is None else triple(turn * self.origin)
         turned = turn[:, None] * (XYZ if self.direction is None else self.direction)
@@ -186,7 +186,7 @@ def find_placement(
     turned = direction[:, order] * np.where(is_back, -1, 1)
     place = {k: volume.place.get(k) if given.get(k) is None else given[k] for k in PLACE}
     if place["direction"] is None and np.abs(turned - XYZ).max() > STRAIGHT:
-        place["direction"] = as_direction(turned)
+        place["direction"] = turned
     spacing, origin, frame = place.values()
     if spacing is None and volume.spacing is not None:
         spacing = tuple(volume.spacing[axis] for axis in order)

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ..formats import check_beside, split_header
+from ..formats import check_beside, files_of, split_header
 from . import DENSITY, LABELS, Index, Names, Request, Volume, from_affine, kept_of, one_unit, triple
 
 SPACES = dict.fromkeys(("right-anterior-superior", "ras"), "RAS")
@@ -33,7 +33,6 @@ SPELT = {"centers": "centerings", "axismins": "axis mins", "axismaxs": "axis max
 # What a MetaImage file may state: that data is a zlib stream, which byte of a number is first
 NEEDED = re.compile(rb"^ *(NDims|DimSize|ElementType) *[=:] *(?:\d|MET_)", re.M)
 TRUE = re.compile(rb"^ *(CompressedData|\w+ByteOrderMSB) *[=:] *[Tt1]", re.M)
-PAIRS = (".img", ".IMG", ".img.gz")  # beside a ``.hdr``
 UNITS = {1: "metre", 3: "micrometre"}  # of lengths in NIfTI, but for millimetres
 INTENT_LABEL = 1002
 VOLUME_STACKS = 401  # space groups of MRC from here on are of stacks of volumes
@@ -182,9 +181,8 @@ def read_nifti(request: Request) -> Volume:
     """
     import nibabel
 
-    if request.path.suffix.lower() == ".hdr":
-        beside = [request.path.with_suffix(end) for end in PAIRS]
-        check_beside(request.path, next((o for o in beside if o.exists()), beside[0]).name)
+    for other in files_of(request.path)[1:]:  # of a ``.hdr``
+        check_beside(request.path, other.name)
     image: Any = nibabel.load(request.path, mmap=False)
     proxy, shape, header = image.dataobj, image.shape, image.header
     place: dict[str, Any] = {"index": request.pick(shape, kept=(0, 1, 2))}

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ...errors import FileError
+from ..formats import plugin
 from . import PLACE, Request, Volume, placed, stored, triple
 
 OPEN3D = ("key", "voxel_size", "block_resolution", "attr_name_tsdf", "attr_name_weight")
@@ -55,6 +56,14 @@ def read_npz(request: Request) -> Volume:
     name = "values" if is_plain else request.choose_array(shapes)
     place = placed(request, shapes[name], {key: archive[key] for key in keys & set(PLACE)})
     return Volume(lambda at: archive[name][at], shapes[name], dtypes[name], **place)
+
+
+def read_plugin(request: Request) -> Volume:
+    """Read a file by the function of another package, which returns the keys of an ``.npz``."""
+    found = plugin("readers", request.path.suffix).load()(request.path)
+    values = np.asanyarray(found["values"])
+    place = placed(request, values.shape, {key: found[key] for key in PLACE if key in found})
+    return Volume(*stored(values), **place)
 
 
 def _blocks_of_open3d(request: Request, archive: Any) -> Volume:

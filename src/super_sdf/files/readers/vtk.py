@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from ...errors import FileError, GridError, OptionTypeError, seen
-from ...grid.samples import even_steps
+from ...grid.samples import as_triple, even_steps
 from . import XYZ, Request, Volume, stored, triple
 
 NAME = "the image"  # in memory, in error messages
+STATED = re.compile(rb'\b(Origin|Spacing)="([^"]*)"')  # of a ``.vti``
 MARKS = ("vtkGhostType", "vtkValidPointMask")
 READERS = {
     ".vti": ("vtkIOXML", "vtkXMLImageDataReader"),
@@ -37,6 +38,9 @@ def read_vtk(request: Request) -> Volume:
     said, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
     request.files.callback(vtkOutputWindow.SetInstance, before)
     vtkOutputWindow.SetInstance(said)
+    with request.path.open("rb") as file:
+        for what, numbers in STATED.findall(file.read(1 << 16)):  # VTK takes nan for 1
+            as_triple(list(map(float, numbers.split())), what.decode())
     reader.SetFileName(str(request.path))
     reader.UpdateInformation()
     about, key = reader.GetOutputInformation(0), vtkStreamingDemandDrivenPipeline.WHOLE_EXTENT()

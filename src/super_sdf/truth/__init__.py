@@ -1,1 +1,0 @@
-"""Exact distances to meshes, for ``sample``, for measuring and for training; extra ``eval``."""
