@@ -13,13 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..arrays import Triple
 from ..errors import GridError, OptionError, OptionTypeError, in_python, seen
 from ..options import FieldKind, Inside, Options
-<<<<<<< HEAD
-from .interpret import NONE_EXACT, Field, check_size, interpret
-from .look import Extremes, Look, border_share, look_at, typical_slope
-=======
 from .interpret import NONE_EXACT, Field, interpret
 from .look import Extremes
->>>>>>> 2eaf22b10c23cc2d3dd0574ee506762e4550ed61
 from .samples import (
     AXES,
     EQUAL_SPACING,
@@ -77,27 +72,7 @@ class SdfGrid:
         origin: ArrayLike | None = None,
         direction: ArrayLike | None = None,
     ) -> None:
-<<<<<<< HEAD
-        samples, _, origin = placed(values, spacing, origin)
-        h, look = max(check_spacing(spacing)), _look_at_finite(samples)
-        if look.is_two and min(look.shape) > 2:
-            raise GridError(f"the only values are {look.low:.6g} and {look.high:.6g}: {NO_MASK}")
-        below = border_share(look, lambda x: x < 0)
-        if below > 0.5:
-            raise GridError(
-                f"{below:.0%} of the grid's border is negative, which is inside: make the grid "
-                "with make_grid(values, spacing=..., inside='positive'), or inside='negative' if "
-                "the solid does run out of the grid there"
-            )
-        rise = typical_slope(look, np.ones(3))
-        if rise > MOST_RISE * h:
-            said = f"the values change by {rise:.6g} from sample to sample, but spacing is {h:.6g}"
-            raise GridError(f"{said}: give distances in its unit, or use make_grid")
-        extremes = look.low, look.high
-        grid = self.trusted(samples, spacing, origin, extremes=extremes, direction=direction)
-=======
         grid = make_grid(values, spacing=spacing, origin=origin, direction=direction)
->>>>>>> 2eaf22b10c23cc2d3dd0574ee506762e4550ed61
         vars(self).update(vars(grid))
 
     @classmethod
@@ -206,25 +181,6 @@ class SdfGrid:
         return places
 
 
-<<<<<<< HEAD
-def _look_at_finite(samples: SampleArray) -> Look:
-    """Look at samples; GridError unless they are finite numbers."""
-    look = look_at(samples)
-    if samples.dtype == np.bool_:
-        raise GridError(f"values are true or false: {NO_MASK}")
-    if not look.is_finite:
-        bad = (np.argwhere(~np.isfinite(plane)) for plane in samples)
-        i, (j, k) = next((i, places[0]) for i, places in enumerate(bad) if len(places))
-        raise GridError(
-            f"values[{i}, {j}, {k}] is {samples[i][j, k]!s}: every sample must be finite; "
-            "replace unknown far samples by a large distance of the right sign"
-        )
-    check_size(look)
-    return look
-
-
-=======
->>>>>>> 2eaf22b10c23cc2d3dd0574ee506762e4550ed61
 def make_grid(
     values: ArrayLike | SamplePlanes,
     *,
