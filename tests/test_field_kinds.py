@@ -328,7 +328,7 @@ def test_shares_of_voxels_are_no_steps():
     share = np.clip(15.6 - np.arange(24) + 0.5, 0, 1) - np.clip(6.4 - np.arange(24) + 0.5, 0, 1)
     values = share[:, None, None] * share[:, None] * share
     mesh = reconstruct(make_grid(values, **PLACE, level=0.5), trilinear)
-    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(9.2, abs=0.08)
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx(9.2, abs=0.1)
 
 
 BAD = {
@@ -380,10 +380,9 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         np.testing.assert_array_equal(grid.values < 0, depth < 0)
     grid = make_grid(depth, **PLACE, field="mask", inside="negative")
     np.testing.assert_array_equal(grid.values < 0, depth < 0)
-    for values, side in ((depth - 1, "below"), (1 - depth, "above")):
+    for values, side in ((depth - 1, "above"), (1 - depth, "below")):
         said = refusal(GridError, make_grid, values, **PLACE, field="mask")
-        ends = f"{values.min():.6g} to {values.max():.6g}"
-        assert said.startswith(f"every value is {side} 0 (they go from {ends}), so their signs")
+        assert said.startswith(f"no value is {side} 0 (") and "give the level" in said
 
 
 def gyroid(period: float) -> np.ndarray:

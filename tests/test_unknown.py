@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import refusal, trilinear
-from scipy import ndimage
 from skimage.measure import marching_cubes
 from solids import box_distance
 from test_field_kinds import PLACE, box, thin_frame
@@ -15,6 +14,7 @@ from trimesh import grouping
 
 from super_sdf import make_grid, reconstruct
 from super_sdf.errors import GridError
+from super_sdf.grid.look import beside_surface
 from super_sdf.options import OPTIONS
 
 
@@ -32,11 +32,9 @@ def test_unknown_far_samples_are_taken_as_cut_off_on_their_side(hollow):
     limits = known[np.abs(known) < 2].min(), known[np.abs(known) < 2].max()
     np.testing.assert_array_equal(grid.values, np.clip(known, *limits))
     inner, outer = (known <= -2).sum(), (known >= 2).sum()
-    nans, infinite = (inner, outer) if np.isnan(hollow) else (0, inner + outer)
     assert grid.notes[0] == (
-        f"{inner + outer:,} samples are unknown ({nans:,} NaN, of which 0 lie on the positive "
-        f"side, and {infinite:,} infinite): they are taken as cut off at {limits[0]:.6g} and "
-        f"{limits[1]:.6g}"
+        f"{inner + outer:,} samples are unknown, of which 0 without a number lie on the positive "
+        f"side: they are taken as cut off at {limits[0]:.6g} and {limits[1]:.6g}"
     )
     assert grid.field.kind == "distance" and reconstruct(grid, trilinear).is_closed()
 
@@ -125,17 +123,22 @@ def test_unequal_spacings_of_distances_that_end_need_the_spline():
     assert np.abs(off).mean() < 0.05 and np.abs(mesh.vertices[:, 0] - 13.6).max() < 9
 
 
-def test_an_infinite_sample_beside_the_surface_is_refused():
+def test_an_infinite_sample_beside_the_other_side_is_as_unknown_as_nan():
     values = truncated()
-    values[values < 0] = -np.inf
-    beside = (values < 0) & ndimage.binary_dilation(values > 0)
-    first = ", ".join(map(str, np.argwhere(beside)[0]))
-    assert refusal(GridError, make_grid, values, **PLACE) == (
-        f"values[{first}] is -inf, and a sample beside it has the other sign, as at "
-        f"{beside.sum():,} infinite samples: where the surface passes between them is unknown; "
-        "replace each by a distance of the right sign (the cut-off value of its side), or by NaN "
-        "where nothing was seen"
-    )
+    at = np.argwhere(beside_surface(values))[::40]
+    values[tuple(at.T)] = np.copysign(np.inf, values[tuple(at.T)])
+    grid = make_grid(values, **PLACE)
+    values[tuple(at.T)] = np.nan
+    want = make_grid(values, **PLACE)
+    np.testing.assert_array_equal(grid.values, want.values)
+    np.testing.assert_array_equal(grid.field.unseen, want.field.unseen)
+
+
+def test_whole_numbers_may_stand_for_unknown_ones():
+    values = np.where(np.abs(box()) > 3, -500, np.rint(20 * box())).astype(np.int16)
+    grid = make_grid(values, **PLACE, scale=0.05)
+    assert "samples are exactly -25, where no distance is" in grid.notes[0]
+    assert reconstruct(grid, trilinear).is_closed()
 
 
 @pytest.mark.parametrize("field", OPTIONS["field"].kind.choices[1:])

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import prod
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,9 +18,11 @@ from ..arrays import BoolArray, Triple
 from ..errors import GridError
 from ..options import Options
 from .look import (
+    MOST_NAMED,
     Extremes,
     Look,
     as_labels,
+    beside_surface,
     border_share,
     look_at,
     named,
@@ -36,16 +37,17 @@ from .samples import (
     SampleArray,
     changed,
     check_spacing,
+    is_cubic,
     steps_of,
 )
 
 INNER = 0.25  # spacings: as deep at least samples inside are, where parts of a solid touch
 NONE_EXACT: Extremes = (0.0, 0.0)
-# Voxels from the surface at which values are cut off: where the rest is filled in, and below which
-# too few are left for that.
-FILLED, TOO_NEAR = 1.75, 0.85
-SNAP = 0.02  # a spacing this close to a usual one is taken as that
-UNEQUAL = 1.01  # ratio from which spacings that the values show differ
+FILLED = 1.75  # voxels from the surface: where distances are cut off nearer, the rest is filled in
+STEEPER = 1.3  # than between any neighbours: slopes to 1.22, beside edges of cut off ones 1.43
+# Densities that level off within a voxel of the surface are distances: share of the values between
+# their ends that are beside it. Volume fractions from .87, ramps over two voxels .74, blurred .33.
+BESIDE = 0.6
 APPROXIMATE = "from the values, so the size of the mesh is approximate (give --spacing)"
 ORDINARY = 1e-100, 1e100  # sizes whose squares are numbers, too
 
@@ -94,7 +96,6 @@ class Case:
     given: SampleArray  # the samples without level and scale: levels that are named are of these
     notes: list[str]
     facts: dict[str, Any] = field(default_factory=dict)
-    was_unknown: bool = False  # whether unknown samples were filled in
     unseen: BoolArray | None = None
     why_open: str = ""
 
@@ -124,13 +125,11 @@ class Case:
             return self.look.low < 0
         below = border_share(self.look, lambda x: ~above(x) if above else x < 0)
         positive, share = below > 0.5, max(below, 1 - below)
-        which, other = ("negative values are", "positive values are")[positive], "sign"
-        if above:
-            which, other = ("the smaller value is", "the larger value is")[positive], "one"
         if share < 1 or (positive and not above):
+            names = ("the smaller value", "the larger value") if above else ("negative", "positive")
             self.notes.append(
-                f"{which} taken as inside: {share:.0%} of the grid's border has the other {other} "
-                "(if that is wrong, use --inside)"
+                f"taken as inside: {names[positive]}; {share:.0%} of the grid's border is on the "
+                "other side (if that is wrong, use --inside)"
             )
         return positive
 
@@ -144,6 +143,7 @@ class Case:
         """Divide the samples by a slope."""
         self.samples = changed(self.samples, lambda planes: planes / slope)
         self.look = replace(self.look, low=self.look.low / slope, high=self.look.high / slope)
+        self.facts = self.facts | {"cut": [x / slope for x in self.facts.get("cut", ())]}
 
     def fill_in(self, values: Sequence[float] = ()) -> None:
         """Fill in unknown samples, for which some values stand, too, if there are some."""
@@ -153,7 +153,8 @@ class Case:
 
         filled = with_known(self.samples, self.look, values, self.notes)
         self.samples, self.unseen, self.why_open = filled
-        self.look, self.was_unknown = look_at(self.samples), True
+        self.look = look_at(self.samples)
+        self.facts = self.facts | {"cut": [self.look.low, self.look.high]}
 
 
 def interpret(
@@ -167,7 +168,7 @@ def interpret(
     if wanted.inside == "auto" and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
     if wanted.label is not None:
-        samples = labelled(as_labels(samples), wanted.label)
+        labels, samples = samples, labelled(as_labels(samples), wanted.label)
     if wanted.unknown is not None and samples.dtype.kind != "b":
         value = wanted.unknown
         samples = changed(samples, lambda planes: np.where(planes == value, np.nan, planes))
@@ -179,14 +180,14 @@ def interpret(
     if wanted.scale is not None and samples.dtype.kind != "b":
         samples = changed(samples, partial(np.multiply, float(wanted.scale)))
     look = look_at(samples)
-    _check_size(look)
+    if wanted.label is not None and look.low == look.high:
+        values = {x.item() for plane in as_labels(labels) for x in np.unique(plane)[:MOST_NAMED]}
+        which = f"{'every' if look.high else 'no'} sample has the label {wanted.label}"
+        raise GridError(f"{which}: the labels are {named(values)}")
+    check_size(look)
     case = Case(samples, look, wanted, steps, given, notes)
     if samples.dtype.kind == "b":
         return _of_mask(case, np.asarray)
-    if look.infinite:
-        from .unknown import check_infinite
-
-        check_infinite(samples)
     if wanted.level is not None:
         return _of_level(case)
     if wanted.field == "mask":
@@ -194,17 +195,20 @@ def interpret(
         return _of_sides(case)
     h = None if steps is None else np.array(steps_of(steps))
     answer = Answer(wanted.field, "", {"cut": look.cut, "spacing": h})
-    if wanted.field == "auto":
+    if wanted.field == "auto" or h is None:
         answer = recognise(samples, look, h, hint)
-    elif look.is_two:
-        answer = Answer("mask", "there are two values", answer.facts)
+    if wanted.field != "auto":
+        facts = {name: answer.facts.get(name) for name in ("cut", "spacing", "unit")}
+        answer = Answer("mask" if look.is_two else wanted.field, "", facts)
     is_shell = answer.kind == "distance" and look.is_one_sided and wanted.inside != "auto"
-    if answer.refusal and not is_shell:
-        raise _refused(case, answer)
+    if answer.kind == "labels":
+        raise GridError(answer.refusal)
+    if answer.kind == "density" or (answer.refusal and not is_shell):
+        raise _refused(case, answer.refusal)
     return _as_recognised(case, answer)
 
 
-def _check_size(look: Look) -> None:
+def check_size(look: Look) -> None:
     """Raise GridError unless there are different values, of a size with which one can calculate."""
     if look.low > look.high:
         raise GridError("no value is finite: there is no surface")
@@ -217,18 +221,15 @@ def _check_size(look: Look) -> None:
         raise GridError(f"the largest value is {end:.6g}: {said}")
 
 
-def _refused(case: Case, answer: Answer) -> GridError:
-    """Return the error for values that cannot be meshed."""
-    said, side, look = answer.refusal, "", case.look
-    if answer.kind == "density" and case.wanted.scale:  # a level is a value without the scale
-        said = which_level(look_at(case.given), signed=not look.is_one_sided)
-    if answer.kind == "labels":
-        side = "no solid is chosen: "
-    elif look.low >= 0:
-        side = f"no value is below 0 (the smallest is {look.low:.6g}): "
-    elif look.high <= 0:
-        side = f"no value is above 0 (the largest is {look.high:.6g}): "
-    return GridError(side + said)
+def _refused(case: Case, said: str = "") -> GridError:
+    """Return the error for values that cannot be meshed; by default they need a level."""
+    before, level, side = look_at(case.given), case.wanted.level or 0.0, ""
+    value = "finite value" if before.infinite else "value"
+    if case.look.low >= 0:
+        side = f"no {value} is below {level:g} (the smallest is {before.low:.6g}): "
+    elif case.look.high <= 0:
+        side = f"no {value} is above {level:g} (the largest is {before.high:.6g}): "
+    return GridError(side + (said or which_level(before)))
 
 
 def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
@@ -236,8 +237,6 @@ def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
     case.facts = facts = answer.facts
     case.fill_in(facts.get("unknown_values", ()))
     if answer.kind == "mask":
-        if "two values" not in answer.why:
-            case.notes.append(f"the values are {answer.why}")
         return _of_sides(case)
     if answer.kind == "smooth":
         if answer.why:
@@ -259,23 +258,16 @@ def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
             f"they are divided by that (if the spacing is wrong, give --spacing)"
         )
         case.scaled(slope)
-        case.facts = facts | {"cut": [x / slope for x in facts["cut"]]}
     return _of_distances(case, case.spacing)
 
 
-def labelled(samples: SampleArray, label: int) -> SampleArray:
-    """Return which samples have a label; GridError if none or all have."""
+def labelled(samples: SampleArray, label: int) -> MadePlanes:
+    """Return which samples have a label."""
     value: Any = np.nan  # equals no sample: a label that the type does not hold is not rounded
     with np.errstate(over="ignore"), suppress(OverflowError):
         nearest = np.array(label, object).astype(samples.dtype)
         value = nearest if int(nearest) == label else value
-    mask = changed(samples, lambda planes: planes == value, np.bool_)
-    count = sum(int(np.count_nonzero(plane)) for plane in mask)
-    if 0 < count < prod(samples.shape):
-        return mask
-    labels = {x.item() for plane in samples for x in np.unique(plane)[:9]}
-    which = "every" if count else "no"
-    raise GridError(f"{which} sample has the label {label}: the labels are {named(labels)}")
+    return changed(samples, lambda planes: planes == value, np.bool_)
 
 
 # Masks
@@ -291,11 +283,9 @@ def _of_sides(case: Case) -> dict[str, Any]:
     if look.is_two:
         return _of_mask(case, partial(np.less, look.low))
     if look.low > 0 or look.high < 0:
-        raise GridError(
-            f"every value is {'above' if look.low > 0 else 'below'} 0 (they go from {look.low:.6g} "
-            f"to {look.high:.6g}), so their signs make no mask: {which_level(look_at(case.given))}"
-        )
+        raise _refused(case)
     if "step" in facts:
+        case.notes.append("they are a distance transform, so only their signs say something")
         case.set_spacing(facts["step"], "the step of the transform")
     below, zeros = border_share(look, lambda x: x < 0), facts.get("zeros", 0)
     is_positive = below > 0.5 if inside == "auto" else inside == "positive"
@@ -325,12 +315,8 @@ def _of_mask(case: Case, above: Above) -> dict[str, Any]:
 def _of_level(case: Case) -> dict[str, Any]:
     """Return values from which a level was taken, above it positive."""
     look, wanted = case.look, case.wanted
-    if look.low >= 0 or look.high <= 0:
-        before = look_at(case.given)
-        raise GridError(
-            f"no value is {'above' if look.high <= 0 else 'below'} the level {wanted.level:g} "
-            f"(they go from {before.low:.6g} to {before.high:.6g}): {which_level(before)}"
-        )
+    if look.is_one_sided:
+        raise _refused(case)
     if look.is_two or wanted.field == "mask":
         return _of_mask(case, partial(np.less, 0))
     case.fill_in()
@@ -341,77 +327,67 @@ def _of_level(case: Case) -> dict[str, Any]:
 def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     """Return values in steps of their slope beside the surface, to be meshed by their spline."""
     if case.look.is_one_sided:
-        raise GridError(f"no value is on the other side of 0: {which_level(look_at(case.given))}")
+        raise _refused(case)
     case.spacing = spacing = case.spacing or _estimated(case)
-    case.scaled(1.0 if case.wanted.scale else _slope_at_surface(case.look, steps_of(spacing)))
+    steps = steps_of(spacing)
+    slope = 1.0 if case.wanted.scale else _slope_at_surface(case.look, steps)
+    if kind == "density" and is_cubic(spacing) and _levels_off(case.look):
+        case.facts = {"cut": [case.look.low, case.look.high]}
+        case.scaled(slope)
+        return _of_distances(case, spacing, "density")
+    case.scaled(slope)
     if "inside" in case.facts:
         from .derived import without_inner_faces
 
-        deep = INNER * min(steps_of(spacing))
+        deep = INNER * min(steps)
         case.samples = without_inner_faces(case.samples, case.facts["inside"], deep)
     has_jumps = bool(case.facts.get("cut")) and kind == "smooth"
     own = Field(kind, exact=NONE_EXACT, network=None, has_jumps=has_jumps)
     return case.taken(own, case.choose_side())
 
 
+def _levels_off(look: Look) -> bool:
+    between = (look.part > look.low) & (look.part < look.high)
+    return bool(beside_surface(look.part)[between].mean() > BESIDE)
+
+
 def _slope_at_surface(look: Look, steps: ArrayLike) -> float:
     """Return the typical slope beside the surface, in world units; of steps over 0 if unknown."""
     slope = typical_slope(look, np.array(steps), look.cut)
-    if not np.isfinite(slope):
-        slope = float(np.abs(look.pairs[0] - look.pairs[1]).max(initial=0) / np.min(steps))
-    return slope or 1.0
+    steepest = float(np.abs(look.pairs[0] - look.pairs[1]).max(initial=0) / np.min(steps))
+    return slope if slope < STEEPER * steepest else steepest or 1.0
 
 
 # Distances
 
 
-def _of_distances(case: Case, spacing: Triple) -> dict[str, Any]:
+def _of_distances(case: Case, spacing: Triple, kind: str = "distance") -> dict[str, Any]:
     """Return distances, of which some may be cut off; what is missing is filled in if it helps."""
     look, cut, steps = case.look, case.facts["cut"], steps_of(spacing)
-    if case.was_unknown:  # unknown samples are taken as cut off
-        cut = [look.low, look.high]
     positive = case.choose_side()
     low = look.low if look.low in cut and look.low < 0 else -np.inf
     high = look.high if look.high in cut and look.high > 0 else np.inf
-    at = min(-low, high) / max(steps)
-    if at < FILLED:
-        case.notes.append(f"distances that are cut off {at:.3g} voxels from the surface")
-    if TOO_NEAR <= at < FILLED:
+    if (at := min(-low, high) / max(steps)) < FILLED:
         from .derived import filled_planes
 
+        case.notes.append(f"distances that are cut off {at:.3g} voxels from the surface")
         case.samples = filled_planes(case.samples, steps, (look.low, look.high))
-    exact, network = (-high, -low) if positive else (low, high), "distance"
-    kind = Field(exact=exact, network=None if at < TOO_NEAR else network)
-    return case.taken(kind, positive)
+    exact = (-high, -low) if positive else (low, high)
+    return case.taken(Field(kind, exact=exact if kind == "distance" else NONE_EXACT), positive)
 
 
 def _estimated(case: Case) -> Triple:
     """Return the spacing that the values show, with a note; GridError if they show none."""
-    look, facts = case.look, case.facts
-    if facts.get("spacing") is None and "unit" not in facts:
-        facts = recognise(case.samples, look).facts
-    found = facts.get("spacing")
+    found = case.facts.get("spacing")
     if found is None:
-        found = facts.get("unit") or _slope_at_surface(look, np.ones(3))
-    found = np.ones(3) * found
-    if not LEAST_SPACING <= found.min() <= found.max() <= MOST_SPACING:
+        found = case.facts.get("unit") or _slope_at_surface(case.look, np.ones(3))
+    x, y, z = (np.ones(3) * found).tolist()
+    if not LEAST_SPACING <= min(x, y, z) <= max(x, y, z) <= MOST_SPACING:
         raise GridError(
-            f"spacing not given: the values change by {found.max():.6g} from sample to sample; give"
-            f" --spacing, in a unit in which it is between {LEAST_SPACING:g} and {MOST_SPACING:g}"
+            f"spacing not given: the values change by {max(x, y, z):.6g} from sample to sample; "
+            f"give --spacing, in a unit in which it is between {LEAST_SPACING:g} and "
+            f"{MOST_SPACING:g}"
         )
-    if found.max() > UNEQUAL * found.min():
-        for near in found.copy():  # axes that are equal but for the error of the estimate
-            alike = np.abs(found / near - 1) <= SNAP
-            found[alike] = found[alike].mean()
-        spacing = check_spacing(found)
-        shown = ", ".join(f"{h:.6g}" for h in spacing)
-        case.notes.append(f"spacing not given: estimated as {shown} along x, y, z {APPROXIMATE}")
-        return spacing
-    measured, n = float(found.mean()), max(look.shape)
-    usual = {"1": 1.0} | {f"{a}/{b}": a / b for a in (1, 2) for b in (n, n - 1)}
-    name = min(usual, key=lambda key: abs(np.log(usual[key] / measured)))
-    if abs(measured / usual[name] - 1) > SNAP:
-        case.notes.append(f"spacing not given: estimated as {measured:.6g} {APPROXIMATE}")
-        return (measured,) * 3
-    case.notes.append(f"spacing not given: taken as {name}, the values show {measured:.6g}")
-    return (usual[name],) * 3
+    shown = f"{x:.6g}" if x == y == z else f"{x:.6g}, {y:.6g}, {z:.6g} along x, y, z"
+    case.notes.append(f"spacing not given: estimated as {shown} {APPROXIMATE}")
+    return check_spacing((x, y, z))

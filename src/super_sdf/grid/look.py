@@ -145,8 +145,6 @@ def look_at(samples: SampleArray) -> Look:
         faces += [x.copy() for x in (*ends, plane[0], plane[-1], plane[:, 0], plane[:, -1])]
         if i % 16 == 0:
             let_go(samples)
-    if high <= 0:
-        changes = np.array([np.count_nonzero(plane < 0) for plane in samples])
     part, own = _part_of(samples, changes)
     shape, together = tuple(map(int, samples.shape)), np.concatenate(faces)
     is_two = _has_two([part], low, high) and _has_two(samples, low, high)
@@ -305,13 +303,6 @@ def side_of_zeros(look: Look) -> int:
     return int(np.sign(lone[1] - lone[0]))
 
 
-def parting_level(values: Floats) -> float:
-    """Return the level that parts the values into two of least variance (Otsu's)."""
-    ordered, below = np.sort(values), np.arange(1, len(values))
-    apart = np.cumsum(ordered - ordered.mean())[:-1] ** 2 / (below * below[::-1])
-    return float(ordered[apart.argmax()])
-
-
 def last_digit(look: Look) -> float:
     """Return by how much values beside the surface typically differ at least."""
     largest = max(abs(look.low), abs(look.high))
@@ -352,7 +343,7 @@ def steps_by_axis(gradients: Floats) -> Floats:
 # What a refusal names
 
 
-def which_level(look: Look, *, signed: bool = False) -> str:
+def which_level(look: Look) -> str:
     """Return the advice to give a level: that over which neighbours differ most.
 
     It is the shortest number among those that are about as good, and never a value of a sample.
@@ -383,22 +374,19 @@ def which_level(look: Look, *, signed: bool = False) -> str:
         level = float(values[at - 1 if at else 1] + level) / 2
     outside = border_share(look, lambda x: x > level) > MOST_OUTSIDE
     option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
-    other = " (or --field smooth, if it is at 0)" if signed else ""
+    other = " (or --field smooth, if it is at 0)" if look.low < 0 < look.high else ""
     return f"they look like densities: give the level of their surface, such as {option}{other}"
 
 
-def which_label(samples: SampleArray) -> str:
-    """Return the advice to choose a label: the most frequent but 0 that is not the border's."""
-    samples = as_labels(samples)
-    found = different_values(samples)
+def which_label(found: tuple[NDArray[Any], NDArray[np.int64]] | None) -> str:
+    """Return the advice to choose a label: the most frequent after that of the background."""
     if found is None:
-        return "they are labels: choose one with --label, or some with --labels"
+        return "no solid is chosen: they are labels: choose one with --label, or some with --labels"
     distinct, counts = found
-    values, frequent = np.unique(np.stack([samples[0], samples[-1]]), return_counts=True)
-    at = np.flatnonzero((distinct != values[frequent.argmax()]) & (distinct != 0))
-    best = distinct[at[counts[at].argmax()] if len(at) else 0]
+    ordered = distinct[np.argsort(counts, kind="stable")[::-1]]
+    best = next((x for x in ordered[1:] if x), ordered[0])
     return (
-        f"they look like labels ({named(distinct.tolist())}): choose one with "
+        f"no solid is chosen: they look like labels ({named(distinct.tolist())}): choose one with "
         f"--label {round(best.item())}, or mesh all with --labels all"
     )
 

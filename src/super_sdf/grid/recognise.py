@@ -35,13 +35,11 @@ from .look import (
     different_values,
     equal_neighbours,
     last_digit,
-    parting_level,
     side_of_zeros,
     smooth_gradients,
     steps_by_axis,
     typical_slope,
     which_label,
-    which_level,
     whole_factor,
 )
 from .samples import SampleArray
@@ -58,13 +56,11 @@ FEW_LABELS = 8  # different values: rounded distances and images from 11, lesion
 FOLLOW = 0.953  # distances to .9502 (but where faces are along the axes), transforms from .957
 STAIRS = 0.2  # solids along the axes to .18, masks of others from .26
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
-NOTHING = 1e-4  # of the largest: densities that fade out are less, squares of distances from 5e-4
 ROUGH = 1.0  # fourth differences over slopes: lattices of short periods to .5, transforms from 1.5
-COUNTED = 0.93  # equal ones a step farther off: transforms 1, rounded distances and images to .87
+COUNTED = 0.98  # that are 1 where they are beside the other side: steps 1, rounded to .96
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
 # 4. Unknown samples: steps to a frequent value over the steepest ones; how many of them jump.
 JUMP = 1.5  # cut off 1.0, sentinels from 2
-MIXED = 0.05  # cut off 0, where it is also the cut-off value from .09
 # 5. Distances: share of the smooth samples whose slope is the commonest one; share of the samples
 # beside the surface that differ from two others by more than they are apart.
 SLOPES = 0.95  # exact from .98; smooth unions to .83, saturating to .36, noise of .05 to .66
@@ -78,9 +74,9 @@ NARROW = 4.5  # spacings up to which values that are cut off have too few slopes
 NEVER = 5e-4  # contradictions of these: cut off 0, fused depth images from .0018
 SLOPE_NEAR = 0.5, 1.25  # of these: cut off at half a voxel .55 to 1.05, in half the unit .5 and 2
 SLOPE_OFF = 0.25  # of rounded distances from 1
-CROWDED = 0.7  # of the uncut samples, those in the last tenth: cut off to .55, tanh from .85
 SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
 THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
+STEEP = 0.25  # spacings
 # 6. Densities: range over the smallest step; median of the sizes over the largest, with more
 # surface at 0 than at the level that parts them best; valleys per sample of a face. Distances may
 # be rounded, to this part of the spacing.
@@ -88,9 +84,6 @@ ROUNDED = 1.0
 IMAGE = 1 << 17  # 16 bits have 65,535, floats 1e6 and more
 ALIKE = 0.05  # by which ends differ between which distances were cut off: .004, images .2 to 1
 CENTRED = 0.13  # maps of density and statistics to .11, fields from .15
-AREA = 1.0  # fields to 1.11 and d^3 1.02 with centres from .15, maps from 1.14
-RISING = 0.1  # of steps between neighbours, median over steepest: images to .03, distances from .3
-VALLEY = 0.2, 1.5  # unsigned distances .3 to .6; densities .05, noise 3
 # 7. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
 # samples of all.
 NOISE = 0.05  # uniform noise of .05 to .5 voxel and Gaussian to .033; logits .087, networks .096
@@ -122,13 +115,13 @@ def recognise(
     facts: dict[str, Any] = {"cut": look.cut}
     is_mask = look.is_two and hint != "labels"
     may_be_labels = not is_mask or (look.unknown and look.low > 0)  # such as 1 and 2 beside NaN
-    if hint == "labels" or (not hint and may_be_labels and _are_labels(samples, look, facts)):
-        return Answer("labels", "", facts, which_label(samples))
+    may_be_labels = hint == "labels" or (not hint and may_be_labels)
+    if may_be_labels and (answer := _labels(samples, look, hint, facts)) is not None:
+        return answer
     if is_mask:
-        return Answer("mask", "there are two values", facts)
+        return Answer("mask", "", facts)
     if not hint and (step := _step_of_transform(look, given)):
-        why = "a distance transform, so only their sign says something"
-        return Answer("mask", why, facts | {"step": step, "zeros": side_of_zeros(look)})
+        return Answer("mask", "", facts | {"step": step, "zeros": side_of_zeros(look)})
     look = _without_sentinels(look, facts)
     if (answer := _distances(look, given, facts)) is not None:
         return answer
@@ -136,14 +129,8 @@ def recognise(
         known = facts | {"unknown_values": [0.0]}
         if (answer := _distances(look.without(0.0), given, known)) is not None:
             return answer
-    if hint == "density":
-        return Answer("density", "", facts, which_level(look))
-    if look.is_one_sided:
-        return _of_one_side(look, facts)
-    if "perhaps_unknown" in facts:
-        value = facts["perhaps_unknown"]
-        said = f"beside some of the samples that are {value:g} the values jump: --unknown {value:g}"
-        return Answer("smooth", "", facts, said)
+    if hint == "density" or look.is_one_sided:
+        return Answer("density", "", facts)
     if (steps := _steps_of_cut(look, given, facts)) is not None:
         return Answer("distance", "", facts | {"spacing": steps})
     return _of_both_sides(look, given, facts)
@@ -152,12 +139,15 @@ def recognise(
 # Questions 2 and 3: labels and masks
 
 
-def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool:
-    if look.infinite or not (factor := whole_factor([look.pairs])):
-        return False
-    found = different_values(as_labels(samples))
+def _labels(samples: SampleArray, look: Look, hint: str, facts: dict[str, Any]) -> Answer | None:
+    factor, found = whole_factor([look.pairs]), None
+    if hint or (factor and not look.infinite):
+        found = different_values(as_labels(samples))
+    answer = Answer("labels", "", facts, which_label(found))
+    if hint:
+        return answer
     if found is None or not whole_factor([found[0]]):
-        return False
+        return None
     distinct, counts = found
     pairs, part = (np.rint(x / factor) for x in (look.pairs, look.part))
     ranks = np.abs(np.diff(np.searchsorted(distinct, pairs), axis=0))
@@ -167,50 +157,45 @@ def _are_labels(samples: SampleArray, look: Look, facts: dict[str, Any]) -> bool
         inner &= (part != distinct[0]) & (part != distinct[-1])
     equal = equal_neighbours(part)[inner]
     amid, level = ((equal >= n).mean() if len(equal) else 1.0 for n in (6, 4))
-    if len(distinct) > 3 and facts["by_rank"] >= BY_RANK:
-        return bool(amid >= AMID)
-    few = len(distinct) <= FEW_LABELS and look.low >= 0
     has_cores = amid >= AMID or look.is_one_sided  # distances to boxes have none
-    return bool(few or (level >= PLATEAUS and has_cores))
+    are_few = len(distinct) <= FEW_LABELS and look.low >= 0
+    are_labels = are_few or (level >= PLATEAUS and has_cores)
+    if len(distinct) > 3 and facts["by_rank"] >= BY_RANK:
+        are_labels = amid >= AMID
+    return answer if are_labels else None
 
 
 def _step_of_transform(look: Look, given: Floats | None) -> float:
-    """Return the typical size beside the surface of values that follow from their signs, else 0.
+    """Return the typical size beside the surface of values that follow from their sides, else 0.
 
-    Samples are equal wherever the 27 signs round them are; of most transforms they all have one
-    size. So have distances to faces along the axes, which differ by their steps.
+    Samples are equal wherever the other side is beside them along as many axes; of most transforms
+    they all have one size. So have distances to faces along the axes, which differ by their steps.
     """
     fine = np.ones(3, bool) if given is None else given < 1.01 * given.min()
-    middle, largest = look.boxes[:, 2, 2, 2], max(abs(look.low), abs(look.high))
-    known = np.isfinite(look.boxes[:, 1:4, 1:4, 1:4]).all((1, 2, 3)) & (middle != 0)
+    around, middle = look.boxes[:, 1:4, 1:4, 1:4].reshape(-1, 27), look.boxes[:, 2, 2, 2]
     cut = [value for value in look.cut if value]
-    best, step, is_stepped, counts = (FOLLOW, 0), 0.0, False, look.boxes
+    known = np.isfinite(around).all(1) & (middle != 0)
+    best, step, is_stepped = (FOLLOW, 0), 0.0, False
     for sign in (1, -1):  # 0 may be on either side
-        signs = (sign * look.boxes[:, 1:4, 1:4, 1:4] > 0).reshape(-1, 27)
-        along = (signs != signs[:, 13:14])[:, FACES].any(2)[:, fine]
-        ring = known & along.any(1)
-        free = ring & ~np.isin(middle, cut)
-        x = middle[free]
-        if len(x) < max(ENOUGH, ring.sum() / 2):
+        sides = sign * around > 0
+        axes = (sides != sides[:, 13:14])[:, FACES].any(2)[:, fine].sum(1)
+        beside = known & (axes > 0)
+        free = beside & ~np.isin(middle, cut)
+        if free.sum() < max(ENOUGH, beside.sum() / 2):
             continue
+        x, patterns = middle[free], np.packbits(sides[free], axis=1)
         typical = float(np.quantile(np.abs(x), 0.5))
-        alike = np.abs(np.abs(x) - typical) <= 0.01 * typical
-        share = min(float(alike[side].mean()) for side in (x > 0, x < 0) if side.any())
-        key = np.ascontiguousarray(np.packbits(signs[free], axis=1)).view(np.uint32).ravel()
-        order = np.argsort(key, kind="stable")
-        same = np.diff(key[order]) == 0
-        if same.sum() >= 5 * ENOUGH:
-            equal = np.abs(np.diff(x[order])[same]) <= 0.01 * typical
-            share = max(share, float(equal.mean()))
-        if (share, len(x)) > best and typical > NOTHING * largest:
-            best, step, counts = (share, len(x)), typical, look.boxes[ring] * (sign / typical)
-            is_many = np.count_nonzero(~same) >= min(PATTERNS, OF_ALL * len(x))
-            has_stairs = (along[free].sum(1) > 1).mean() > STAIRS
-            is_stepped = bool(has_stairs and is_many and len(cut) < 2)
+        many, share = _share_alike(x, patterns)
+        share = max(share, _share_alike(x, (axes[free] * np.sign(x))[:, None])[1])
+        if (share, len(x)) > best:
+            best, step = (share, len(x)), typical
+            is_stepped = (axes[free] > 1).mean() > STAIRS and len(cut) < 2
+            is_stepped &= many >= min(PATTERNS, OF_ALL * len(x))
     if not (step and (is_stepped or _jump_over_0(look))):
         return 0.0
     whole = look.pairs / np.abs(look.pairs[look.pairs != 0]).min()
-    if (np.abs(whole - np.rint(whole)) <= NEARLY).all() and not _count_steps(counts, fine):
+    is_whole = fine.all() and (np.abs(whole - np.rint(whole)) <= NEARLY).all()
+    if is_whole and not _counts_steps(look.boxes / step):
         return 0.0
     rough = np.abs(np.diff(look.box_lines, 4)[..., 0]).sum(1)
     rise = np.abs(np.diff(look.box_lines[..., 1::2])[..., 0]).sum(1) / 2
@@ -218,23 +203,31 @@ def _step_of_transform(look: Look, given: Floats | None) -> float:
     return step if not len(rise) or np.median(rough) >= ROUGH * np.median(rise) else 0.0
 
 
-def _count_steps(boxes: Floats, fine: BoolArray) -> bool:
-    """Return whether whole numbers in boxes (n, 5, 5, 5) count steps to the surface.
+def _share_alike(values: Floats, keys: NDArray[Any]) -> tuple[int, float]:
+    """Return how many different keys (n, k) there are, and the share of equal values for these."""
+    found, which = np.unique(keys, axis=0, return_inverse=True)
+    order = np.argsort(which.ravel(), kind="stable")
+    same = np.diff(which.ravel()[order]) == 0
+    alike = np.abs(np.diff(values[order])[same]) <= 0.01 * np.quantile(np.abs(values), 0.5)
+    return len(found), float(alike.mean()) if len(alike) >= ENOUGH else 0.0
 
-    Then those above 0 are equal where others are beside an edge of theirs but no face, and equal
-    and larger right behind those at the surface. Distances and images that were rounded differ.
+
+def _counts_steps(boxes: Floats) -> bool:
+    """Return whether whole numbers in boxes (n, 5, 5, 5) count steps to the other side.
+
+    Then they are 1 wherever a sample of that is beside them, by faces alone or edges and corners.
     """
-    windows = np.lib.stride_tricks.sliding_window_view(boxes > 0.5, (3, 3, 3), axis=(1, 2, 3))
-    windows = windows.reshape(-1, 27, 27)
-    others = windows[..., 13:14] & ~windows
-    offsets = np.abs(np.indices((3, 3, 3)) - 1).reshape(3, 27)
-    edges = (offsets[fine].sum(0) == 2) & ~offsets[~fine].any(0)
-    values, at_face = boxes[:, 1:4, 1:4, 1:4].reshape(-1, 27), others[..., FACES].any((2, 3))
-    second = values[others[..., edges].any(2) & ~at_face]
-    third = values[:, FACES][(windows[..., 13] & ~others.any(2))[:, FACES]]
-    alike = [(np.abs(x - np.median(x)) < 0.01).mean() for x in (second, third) if len(x)]
-    farther = np.median(third if len(third) else second) if alike else 0.0
-    return bool(min(alike, default=0.0) >= COUNTED and farther > 1.5)
+    from scipy import ndimage
+
+    shares = list[float]()
+    for rank in (1, 3):
+        steps, alike = ndimage.generate_binary_structure(3, rank)[None], list[BoolArray]()
+        for side in (boxes, -boxes):
+            is_one = ndimage.binary_dilation(side < 0.5, steps)[:, 1:4, 1:4, 1:4]
+            middle = side[:, 1:4, 1:4, 1:4]
+            alike.append(((middle < 1.5) == is_one)[middle > 0.5])
+        shares.append(float(np.concatenate(alike).mean()))
+    return max(shares) >= COUNTED
 
 
 def _jump_over_0(look: Look) -> bool:
@@ -259,18 +252,12 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
         steps = steps if len(steps) else change[at]  # only beside samples that are cut off
         if not len(steps) or at.all():
             continue
-        jumps = float((steps > JUMP * np.quantile(change[~at], 0.99)).mean())
-        if jumps > 0.5:
+        if (steps > JUMP * np.quantile(change[~at], 0.99)).mean() > 0.5:
             found.append(value)
-        elif jumps > MIXED and value in look.cut:
-            facts["perhaps_unknown"] = value
-    # far inside and far outside a value may stand for "unknown" with either sign
-    found += [x for x in (look.low, look.high) if -x in found and x not in found]
     if not found:
         return look
     for value in found:
         look = look.without(value)
-    facts.pop("perhaps_unknown", None)
     facts |= {"unknown_values": found, "cut": look.cut}
     return look
 
@@ -282,8 +269,8 @@ def _distances(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answe
     """Return distances, or why they are none to a surface in the grid; None if they are none."""
     facts["digit"] = last_digit(look)
     unit = _find_unit(np.where(np.isin(look.lines, look.cut), np.nan, look.lines), given, facts)
-    enough = not look.is_one_sided or facts["smooth"] > SMOOTH_SHARE
-    if unit is None or not enough or facts["slopes"] < SLOPES:
+    ends_at_0 = look.is_one_sided and (look.low if look.low >= 0 else look.high) in look.cut
+    if unit is None or facts["slopes"] < SLOPES or ends_at_0:
         return None
     steps = unit * (np.ones(3) if given is None else given)
     facts["contradictions"] = _contradictions(look, steps, facts["digit"])
@@ -338,18 +325,16 @@ def _in_unit(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any])
         return Answer("distance", "", facts, said)
     off = 0.0 if given is None else abs(float(unit) - 1)
     if off > ANOTHER_UNIT:
-        power, short = 10.0 ** np.round(np.log10(1 / unit)), float(f"{1 / unit:.2g}")
-        scale = next((x for x in (power, short) if abs(1 / unit / x - 1) < 2e-3), 1 / unit)
         shown = ",".join(f"{x:.4g}" for x in np.unique(steps) * unit)
         said = (
             "they are distances in another unit than the spacing: multiply the values, --scale "
-            f"{scale:.6g} (or the spacing is wrong: they show {shown})"
+            f"{1 / unit:.4g} (or the spacing is wrong: they show {shown})"
         )
         return Answer("distance", "", facts, said)
     if off > facts["error"]:
         facts["slope"] = float(unit)
     if look.is_one_sided:
-        return _to_thin_walls(look, steps, facts)
+        return _of_one_sign(look, steps, facts)
     outside = -1 if border_share(look, lambda x: x < 0) > 0.5 else 1  # also if none is known
     found, changes = count_valleys(look, float(steps.min()), -outside)
     facts["seams"] = found / max(changes, 1)
@@ -359,34 +344,23 @@ def _in_unit(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any])
     return Answer("distance", "", facts)
 
 
-def _to_thin_walls(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
-    """Return distances of one side: to walls thinner than the spacing, or no surface at 0.
+def _of_one_sign(look: Look, steps: Floats, facts: dict[str, Any]) -> Answer:
+    """Return distances to walls thinner than the spacing, or that unsigned ones have no inside.
 
     Along a line of samples the field falls towards a wall and rises behind it. What the distances
     on either side leave of the way between two samples is how thick it is.
     """
-    sign = 1 if look.low >= 0 else -1
-    if (look.low if sign > 0 else look.high) in look.cut:
-        return Answer("density", "", facts, which_level(look))
     thickness = list[NDArray[Any]]()
     for axis in range(3):
-        lines = np.moveaxis(look.part, axis, 0) * (sign / steps[axis])
+        lines = np.abs(np.moveaxis(look.part, axis, 0)) / steps[axis]
         before, left, right, after = (lines[i : len(lines) - 3 + i] for i in range(4))
         falling, rising = before - left, after - right
         left_over = (falling + rising) / 2 - left - right
-        thickness.append(left_over[(np.minimum(falling, rising) > 0.25) & (left_over > -0.6)])
+        thickness.append(left_over[(np.minimum(falling, rising) > STEEP) & (left_over > -STEEP)])
     walls = np.concatenate(thickness)
-    if not len(walls):
-        said = "no wall lies between samples, so there is no surface"
-        return Answer("distance", "", facts, said)
-    if (walls > -0.25).any() and np.median(walls[walls > -0.25]) > THICK:
+    if len(walls) and np.median(walls) > THICK:
         return Answer("distance", "", facts)
-    return _unsigned(sign, float(steps.max()), facts)
-
-
-def _unsigned(sign: int, h: float, facts: dict[str, Any]) -> Answer:
-    """Return the refusal of distances without a sign; ``sign`` is that of all values."""
-    option = f"--inside {'negative' if sign > 0 else 'positive'} --offset {h:.4g}"
+    option = f"--inside {'negative' if look.low >= 0 else 'positive'} --offset {steps.max():.4g}"
     said = f"unsigned distances have no inside: mesh the shell round the surface with {option}"
     return Answer("distance", "", facts, said)
 
@@ -399,9 +373,7 @@ def _steps_of_cut(look: Look, given: Floats | None, facts: dict[str, Any]) -> Fl
     nearest = min(map(abs, look.cut), default=known)
     if nearest >= NARROW * steps.max():
         return None
-    size = np.abs(look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]) / nearest
     is_even = SLOPE_NEAR[0] < typical_slope(look, steps, look.cut) < SLOPE_NEAR[1]
-    is_even &= not size.size or float((size > 0.9).mean()) < CROWDED
     return steps if is_even and _contradictions(look, steps, facts["digit"]) <= NEVER else None
 
 
@@ -421,15 +393,13 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
             why = f"distances rounded to {digit:.3g}"
             return Answer("noisy", why, facts | {"spacing": steps})
         if not look.cut or abs(look.low + look.high) >= ALIKE * look.high:
-            return Answer("density", "", facts, which_level(look, signed=True))
+            return Answer("density", "", facts)
     middle = look.lines[np.isfinite(look.lines[:, 0, 2]), 0, 2]
     if len(middle) >= ENOUGH:
-        size, (one, other) = np.abs(middle), look.pairs
+        size = np.abs(middle)
         facts["centred"] = float(np.median(size) / np.quantile(size, 0.995))
-        at_0, best = (((one > x) != (other > x)).sum() for x in (0.0, parting_level(middle)))
-        facts["area"] = float(at_0 / max(best, 1))
-        if facts["centred"] < CENTRED and facts["area"] > AREA:
-            return Answer("density", "", facts, which_level(look, signed=True))
+        if facts["centred"] < CENTRED:
+            return Answer("density", "", facts)
     if given is not None and _is_noise(look, given, facts):
         return Answer("noisy", "distances with noise", facts | {"spacing": given})
     return Answer("smooth", "the slope is not that of a distance everywhere", facts)
@@ -442,7 +412,8 @@ def _before_rounding(
     steps = np.ones(3) if given is None else given
     if facts.get("by_rank", 0) >= BY_RANK and abs(steps.max() - 1) < SLOPE_OFF:
         return steps  # whole numbers, of neighbours one apart
-    slope = typical_slope(look, steps)
+    rise = (look.lines[..., 4] - look.lines[..., 0]) / (4 * steps)
+    slope = float(np.nanmedian(np.sqrt((rise**2).sum(1))))
     is_off = not abs(slope - 1) < SLOPE_OFF  # in another unit, if they are
     steps = steps * slope if given is None or is_off else steps
     least = MOST_DIGIT if given is not None and is_off else 0.0  # images have finer digits
@@ -466,18 +437,3 @@ def _is_noise(look: Look, steps: Floats, facts: dict[str, Any]) -> bool:
         return False
     without, allowed = (_contradictions(look, steps, facts["digit"], x) for x in (0.0, noise))
     return without > CONTRADICTIONS and allowed <= NOISE
-
-
-def _of_one_side(look: Look, facts: dict[str, Any]) -> Answer:
-    """Return densities, or unsigned distances of one slope or another."""
-    sign = 1 if look.low >= 0 else -1
-    change = np.abs(look.pairs[0] - look.pairs[1])
-    steep = float(np.quantile(change, 0.98))
-    share = np.count_nonzero(~np.isnan(look.part)) / np.prod(look.shape)
-    found = count_valleys(look, steep, sign)[0] / share / float(np.prod(look.shape)) ** (2 / 3)
-    # steps between plateaus, with noise on them, make valleys, too
-    is_rising = np.median(change) > RISING * steep
-    is_cut = (look.low if sign > 0 else look.high) in look.cut
-    if is_rising and not is_cut and VALLEY[0] < found < VALLEY[1]:
-        return _unsigned(sign, steep, facts)
-    return Answer("density", "", facts, which_level(look))

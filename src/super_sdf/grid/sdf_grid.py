@@ -94,7 +94,7 @@ class SdfGrid:
         """
         steps, axes, field = check_spacing(spacing), check_direction(direction), field or Field()
         is_sheared = np.abs(np.transpose(axes) @ np.array(axes) - np.eye(3)).max() > 2 * SKEW
-        are_distances = field.network in ("distance", "noisy")
+        are_distances = field.kind in ("distance", "noisy")
         if is_sheared and are_distances and not field.own_lattice:
             raise GridError(
                 f"direction is {in_rows(axes)}: its axes are not at right angles, and there "

@@ -1,9 +1,10 @@
 """Unknown samples, NaN or infinite or a value that stands for them: their side, and distances.
 
-An infinite sample is on the side of its sign. Others are on the side of the known samples round the
-connected region of unknown ones that they lie in. All get the cut-off of their side: the largest
-known distance there. A region with both sides beside it is filled in by what is round it if it is
-small; else the surface ends there. The whole grid is held in memory for this.
+An infinite sample is on the side of its sign; beside the other side it is as unknown as NaN. Others
+are on the side of the known samples round the connected region of unknown ones that they lie in.
+All get the cut-off of their side: the largest known distance there. A region with both sides beside
+it is filled in by what is round it if it is small; else the surface ends there. The whole grid is
+held in memory for this.
 """
 
 from __future__ import annotations
@@ -16,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import BoolArray
-from ..errors import GridError
 from ..threads import check_fits
-from .look import Extremes, Look, beside_surface, border_share
+from .look import Look, beside_surface, border_share
 from .samples import SampleArray
 
 LAYERS = 3  # of unknown samples to which the surface beside them is continued
@@ -32,16 +32,15 @@ def with_known(
 ) -> tuple[NDArray[Any], BoolArray | None, str]:
     """Return samples without unknown ones, for which some ``values`` stand, too.
 
-    Where both sides are near, they are continued linearly over ``LAYERS`` unknown samples; farther
-    away these are outside. Also returned are which samples lie in large unknown regions with both
-    sides, or none, beside them, None if none do, and a sentence on these.
+    Also returned are which samples lie in large unknown regions with both sides, or none, beside
+    them, None if none do, and a sentence on these.
     """
     from scipy import ndimage
 
     check_fits(BYTES * prod(samples.shape), "the grid with unknown samples", "crop it")
-    whole, named = np.array(samples[:]), " or ".join(f"{value:g}" for value in values)
-    if values:
-        whole[np.isin(whole, values)] = np.nan
+    whole = np.array(samples[:], np.result_type(samples.dtype, np.float32))
+    infinite = np.isinf(whole)
+    whole[np.isin(whole, values) | (infinite & beside_surface(whole))] = np.nan
     finite = whole[np.isfinite(whole)]
     low, high = float(finite.min()), float(finite.max())
     regions, number = ndimage.label(unknown := np.isnan(whole))
@@ -52,26 +51,25 @@ def with_known(
         for side in (whole > 0, whole <= 0)
     )
     unsure = (positive == negative) & (size > 0)
-    count, outer = int(size.sum()), int(size[positive & ~unsure].sum())
-    if values:
-        notes.append(
-            f"{count:,} samples are exactly {named}, where no distance is: they are taken as "
-            "unknown (write NaN where nothing was seen)"
-        )
-    notes.append(
-        f"{count + look.infinite:,} samples are unknown ({count:,} NaN, of which {outer:,} lie "
-        f"on the positive side, and {look.infinite:,} infinite): they are taken as cut off at "
-        f"{low:.6g} and {high:.6g}"
-    )
     is_open = unsure & (size > SMALL)
     if size[unsure & ~is_open].sum() > MOST_KNOWN * whole.size:
         is_open = unsure
     of_side = np.where(unsure, np.nan, np.where(positive, high, low)).astype(whole.dtype)
-    whole[unknown] = of_side[regions[unknown]]
-    whole = np.clip(whole, low, high)
-    _continue(whole, (low, high))
-    below = border_share(look, lambda x: (x < 0) & ~np.isin(x, values))
-    whole[np.isnan(whole)] = low if below > 0.5 else high
+    whole = np.where(unknown, of_side[regions], whole)
+    _continue(whole)
+    outside = low if border_share(look, lambda x: x < 0) > 0.5 else high
+    whole = np.where(np.isnan(whole), outside, whole).clip(low, high).astype(of_side.dtype)
+    if values:
+        named, count = " or ".join(f"{value:g}" for value in values), int(size.sum())
+        notes.append(
+            f"{count:,} samples are exactly {named}, where no distance is: they are taken as "
+            "unknown (write NaN where nothing was seen)"
+        )
+    count, outer = int((unknown | infinite).sum()), int(size[positive & ~unsure].sum())
+    notes.append(
+        f"{count:,} samples are unknown, of which {outer:,} without a number lie on the positive "
+        f"side: they are taken as cut off at {low:.6g} and {high:.6g}"
+    )
     if not is_open.any():
         return whole, None, ""
     unseen, count = is_open[regions], int(size[is_open].sum())
@@ -79,16 +77,15 @@ def with_known(
         f"{count:,} of the unknown samples are in regions that touch both sides of the surface: "
         "it is open there"
     )
-    which = f" (those that are exactly {named} are taken as such)" if values else ""
-    first = ", ".join(map(str, np.argwhere(unseen)[0]))
     why_open = (
-        f"{count:,} samples are unknown{which}, values[{first}] the first, in regions that touch "
-        "samples on both sides of the surface, so whether they are inside is unknown"
+        f"{count:,} samples are unknown, values[{', '.join(map(str, np.argwhere(unseen)[0]))}] the "
+        "first, in regions that touch samples on both sides of the surface, so whether they are "
+        "inside is unknown"
     )
     return whole, unseen, why_open
 
 
-def _continue(values: NDArray[Any], limits: Extremes) -> None:
+def _continue(values: NDArray[Any]) -> None:
     """Fill in unknown values beside others by straight lines through these."""
     for _ in range(LAYERS if np.isnan(values).any() else 0):
         total, count = np.zeros(values.shape), np.zeros(values.shape, np.int8)
@@ -100,18 +97,4 @@ def _continue(values: NDArray[Any], limits: Extremes) -> None:
                 np.moveaxis(total, axis, 0)[flipped][2:] += np.where(known, line, 0)
                 np.moveaxis(count, axis, 0)[flipped][2:] += known
         new = np.isnan(values) & (count > 0)
-        values[new] = np.clip(total[new] / count[new], *limits)
-
-
-def check_infinite(samples: SampleArray) -> None:
-    """Raise GridError if infinite samples are beside the surface."""
-    values = np.asarray(samples[:])
-    bad = np.argwhere(np.isinf(values) & beside_surface(values))
-    if len(bad):
-        i, j, k = bad[0].tolist()
-        raise GridError(
-            f"values[{i}, {j}, {k}] is {values[i, j, k]!s}, and a sample beside it has the other "
-            f"sign, as at {len(bad):,} infinite samples: where the surface passes between them is "
-            "unknown; replace each by a distance of the right sign (the cut-off value of its "
-            "side), or by NaN where nothing was seen"
-        )
+        values[new] = total[new] / count[new]
