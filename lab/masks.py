@@ -16,10 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from super_sdf import Mesh, make_grid, reconstruct
-from super_sdf.evaluation import sample_surface
+from super_sdf.evaluation import Sampled
 from super_sdf.labels.reconstruct import reconstruct_labels
 from super_sdf.options import DEFAULT_QUALITY
-from super_sdf.truth import Solid
 
 from .measuring import network_of
 from .rows import Row
@@ -37,7 +36,7 @@ RADII, CENTRES = (8, 16, 28), 3  # of the balls, and how many positions each has
 SIZE, FEW = 48, 6  # samples along the box diagonal of meshes, and how many parts there are
 ORGANIC = ("cow", "os-koala", "os-spot", "p2m-cat", "pmp-bunny", "pmp-elephant")
 REACH, NODES = 40, 3_000_000  # of forms from the origin, and of the lattice that finds a surface
-POINTS, DEEP = 10_000, 4  # drawn from a surface; gaps are searched so deep below the outer surface
+POINTS, DEEP = 10_000, 3  # on a surface; how deep, beyond a slice, gaps are searched
 PLACE, TURN = 7, 0  # stream of random positions, and the seed of random turns
 ZERO = (0, 0, 0)
 VESSELS: tuple[Form, ...] = (
@@ -110,24 +109,25 @@ def surface_of(field: Field) -> Mesh:
 
 
 @lru_cache(maxsize=1)
-def solids_of(scene: Scene) -> list[Solid]:
-    """Return the solids of a scene, turned at random."""
-    turn = turn_of(scene.name, TURN)
-    return [Solid(make().transformed(turn, np.zeros(3))) for make in scene.surfaces]
+def truths_of(scene: Scene) -> list[Sampled]:
+    """Return the true surfaces of a scene, turned at random."""
+    turn, seed = turn_of(scene.name, TURN), name_seed(scene.name)
+    meshes = [make().transformed(turn, np.zeros(3)) for make in scene.surfaces]
+    return [Sampled(mesh, seed, POINTS) for mesh in meshes]
 
 
 @lru_cache(maxsize=1)
 def image_of(scene: Scene, ratio: float) -> tuple[Array, Array, Array]:
     """Return the labels of samples, their spacing, and the position of sample (0, 0, 0)."""
-    vertices = np.concatenate([solid.mesh.vertices for solid in solids_of(scene)])
+    vertices = np.concatenate([true.mesh.vertices for true in truths_of(scene)])
     spacing = np.array([1, 1, ratio], float)
     random = np.random.default_rng(name_seed(scene.name, PLACE)).random(3)
     first = vertices.min(0) - (2 + random) * spacing
     shape = np.ceil((vertices.max(0) - first) / spacing).astype(int) + 3
     points = first + np.stack(np.indices(shape), -1).reshape(-1, 3) * spacing
     image = np.zeros(shape, np.int16)
-    for label, solid in enumerate(solids_of(scene), 1):
-        image[solid.is_inside(points).reshape(shape)] = label
+    for label, true in enumerate(truths_of(scene), 1):
+        image[true.solid.is_inside(points).reshape(shape)] = label
     return image, spacing, first
 
 
@@ -209,26 +209,26 @@ def measure(scene: Scene, method: str, ratio: float) -> Row:
         clock = time.process_time()
         meshes = PEERS[method](image, spacing)
         seconds = time.process_time() - clock
-    results = [Solid(stretched(mesh, 1, first)) for mesh in meshes.values()]
-    rows = [compared(true, result) for true, result in zip(solids_of(scene), results)]
+    results = [Sampled(stretched(mesh, 1, first), (), POINTS) for mesh in meshes.values()]
+    rows = [compared(true, result) for true, result in zip(truths_of(scene), results)]
     row = {key: float(np.mean([row[key] for row in rows])) for key in ("voxels", "bias", "volume")}
     row |= {key: sum(row[key] for row in rows) for key in ("faces", "open", "megabytes")}
     row |= {"seconds": seconds, "most": max(row["voxels"] for row in rows)}
     if len(results) == 1:
         return row
     depth = ndimage.distance_transform_edt(image > 0, sampling=spacing)
-    near = [sample_surface(solid.mesh, (0, 2), POINTS).points for solid in solids_of(scene)]
-    near = np.concatenate(near) + np.random.default_rng(0).uniform(-1, 1, (len(near) * POINTS, 3))
-    near = near[depth[tuple(np.rint((near - first) / spacing).astype(int).T)] > DEEP]
-    times = np.sum([result.is_inside(near) for result in results], 0)
+    near = np.concatenate([true.drawn[0] for true in truths_of(scene)])
+    near += np.random.default_rng(0).uniform(-1, 1, near.shape)
+    near = near[depth[tuple(np.rint((near - first) / spacing).astype(int).T)] > DEEP + ratio]
+    times = np.sum([result.solid.is_inside(near) for result in results], 0)
     return {**row, "gaps": float(np.mean(times == 0)), "overlaps": float(np.mean(times > 1))}
 
 
-def compared(true: Solid, result: Solid) -> Row:
+def compared(true: Sampled, result: Sampled) -> Row:
     """Return how far a mesh is from the true one, both ways, on which side, and how large it is."""
     mesh = result.mesh
-    there = result.distance(sample_surface(true.mesh, (0, 0), POINTS).points)
-    back = true.signed_distance(sample_surface(mesh, (0, 1), POINTS).points)
+    there = result.solid.distance(true.drawn[0])
+    back = true.solid.signed_distance(result.drawn[0])
     row = {"voxels": float(there.mean() + np.abs(back).mean()) / 2, "bias": float(back.mean())}
     ply = 12 * len(np.unique(mesh.faces)) + 13 * len(mesh.faces)  # bytes of a binary file
     row |= {"faces": len(mesh.faces), "open": mesh.open_edges(), "megabytes": ply / 1e6}

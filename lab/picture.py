@@ -151,7 +151,7 @@ def panels_of_mask() -> list[Panel]:
     form = masks.union([BALL, *masks.VESSELS])
     scene = masks.Scene("", "ball with vessels", (partial(masks.surface_of, form),))
     image, spacing, _ = masks.image_of(scene, 1)
-    found = {"true surface": [solid.mesh for solid in masks.solids_of(scene)]}
+    found = {"true surface": [true.mesh for true in masks.truths_of(scene)]}
     found |= {label_of(name): [masks.PEERS[name](image, spacing)[1]] for name in MASKED}
     return compared(found.items(), turn_of(scene.name, masks.TURN))
 

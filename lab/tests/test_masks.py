@@ -14,7 +14,7 @@ SCENES = {scene.name: scene for scene in masks.scenes([], [])}
 def test_a_ball_is_measured(method, monkeypatch):
     monkeypatch.setattr(masks, "NODES", 200_000)
     row, off = masks.measure(SCENES["ball-8-0"], method, 1), 0.16 + 0.3 * (method == "surfacenets")
-    assert row["open"] == 0 and abs(row["bias"]) < row["voxels"] < off
+    assert row["open"] == 0 and abs(row["bias"]) - 0.01 < row["voxels"] < off
     assert row["volume"] == pytest.approx(100 * abs(1 - (1 + row["bias"] / 8) ** 3), abs=0.4)
 
 
