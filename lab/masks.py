@@ -37,7 +37,7 @@ RADII, CENTRES = (8, 16, 28), 3  # of the balls, and how many positions each has
 SIZE, FEW = 48, 6  # samples along the box diagonal of meshes, and how many parts there are
 ORGANIC = ("cow", "os-koala", "os-spot", "p2m-cat", "pmp-bunny", "pmp-elephant")
 REACH, NODES = 40, 3_000_000  # of forms from the origin, and of the lattice that finds a surface
-POINTS, DEEP = 10_000, 4  # drawn from a surface; gaps are searched so deep below the outer surface
+POINTS, DEEP = 10_000, 3  # on a surface; how deep, beyond a slice, gaps are searched
 PLACE, TURN = 7, 0  # stream of random positions, and the seed of random turns
 ZERO = (0, 0, 0)
 VESSELS: tuple[Form, ...] = (
@@ -219,7 +219,7 @@ def measure(scene: Scene, method: str, ratio: float) -> Row:
     depth = ndimage.distance_transform_edt(image > 0, sampling=spacing)
     near = [sample_surface(solid.mesh, (0, 2), POINTS).points for solid in solids_of(scene)]
     near = np.concatenate(near) + np.random.default_rng(0).uniform(-1, 1, (len(near) * POINTS, 3))
-    near = near[depth[tuple(np.rint((near - first) / spacing).astype(int).T)] > DEEP]
+    near = near[depth[tuple(np.rint((near - first) / spacing).astype(int).T)] > DEEP + ratio]
     times = np.sum([result.is_inside(near) for result in results], 0)
     return {**row, "gaps": float(np.mean(times == 0)), "overlaps": float(np.mean(times > 1))}
 
