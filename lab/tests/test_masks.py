@@ -19,6 +19,6 @@ def test_a_ball_is_measured(method, monkeypatch):
 
 
 def test_walls_that_are_shared_leave_no_gap(monkeypatch):
-    monkeypatch.setattr(masks, "NODES", 20_000)
-    found = {name: masks.measure(SCENES["labels"], name, 5) for name in ("mc", "serra", "ours")}
+    monkeypatch.setattr(masks, "NODES", 100_000)
+    found = {name: masks.measure(SCENES["labels"], name, 1) for name in ("mc", "serra", "ours")}
     assert max(found["serra"]["gaps"], found["ours"]["overlaps"]) < 2e-4 < found["mc"]["gaps"]
