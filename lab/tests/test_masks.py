@@ -6,7 +6,6 @@ import pytest
 
 from lab import masks
 
-pytest.importorskip("serra_mesh")
 SCENES = {scene.name: scene for scene in masks.scenes([], [])}
 
 
