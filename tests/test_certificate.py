@@ -231,8 +231,6 @@ def test_the_offset_is_that_of_the_mesh(here, command):
 @pytest.mark.parametrize(
     ("words", "code", "message"),
     [
-        ("none.ply ball.npz", 1, "none.ply does not exist"),
-        ("ball.ply ball.npz --max-mean -1", 2, "Invalid value for '--max-mean': -1.0 is not in"),
         ("ball.ply ball.npz -q --tolerance nan", 1, "in world units, --tolerance is nan"),
         ("ball.ply ball.npz --offset nan", 2, "--offset is 'nan': give a finite number, in world"),
     ],
