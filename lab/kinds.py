@@ -99,7 +99,7 @@ def varying(case: Case) -> Array:
 
 def noisy(case: Case, *, amplitude: float) -> Array:
     """Return distances with uniform noise of an amplitude in voxels."""
-    random = np.random.default_rng(case.shape.seed(FIELD_NOISE))
+    random = np.random.default_rng((*case.shape.seed, FIELD_NOISE))
     noise = random.uniform(-amplitude, amplitude, case.coarse.shape) * case.spacing
     return (case.coarse + noise).astype(np.float32)
 

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from super_sdf.arrays import BoolArray, face_normals
-from super_sdf.evaluation import F1_DISTANCE, FIGURES, Comparison as Pair, nearest_or_dot
-from super_sdf.truth import Distances
+from super_sdf.arrays import BoolArray, dot, face_normals
+from super_sdf.evaluation import F1_DISTANCE, FIGURES, Comparison as Pair
+from super_sdf.truth import Distances, smallest_angles
 
 from .shapes import Shape
 
@@ -43,27 +43,26 @@ class Comparison(Pair):
 
         Points whose triangle has no area, and so no normal, are left out.
         """
-        sharp = self.reference.sharp
+        sharp, (points, own) = len(self.reference.edges) > 0, self.result.drawn
         if self.spacing is None:
             return np.zeros(0), np.zeros(0, bool)
-        if not self.drawn.normals.any():
+        if not own.any():
             near = np.array([False, True] if sharp else [False])
             return np.full(len(near), NO_NORMAL_ANGLE), near
         mesh = self.reference.mesh
         vectors = face_normals(mesh.vertices, mesh.faces)[self.back[1]]
         lengths = np.linalg.norm(vectors, axis=1)
-        known, points = lengths > 0, self.drawn.points
-        cosines = np.einsum("nd,nd->n", vectors, self.drawn.normals)[known] / lengths[known]
-        near = sharp.distance(points) < self.spacing if sharp else np.zeros(len(points), bool)
+        known = lengths > 0
+        cosines = dot(vectors, own)[known] / lengths[known]
+        near = np.zeros(len(points), bool)
+        if sharp:
+            near = self.reference.to_edges(points) < self.spacing
         return np.degrees(np.arccos(np.clip(cosines, -1, 1))), near[known]
 
     @cached_property
     def least_angles(self) -> Distances:
         """The smallest angle of each triangle, in degrees; 0 without area."""
-        corners = self.mesh.vertices.astype(np.float64)[self.mesh.faces]  # (m, 3, 3)
-        ahead, back = (np.roll(corners, step, axis=1) - corners for step in (-1, 1))
-        sine = np.linalg.norm(np.cross(ahead, back), axis=2)
-        return np.degrees(np.arctan2(sine, np.einsum("mkd,mkd->mk", ahead, back))).min(axis=1)
+        return smallest_angles(self.mesh.vertices.astype(np.float64)[self.mesh.faces])
 
 
 def mean(values: Distances | BoolArray) -> float | None:
@@ -75,9 +74,9 @@ def quantile(distances: Distances) -> float:
 
 
 def edge_distance(c: Comparison) -> float | None:
-    if c.spacing is None or not c.reference.sharp:
+    if c.spacing is None or not len(c.reference.edges):
         return None
-    return float(nearest_or_dot(c.solid, c.reference.sharp.drawn)[0].mean() / c.spacing)
+    return float(c.result.solid.distance(c.reference.drawn_from_edges).mean() / c.spacing)
 
 
 Measure = Callable[[Comparison], "float | None"]

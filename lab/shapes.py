@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from super_sdf.arrays import BoolArray, FloatArray, IntArray
 from super_sdf.errors import FileError, OptionError, seen
-from super_sdf.evaluation import Reference, frame_of, in_frame
+from super_sdf.evaluation import Sampled, frame_of, in_frame
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.options import OPTIONS
@@ -26,7 +26,7 @@ from super_sdf.refine.band import is_active, rescale
 from super_sdf.surface.mesh import Mesh
 from super_sdf.truth import Distances, Solid, load_solid, sample_solid
 
-NOISE, TURN, FIELD_NOISE = 3, 5, 6  # streams of random numbers, beside those of ``Reference``
+NOISE, TURN, FIELD_NOISE = 3, 5, 6  # streams of random numbers, beside those of ``Sampled``
 LARGEST_SIZE = 100_000  # samples along an axis; a larger grid fits into no memory
 SUFFIXES = (*MESH_SUFFIXES, ".gltf")
 
@@ -51,12 +51,12 @@ class Setting:
         return f"{self.size}^3, factor {self.factor}{more}" if self.size else "reference"
 
 
-class Shape(Reference):
+class Shape(Sampled):
     """A reference mesh in its frame, and the points that are drawn from it for all methods."""
 
     def __init__(self, name: str, mesh: Mesh) -> None:
         self.name = name
-        super().__init__(mesh)
+        super().__init__(mesh, name_seed(name))
         self.pieces = self.mesh.components()[0]
 
     @classmethod
@@ -70,18 +70,14 @@ class Shape(Reference):
         turn = np.eye(3) if turned is None else turn_of(path.stem, turned)
         return cls(path.stem, normalise(mesh.transformed(turn, np.zeros(3))))
 
-    def seed(self, stream: int) -> tuple[int, int]:
-        """Return the seed of a stream of random numbers, by the shape's name."""
-        return name_seed(self.name, stream)
-
 
 def normalise(mesh: Mesh) -> Mesh:
     """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
     return in_frame(mesh, *frame_of(mesh))
 
 
-def name_seed(name: str, stream: int) -> tuple[int, int]:
-    return zlib.crc32(name.encode(errors="surrogateescape")), stream
+def name_seed(name: str, *stream: int) -> tuple[int, ...]:
+    return zlib.crc32(name.encode(errors="surrogateescape")), *stream
 
 
 def turn_of(name: str, seed: int) -> NDArray[np.float64]:
@@ -114,7 +110,7 @@ class Case:
         self.coarse = sample_solid(shape.solid, layout, band=np.inf).values
         values = self.coarse.astype(np.float32)
         if setting.noise:
-            random = np.random.default_rng(shape.seed(NOISE))
+            random = np.random.default_rng((*shape.seed, NOISE))
             noise = random.uniform(-1, 1, self.coarse.shape) * setting.noise * self.spacing / 2
             values = (self.coarse + noise).astype(np.float32)
         self.grid = SdfGrid.trusted(values, self.spacing, origin)

@@ -23,7 +23,7 @@ from scipy import ndimage
 
 from super_sdf import load_network, make_grid, reconstruct
 from super_sdf.errors import SuperSdfError
-from super_sdf.evaluation import sample_surface
+from super_sdf.evaluation import Sampled
 from super_sdf.network.contract import Decoder
 from super_sdf.surface.mesh import Mesh
 from super_sdf.truth import Solid
@@ -512,7 +512,7 @@ def distance(truth: Mesh, mesh: Mesh, count: int, within: Array | None = None) -
         return float("nan")
     total = 0.0
     for seed, (one, other) in enumerate(((truth, mesh), (mesh, truth)), 1):
-        points = sample_surface(one, (1, seed), count).points
+        points = Sampled(one, (1, seed), count).drawn[0]
         if within is not None:
             points = points[((points > 0.1) & (points < within - 0.1)).all(1)]
         total += float(Solid(other).distance(points).mean()) / 2 if len(points) else np.inf

@@ -45,7 +45,7 @@ def test_parallel_planes(gap: float) -> None:
 
 
 def test_an_empty_result_is_a_dot_at_the_origin() -> None:
-    assert samples.sample_surface(EMPTY, (7, 1)).points.tolist() == [[0, 0, 0]]
+    assert samples.Sampled(EMPTY).drawn[0].tolist() == [[0, 0, 0]]
     cd, *others = figures(cube(), EMPTY, "cd", "f1", "nc", "signed_nc", "closed", "min_angle")
     assert cd == pytest.approx(0.25 + 1 / 6 + 0.25, rel=0.01)  # of points on the sides; of the dot
     assert others == [0, 0.5, 0, False, None]
@@ -72,13 +72,13 @@ def octagonal(cut: float) -> Mesh:
 
 def test_the_sharp_edges_of_a_cube() -> None:
     box = Mesh(cube().vertices * 0.2, CUBE_FACES)
-    sharp = samples.EdgeCurves.of(box, (7, 0))
+    sharp = samples.Sampled(box, (7,))
     assert len(sharp.edges) == 12  # not the 6 diagonals of its sides
-    assert (np.isclose(np.abs(sharp.drawn), 0.1).sum(1) >= 2).all()
-    near = samples.edge_points(samples.sample_surface(box, (7, 1)))
+    assert (np.isclose(np.abs(sharp.drawn_from_edges), 0.1).sum(1) >= 2).all()
+    near = sharp.near_edges
     off_edge = np.linalg.norm(0.1 - np.sort(np.abs(near), axis=1)[:, 1:], axis=1)
     assert len(near) and off_edge.max() < samples.EDGE_RADIUS < EDGE_DISTANCE
-    np.testing.assert_allclose(sharp.distance(near), off_edge, atol=1e-12)
+    np.testing.assert_allclose(sharp.to_edges(near), off_edge, atol=1e-12)
     ecd, ef1 = figures(box, box, "ecd", "ef1")
     assert ef1 == pytest.approx(1, abs=0.02) and 0 < ecd < 2 * samples.EDGE_RADIUS**2
     assert figures(box, EMPTY, "ef1") == [0]

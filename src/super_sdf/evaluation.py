@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from .arrays import IntArray, face_normals
+from .arrays import IntArray, dot, length
 from .errors import MeshError, OptionError, check_modules, seen
 from .surface.mesh import Mesh, check_mesh
 from .truth import Distances, Points, Solid, read_mesh
@@ -41,7 +41,8 @@ EDGE_RADIUS = 0.004
 # Nearest points that are examined: all within the radius if the area is over 0.1. On a tiny result,
 # with all 1e5 points within the radius, it bounds the work.
 EDGE_NEIGHBOURS = 64
-REFERENCE_POINTS, REFERENCE_EDGES, RESULT_POINTS, RESULT_EDGES = 0, 1, 2, 4  # streams of numbers
+RESULT = 1  # the stream of random numbers for a result
+DOT = Mesh(np.zeros((1, 3)), np.zeros((1, 3), np.int32))
 
 
 def evaluate(
@@ -91,7 +92,7 @@ def evaluate(
         truth = _read(reference)
         frame = frame_of(truth)
         placed = None if np.isnan(step) else step / frame[1]
-        pair = Comparison(Reference(in_frame(truth, *frame)), in_frame(_read(mesh), *frame), placed)
+        pair = Comparison(Sampled(in_frame(truth, *frame)), in_frame(_read(mesh), *frame), placed)
         rows.append([figure(pair) for figure in FIGURES.values()])
     return dict(zip(FIGURES, np.array(rows, np.float64).reshape(-1, len(FIGURES)).T))
 
@@ -117,198 +118,137 @@ def in_frame(mesh: Mesh, middle: NDArray[np.float64], size: float) -> Mesh:
     return Mesh((mesh.vertices.astype(np.float64) - middle) / size, mesh.faces)
 
 
-@dataclass(frozen=True, eq=False)
-class SurfacePoints:
-    """Points (n, 3) sampled on a surface, and the unit normals (n, 3) of their faces."""
+class Sampled:
+    """A mesh in the frame of its reference, and what is drawn from it with a seed.
 
-    points: Points
-    normals: Points
+    A mesh without triangles counts as a triangle without area, a dot, at the origin.
+    """
+
+    def __init__(self, mesh: Mesh, seed: Sequence[int] = (0,), count: int = SAMPLE_COUNT) -> None:
+        self.solid, self.seed, self.count = Solid(mesh if len(mesh.faces) else DOT), seed, count
+        self.mesh = self.solid.mesh
+
+    @cached_property
+    def _library(self) -> Any:
+        """The mesh as one of trimesh."""
+        import trimesh
+
+        return trimesh.Trimesh(self.mesh.vertices, self.mesh.faces, process=False)
+
+    @cached_property
+    def drawn(self) -> tuple[Points, Points]:
+        """Points (n, 3), uniform by area, and the normals there; of a dot one, and 0."""
+        from trimesh.sample import sample_surface
+
+        count = self.count if self._library.area else 1
+        points, faces = sample_surface(self._library, count, seed=self.seed)
+        order = order_in_space(points)
+        return points[order], self._library.face_normals[faces[order]]
 
     @cached_property
     def tree(self) -> Any:
-        """Return a search tree of the points."""
-        return cKDTree(self.points)
+        """A search tree of the points drawn."""
+        return cKDTree(self.drawn[0])
+
+    @cached_property
+    def edges(self) -> IntArray:
+        """The edges (e, 2) of exactly two faces whose normals differ by over 30 degrees."""
+        normals = self._library.face_normals[self._library.face_adjacency]  # (n, 2, 3)
+        is_sharp = dot(normals[:, 0], normals[:, 1]) < SHARP_COSINE
+        # A face without area has no normal, so its edges have no angle.
+        is_sharp &= normals.any(2).all(1)
+        return np.asarray(self._library.face_adjacency_edges[is_sharp])
+
+    @cached_property
+    def drawn_from_edges(self) -> Points:
+        """Points (n, 3) on the sharp edges, uniform by length."""
+        low, high = self.mesh.vertices[self.edges].swapaxes(0, 1)
+        lengths, random = length(high - low), np.random.default_rng(self.seed)
+        edge = random.choice(len(lengths), self.count, p=lengths / lengths.sum())
+        points = low[edge] + random.random((self.count, 1)) * (high - low)[edge]
+        return points[order_in_space(points)]
+
+    def to_edges(self, points: Points) -> Distances:
+        """Return the exact distance of points (k, 3) to the nearest sharp edge, (k,)."""
+        import igl
+
+        return np.sqrt(igl.point_mesh_squared_distance(points, self.mesh.vertices, self.edges)[0])
+
+    @cached_property
+    def near_edges(self) -> Points:
+        """The points drawn, (k, 3), that lie near a sharp edge; the origin if there are none.
+
+        As in NMC, NDC and PoNQ, these are the points with another one nearby whose normal differs
+        by more than the angle of sharp edges, whatever its sign: the two sides of a thin sheet are
+        no edge.
+        """
+        (points, normals), is_edge = self.drawn, []
+        for some in np.array_split(np.arange(len(points)), len(points) // 10_000 + 1):
+            at, reach = points[some], EDGE_RADIUS
+            nearby = self.tree.query(at, EDGE_NEIGHBOURS, distance_upper_bound=reach)
+            # Missing neighbours have the index n; the point itself replaces them, which is no edge.
+            other = np.where(nearby[1] == len(points), some[:, None], nearby[1])
+            cosine = np.abs(dot(normals[some, None], normals[other]))
+            is_edge.append((cosine < SHARP_COSINE).any(1))
+        found = points[np.concatenate(is_edge)]
+        return found if len(found) else DOT.vertices
 
 
-DOT = SurfacePoints(np.zeros((1, 3)), np.zeros((1, 3)))  # stands for a result without a surface
-
-
-def sample_surface(mesh: Mesh, seed: tuple[int, int], count: int = SAMPLE_COUNT) -> SurfacePoints:
-    """Return points sampled uniformly by area, in the order of ``order_in_space``.
-
-    Of a mesh without area it is one dot at the origin.
-    """
-    vectors = face_normals(mesh.vertices, mesh.faces)
-    lengths = np.linalg.norm(vectors, axis=1)
-    if not lengths.sum() > 0:
-        return DOT
-    random = np.random.default_rng(seed)
-    face = draw_index(lengths, random.random(count))
-    root, v = np.sqrt(random.random(count)), random.random(count)
-    weights = np.stack([1 - root, root * (1 - v), root * v], axis=1)  # uniform in the triangle
-    points = np.einsum("nk,nkd->nd", weights, mesh.vertices[mesh.faces[face]])
-    order = order_in_space(points)
-    return SurfacePoints(points[order], (vectors[face] / lengths[face, None])[order])
-
-
-def order_in_space(points: Points) -> Indices:
+def order_in_space(points: Points) -> NDArray[np.intp]:
     """Return an order, (n,), of points (n, 3) in which neighbours in space follow one another.
 
     A search for each of them then finds what it reads in the cache, and takes a third of the time.
     """
-    return cKDTree(points).indices
-
-
-def draw_index(weights: Distances, uniform: Distances) -> Indices:
-    """Return indices (n,) drawn in proportion to weights (m,), from numbers in [0, 1), (n,)."""
-    cumulative = np.cumsum(weights)
-    index = np.searchsorted(cumulative, uniform * cumulative[-1], side="right")
-    return np.minimum(index, np.flatnonzero(weights)[-1])  # rounding may reach past the last one
-
-
-def nearest_or_dot(solid: Solid, points: Points) -> tuple[Distances, Indices]:
-    """Return the distances of points to a mesh, (n,), and their nearest triangles, (n,).
-
-    If it has no faces, the distances are those to the origin, and the triangles -1.
-    """
-    if not len(solid.mesh.faces):
-        return np.linalg.norm(points, axis=1), np.full(len(points), -1)
-    distances, faces, _ = solid.nearest(points)
-    if not np.isfinite(distances).all():
-        raise ValueError("a point-to-triangle distance is not finite")
-    return distances, faces
-
-
-@dataclass(frozen=True, eq=False)
-class EdgeCurves:
-    """The sharp edges of a mesh, and points drawn from them."""
-
-    vertices: Points  # (n, 3), of the mesh
-    edges: IntArray  # (e, 2), the ends of each sharp edge
-    drawn: Points  # (m, 3), uniform by length, in the order of ``order_in_space``
-
-    @classmethod
-    def of(cls, mesh: Mesh, seed: tuple[int, int]) -> EdgeCurves:
-        """Return those of a mesh."""
-        edges, random = sharp_edges(mesh), np.random.default_rng(seed)
-        ends = mesh.vertices[edges]  # (e, 2, 3)
-        if not len(edges):
-            return cls(mesh.vertices, edges, np.zeros((0, 3)))
-        lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
-        low, high = ends[draw_index(lengths, random.random(SAMPLE_COUNT))].swapaxes(0, 1)
-        drawn = low + random.random((SAMPLE_COUNT, 1)) * (high - low)
-        return cls(mesh.vertices, edges, drawn[order_in_space(drawn)])
-
-    def __bool__(self) -> bool:
-        return len(self.edges) > 0
-
-    def distance(self, points: Points) -> Distances:
-        """Return the exact distance of points (k, 3) to the nearest edge, (k,)."""
-        import igl
-
-        return np.sqrt(igl.point_mesh_squared_distance(points, self.vertices, self.edges)[0])
-
-
-def sharp_edges(mesh: Mesh) -> IntArray:
-    """Return the edges (e, 2) of exactly two faces whose normals differ by over 30 degrees."""
-    vectors = face_normals(mesh.vertices, mesh.faces)
-    lengths = np.linalg.norm(vectors, axis=1)
-    edges = np.sort(mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    order = np.lexsort((edges[:, 1], edges[:, 0]))
-    _, first, count = np.unique(edges[order], axis=0, return_index=True, return_counts=True)
-    pairs = order[first[count == 2][:, None] + [0, 1]]
-    one, other = pairs.T // 3
-    # A face without area has no normal, so its edges have no angle.
-    whole = (lengths[one] > 0) & (lengths[other] > 0)
-    dot = np.einsum("nd,nd->n", vectors[one], vectors[other])
-    return edges[pairs[whole & (dot < SHARP_COSINE * lengths[one] * lengths[other]), 0]]
-
-
-def edge_points(drawn: SurfacePoints) -> Points:
-    """Return the points (k, 3) that lie near a sharp edge.
-
-    As in NMC, NDC and PoNQ, these are the points with another one nearby whose normal differs by
-    more than the angle of `sharp_edges`, whatever its sign: the two sides of a thin sheet are no
-    edge.
-    """
-    points, normals, is_edge = drawn.points, drawn.normals, []
-    for some in np.array_split(np.arange(len(points)), len(points) // 10_000 + 1):
-        nearby = drawn.tree.query(points[some], EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)
-        # Missing neighbours have the index n; the point itself replaces them, which is no edge.
-        other = np.where(nearby[1] == len(points), some[:, None], nearby[1])
-        cosine = np.abs(np.einsum("pd,pkd->pk", normals[some], normals[other]))
-        is_edge.append((cosine < SHARP_COSINE).any(1))
-    return points[np.concatenate(is_edge)]
-
-
-class Reference:
-    """A true mesh in its frame, float64, and what is drawn from it for all results."""
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.solid = Solid(mesh)
-        self.mesh = self.solid.mesh
-        self.drawn = sample_surface(self.mesh, self.seed(REFERENCE_POINTS))
-        self.sharp = EdgeCurves.of(self.mesh, self.seed(REFERENCE_EDGES))
-
-    def seed(self, stream: int) -> tuple[int, int]:
-        """Return the seed of a stream of random numbers."""
-        return 0, stream
+    return np.asarray(cKDTree(points).indices)
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
     """A result beside its reference, and what figures need of both, each computed when asked for.
 
-    Of two arrays the first is measured from the reference to the result. A mesh without faces
-    counts as a dot at the origin.
+    Of two arrays the first is measured from the reference to the result.
     """
 
-    reference: Reference
+    reference: Sampled
     mesh: Mesh
     spacing: float | None = None  # of the coarse grid, if there is one
 
     @cached_property
-    def drawn(self) -> SurfacePoints:
-        """Points drawn from the mesh."""
-        return sample_surface(self.mesh, self.reference.seed(RESULT_POINTS))
-
-    @cached_property
-    def solid(self) -> Solid:
-        """The mesh, with search trees."""
-        return Solid(self.mesh)
+    def result(self) -> Sampled:
+        """The mesh, and what is drawn from it."""
+        return Sampled(self.mesh, (*self.reference.seed, RESULT))
 
     @cached_property
     def near(self) -> tuple[tuple[Distances, Distances], tuple[Indices, Indices]]:
         """The distances of P to the nearest of Q and of Q to P, and the indices of these points."""
-        p, q = self.reference.drawn, self.drawn
-        (there, in_q), (back, in_p) = q.tree.query(p.points), p.tree.query(q.points)
+        p, q = self.reference, self.result
+        (there, in_q), (back, in_p) = q.tree.query(p.drawn[0]), p.tree.query(q.drawn[0])
         return (there, back), (in_q, in_p)
 
     @cached_property
     def cosines(self) -> tuple[Distances, Distances]:
         """n.n' of each point and the nearest of the other set."""
-        p, q, (in_q, in_p) = self.reference.drawn.normals, self.drawn.normals, self.near[1]
-        return np.einsum("nd,nd->n", p, q[in_q]), np.einsum("nd,nd->n", q, p[in_p])
+        p, q, (in_q, in_p) = self.reference.drawn[1], self.result.drawn[1], self.near[1]
+        return dot(p, q[in_q]), dot(q, p[in_p])
 
     @cached_property
     def there(self) -> Distances:
         """Distances of P to the nearest triangles of the result."""
-        return nearest_or_dot(self.solid, self.reference.drawn.points)[0]
+        return self.result.solid.distance(self.reference.drawn[0])
 
     @cached_property
     def back(self) -> tuple[Distances, Indices]:
         """Distances of Q to the nearest triangles of the reference, and these."""
-        return nearest_or_dot(self.reference.solid, self.drawn.points)
+        return self.reference.solid.nearest(self.result.drawn[0])[:2]
 
     @cached_property
     def edges_apart(self) -> tuple[Distances, Distances] | None:
         """Distances of points on the reference's edges to edge points of Q, and back to edges."""
-        if not self.reference.sharp:
+        if not len(self.reference.edges):
             return None
-        points = edge_points(self.drawn)
-        points = points if len(points) else DOT.points
-        there = cKDTree(points).query(self.reference.sharp.drawn)[0]
-        return there, self.reference.sharp.distance(points)
+        points = self.result.near_edges
+        there = cKDTree(points).query(self.reference.drawn_from_edges)[0]
+        return there, self.reference.to_edges(points)
 
 
 def chamfer(there: Distances, back: Distances) -> float:
@@ -325,7 +265,7 @@ def f1(there: Distances, back: Distances, reach: float) -> float:
 def normal_consistency(c: Comparison) -> float:
     """Return the mean absolute cosine of the angles between normals, both ways."""
     there, back = (float(np.abs(cosines).mean()) for cosines in c.cosines)
-    return (there + back) / 2 if c.drawn.normals.any() else NO_NORMAL_NC
+    return (there + back) / 2 if c.result.drawn[1].any() else NO_NORMAL_NC
 
 
 def edge_f1_in_voxels(c: Comparison) -> float | None:
@@ -333,13 +273,12 @@ def edge_f1_in_voxels(c: Comparison) -> float | None:
 
     The edge points of EF1 lie up to 0.004 beside an edge: at 64^3 a perfect result would score 0.5.
     """
-    sharp = c.reference.sharp
-    if c.spacing is None or not sharp:
+    if c.spacing is None or not len(c.reference.edges):
         return None
-    curves = EdgeCurves.of(c.solid.mesh, c.reference.seed(RESULT_EDGES))
-    if not curves:
+    if not len(c.result.edges):
         return 0.0
-    there, back = curves.distance(sharp.drawn), sharp.distance(curves.drawn)
+    there = c.result.to_edges(c.reference.drawn_from_edges)
+    back = c.reference.to_edges(c.result.drawn_from_edges)
     return f1(there, back, VOXEL_SHARE * c.spacing)
 
 
