@@ -1,8 +1,7 @@
-"""What tests of processes and batches share: signals, ends, patience on a busy machine, rows."""
+"""What tests of processes share: signals that they hear, their ends, patience on a busy machine."""
 
 from __future__ import annotations
 
-import json
 import signal
 import subprocess
 import sys
@@ -10,7 +9,6 @@ import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import psutil
@@ -23,10 +21,6 @@ from super_sdf.cli.main import main
 run.count_cores = lambda: 2
 main()
 """
-FAST = ("--quality", "fast")
-PLAIN = ("--jobs", 1, "--factor", 2, "--spacing", 1, "--origin", 0)
-LONE = (*PLAIN, *FAST)
-CONSTANT = "every value is 1: a constant field has no surface"
 PATIENCE = 600  # seconds, after which something hangs, however busy the machine is
 
 
@@ -77,8 +71,3 @@ def larger_grids(count: int) -> None:
     """Write grids that take a moment, below ``in``."""
     for i in range(count):
         np.save(f"in/more{i}.npy", ball(32, 10 + i / 40).values)
-
-
-def rows(folder: str = "out") -> list[dict[str, Any]]:
-    """Return the rows of a batch's report."""
-    return [json.loads(line) for line in Path(folder, "report.jsonl").read_text().splitlines()]

@@ -13,19 +13,9 @@ import numpy as np
 import psutil
 import pytest
 import trimesh
+from batches import CONSTANT, FAST, LONE, files, rows
 from conftest import ball
-from processes import (
-    COMMAND,
-    CONSTANT,
-    FAST,
-    LONE,
-    PATIENCE,
-    all_end,
-    larger_grids,
-    rows,
-    start_command,
-    wait_for_lines,
-)
+from processes import COMMAND, PATIENCE, all_end, larger_grids, start_command, wait_for_lines
 
 import super_sdf
 from super_sdf.batch import work as batch_work
@@ -52,12 +42,6 @@ def batch(command):
         return code, json.loads(said), err
 
     return go
-
-
-def files(folder="out"):
-    """Return what is in a folder and not hidden, with the times of change."""
-    found = sorted(path for path in Path(folder).rglob("[!.]*") if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.stat().st_mtime_ns for path in found}
 
 
 def contents():

@@ -12,19 +12,9 @@ import numpy as np
 import psutil
 import pytest
 import trimesh
+from batches import CONSTANT, FAST, PLAIN, rows
 from distributed import Client
-from processes import (
-    CONSTANT,
-    FAST,
-    PATIENCE,
-    PLAIN,
-    all_end,
-    larger_grids,
-    rows,
-    start_command,
-    wait_for_lines,
-    wait_until,
-)
+from processes import PATIENCE, all_end, larger_grids, start_command, wait_for_lines, wait_until
 
 from super_sdf import __version__
 from super_sdf.batch import cluster

@@ -13,7 +13,7 @@ from urllib.request import url2pathname
 import numpy as np
 import pytest
 import trimesh
-from processes import CONSTANT, LONE
+from batches import CONSTANT, LONE
 from solids import wedge
 
 from super_sdf import Mesh, SdfGrid, reconstruct, write_mesh
