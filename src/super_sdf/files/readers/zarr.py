@@ -2,7 +2,7 @@
 
 They are (z, y, x) unless OME metadata, names of dimensions as xarray writes them, or ``--axes`` say
 otherwise. OME's are levels of an image, of versions 0.4 and 0.5 of OME-NGFF: see
-https://ngff.openmicroscopy.org/0.5/, ``multiscales`` metadata. Codecs that the metadata names are checked
+https://ngff.openmicroscopy.org/0.5/, ``multiscales`` metadata. The codecs of all arrays are checked
 before anything is unpacked.
 """
 
