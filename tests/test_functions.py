@@ -104,10 +104,11 @@ def test_an_offset_is_where_the_function_has_it(sign):
     assert is_on(lambda points: torus(points) - 0.1, mesh)
 
 
+@pytest.mark.programs
 @pytest.mark.parametrize("columns", [(), (1,)])
 def test_a_module_of_pytorch_is_taken(columns):
     """It gets tensors of the type of its parameters; NumPy takes none that has gradients."""
-    torch = pytest.importorskip("torch")
+    import torch
 
     class Ball(torch.nn.Linear):
         def forward(self, points):

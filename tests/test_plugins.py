@@ -22,6 +22,9 @@ FILES = {
     "slicer": "SuperSdf/SuperSdf.py",
     "napari": "napari_super_sdf/__init__.py",
 }
+PROGRAMS = [
+    pytest.param(name, marks=pytest.mark.programs if name == "blender" else ()) for name in FILES
+]
 LABELS = np.zeros((14, 16, 18), np.uint8)
 LABELS[3:11, 3:9, 4:14], LABELS[3:11, 9:13, 4:12] = 1, 2
 BALL = pyvista.ImageData(dimensions=(16, 17, 18), spacing=(0.5,) * 3, origin=(1, 2, 3))
@@ -52,14 +55,12 @@ def load(monkeypatch):
             for parent in ("qt", "paraview", "paraview.util", "slicer", "napari"):
                 monkeypatch.setitem(sys.modules, parent, MagicMock())
             monkeypatch.setitem(sys.modules, name, module)
-        if program == "blender":
-            pytest.importorskip("bpy")
         return SimpleNamespace(**runpy.run_path(str(ROOT / program / FILES[program])))
 
     return run
 
 
-@pytest.mark.parametrize("program", FILES)
+@pytest.mark.parametrize("program", PROGRAMS)
 def test_a_plugin_is_short_and_says_how_super_sdf_is_installed(program, load, monkeypatch, caplog):
     assert len((ROOT / program / FILES[program]).read_text().splitlines()) <= 150
     plugin, blender = load(program), MagicMock()
@@ -98,7 +99,7 @@ def test_paraview_makes_the_mesh_of_the_library(load, caplog):
     made.SetLevel(99)
     made.Update()
     assert not made.GetOutputDataObject(0).GetNumberOfCells()
-    assert "super-sdf: no value is above the level 99" in caplog.text
+    assert "super-sdf: no value is above 99" in caplog.text
 
 
 def test_slicer_gets_closed_segments_where_the_labels_are(load):
@@ -142,21 +143,26 @@ def test_napari_gets_surfaces_in_the_place_of_their_layer(load):
     assert 0 < len(few) < len(faces)
 
 
+@pytest.mark.programs
 def test_napari_takes_the_manifest_and_the_layers(load):
+    import napari.layers as layers
+    import npe2
+
     manifest = ROOT / "napari" / "napari_super_sdf" / "napari.yaml"
-    found = pytest.importorskip("npe2").PluginManifest.from_file(manifest)
+    found = npe2.PluginManifest.from_file(manifest)
     assert len(found.contributions.widgets) == 2
-    layers = pytest.importorskip("napari.layers")
     made = load("napari").labels_to_surfaces(layers.Labels(LABELS, **PLACE))[0]
     points = made[0][0] * PLACE["scale"] + PLACE["translate"]
     extent = layers.Layer.create(*made).extent.world
     assert np.allclose(extent, (points.min(0), points.max(0)), atol=1e-3)
 
 
+@pytest.mark.programs
 def test_blender_imports_a_mesh_object(load, tmp_path):
+    import bpy
+
     plugin, mesh, path = load("blender"), reconstruct(grid_from_image(BALL)), tmp_path / "ball.vti"
     BALL.save(path)
-    bpy = pytest.importorskip("bpy")
     bpy.ops.wm.read_factory_settings(use_empty=True)
     plugin.register()
     assert bpy.ops.import_mesh.super_sdf(filepath=str(path), scale=0.001) == {"FINISHED"}

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import FileError, GridError
-from ..formats import check_beside, files_of, split_header
+from ..formats import check_beside, split_header
 from . import DENSITY, LABELS, Index, Names, Request, Volume, from_affine, kept_of, one_unit, triple
 
 SPACES = dict.fromkeys(("right-anterior-superior", "ras"), "RAS")
@@ -181,8 +181,6 @@ def read_nifti(request: Request) -> Volume:
     """
     import nibabel
 
-    for other in files_of(request.path)[1:]:  # of a ``.hdr``
-        check_beside(request.path, other.name)
     image: Any = nibabel.load(request.path, mmap=False)
     proxy, shape, header = image.dataobj, image.shape, image.header
     place: dict[str, Any] = {"index": request.pick(shape, kept=(0, 1, 2))}
