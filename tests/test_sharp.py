@@ -129,16 +129,21 @@ def test_no_triangles_intersect_with_features_everywhere(features_everywhere):
     assert intersections(extract_sharp(*fields[0])) > 100
 
 
-def test_features_that_bring_the_mesh_no_nearer_to_the_spheres_are_dropped(features_everywhere):
-    """Of a ball, few are left where none is sure, and thousands if all are."""
-    field = upsample(ball(16, 5.0), load_network("fast"), 4)
-    everywhere = np.ones(len(field.voxel_ijk), bool)
-    features_everywhere.setattr(features, "voxels_near_kinks", lambda *of: everywhere)
-    plain = len(extract_mesh(field, mesher="marching").vertices)
-    sure = len(extract_sharp(field).vertices) - plain
-    for name in ("SURE_COSINE", "SURE_TRUST"):
-        features_everywhere.setattr(features, name, np.inf)
-    assert sure > 1000 and len(extract_sharp(field).vertices) - plain < 0.1 * sure
+@pytest.mark.parametrize("radius", [0.5, 0.8])
+def test_edges_of_a_rounded_box_are_dropped_since_they_are_off_the_spheres(monkeypatch, radius):
+    """A rule that takes all for edges sets hundreds of features there."""
+    half, middle = np.array([4.2, 3.1, 2.3]), 10.13
+    grid = SdfGrid.trusted(box_grid(half, 20, middle) - radius, 1.0)
+    field = upsample(grid, load_network("fast"), 4)
+    monkeypatch.setattr(features, "load_rule", lambda: features.Rule(1.0, ()))
+
+    def worst(mesh):
+        return np.abs(box_distance((mesh.vertices - middle) @ TURN, half) - radius).max()
+
+    monkeypatch.setattr(features, "SURE_COSINE", np.inf)
+    assert worst(extract_sharp(field)) < 0.04
+    monkeypatch.setattr(features, "no_gain", lambda *of: np.zeros(len(of[2]), bool))
+    assert worst(extract_sharp(field)) > 0.14
 
 
 def test_a_blade_and_a_gap_do_not_intersect():

@@ -278,7 +278,7 @@ class Result:
         if grid.low >= self.options.offset:
             thin = "no sample lies inside: the solid is thinner than the spacing"
             warnings.append(f"{thin}, and its mesh may have holes")
-        if self.whole.noisy and field.network and not field.sides_only:
+        if self.whole.noisy and field.has_exact:
             share = 100 * self.whole.noisy / self.whole.count
             differ = f"in {share:.3g} % of the band the values differ by more than distances can"
             warnings.append(f"{differ}: they are taken as noisy there, and corrected")

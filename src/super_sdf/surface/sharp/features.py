@@ -49,6 +49,7 @@ from .patches import (
 )
 from .planes import (
     LARGEST_RADIUS,
+    NEAR,
     ROUNDS,
     TOUCHED_ALONG,
     TOUCHING,
@@ -78,15 +79,18 @@ LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and 
 # Of features that are surely sharp: share, cosine of the two faces, logarithm of the trust in the
 # flattest ground. With all others of 63 shapes at 32^3 come nine tenths of what brings no gain.
 SURE_SHARE, SURE_COSINE, SURE_TRUST = 0.9, -0.3, -0.6
-# Coarse spacings: from a sphere to the feature that it passes by, and to the nearer of both meshes
-PASSES_BY, OFF_MESH = 0.1, 0.15
+# Coarse spacings from a sphere: to a feature round which triangles are measured, to a feature that
+# is compared, to the nearer of both meshes
+PASSES_BY, COMPARED_TO, OFF_MESH = 0.1, 1.5, 0.15
 LEAST_GAIN, EXACT = 0.2, 0.01  # of what is left after, beyond what is exact in coarse spacings
 SIDES: tuple[Literal["left", "right"], ...] = "left", "right"
 TEMPORARIES = 500  # numbers per patch in the search for its spheres among 125 samples
 # Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
 # is the fan beside.
 REACH_IN_CELLS = RINGS + ROUNDS + 2 * CHAIN_ROUNDS + 2 * MOVED_RINGS + REACH + 7
-REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
+# Further: whether a voxel is examined depends on those beside it; spheres are compared with the
+# triangles round features near them.
+REACH_IN_VOXELS = 2 + 2 * NEAR
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,17 +225,19 @@ def no_gain(
     centre = factor * (centre + 0.5)
     radius = np.abs(spheres.distance) / 2  # in coarse spacings
     peak = placed.peak[np.searchsorted(placed.feature, feature)]
-    beyond = length(centre[number] - peak[:, None]) / factor - radius[number]
-    passes = (number >= 0) & (radius[number] < LARGEST_RADIUS) & (np.abs(beyond) < PASSES_BY)
-    fan, sphere = np.nonzero(passes)[0], number[passes]
+    beyond = np.abs(length(centre[number] - peak[:, None]) / factor - radius[number])
+    usable = (number >= 0) & (radius[number] < LARGEST_RADIUS)
+    fan, sphere = np.nonzero(passes := usable & (beyond < PASSES_BY))[0], number[passes]
     plain = replace(placed, position=own.point, feature=feature[:0], peak=peak[:0])
-    off = np.empty((2, len(fan)))
+    off = np.full((2, len(radius)), np.inf)  # of spheres from the triangles round features
     for each, mesh in zip(off, (plain, placed)):
-        each[:] = _distance_from_fans(patches, mesh, feature, fan, centre[sphere]) / factor
-    off = np.abs(off - radius[sphere])
-    near = np.flatnonzero(off.min(0) < OFF_MESH)
-    weights = *off[:, near], np.ones(len(near))
-    sums = [np.bincount(fan[near], each, len(feature)) for each in weights]
+        apart = _distance_from_fans(patches, mesh, feature, fan, centre[sphere])
+        np.minimum.at(each, sphere, apart / factor)
+    off = np.abs(off - radius)
+    near = usable & (beyond < COMPARED_TO) & (off.min(0) < OFF_MESH)[number]
+    fan, sphere = np.nonzero(near)[0], number[near]
+    weights = *off[:, sphere], np.ones(len(fan))
+    sums = [np.bincount(fan, each, len(feature)) for each in weights]
     before, after, count = _mean_along_chain(fans, np.stack(sums, 1)).T
     return np.asarray(before - after <= LEAST_GAIN * (after - EXACT * count))
 
