@@ -120,6 +120,7 @@ def off(mesh, direction: np.ndarray | None = None, origin: np.ndarray = ORIGIN) 
     return np.min([np.linalg.norm(turned - np.array(m), axis=1) - r for m, r in balls], axis=0)
 
 
+SEEN = np.where(np.abs(two_parts()) < 2.5, two_parts(), np.nan)
 KINDS = {
     "mask": (two_parts() < 0, {}, 0.6),
     "label": (np.where(two_parts() < 0, 3, 1), {"label": 3}, 0.6),
@@ -136,11 +137,7 @@ KINDS = {
     "scaled": (two_parts() * (two_parts() + 60) * 7, {"field": "smooth"}, 0.12),
     "truncated at .5": (np.clip(two_parts(), -1.25, 1.25), {}, 0.3),
     "truncated at 1": (np.clip(two_parts(), -2.5, 2.5), {}, 0.2),
-    "truncated at 1, unknown beyond": (
-        np.where(np.abs(two_parts()) < 2.5, two_parts(), np.nan),
-        {},
-        0.2,
-    ),
+    "truncated at 1, unknown beyond": (SEEN, {}, 0.2),
     "truncated at 2": (np.clip(two_parts(), -5, 5), {}, 0.08),
 }  # fmt: skip
 TAKEN = {"label": "mask", "transform": "mask", "scaled": "smooth", "truncated": "distance"}

@@ -83,12 +83,10 @@ KINDS = {
     "a plane half-way between samples": (np.indices((12, 12, 12))[0] - 5.5, "distance"),
     "two balls": (np.minimum(torus(), box()), "distance"),
     "a wall": (thin_frame(), "distance"),
-    "cut off far away": (np.clip(box(), -3.5, 4), "distance"),
     "cut off at 1": (np.clip(box(), -1, 1), "distance"),
     "cut off unevenly": (np.clip(box(), -1, 2.5), "distance"),
     "cut off at 0.5": (np.clip(box(), -0.5, 0.5), "distance"),
     "unknown beyond 2": (np.where(np.abs(torus()) > 2, np.nan, torus()), "distance"),
-    "unknown beyond 3": (np.where(np.abs(box()) > 3, np.nan, box()), "distance"),
     "rounded to tenths": (np.rint(10 * box()) / 10, "distance"),
     "rounded to whole numbers": (np.rint(torus()), "noisy"),
     "the whole part": (np.trunc(torus()), "noisy"),
@@ -177,7 +175,6 @@ def stack() -> np.ndarray:
 
 ORGANS = MASK * 2 + (box() < 0)
 LABELS = {
-    "bytes": ORGANS.astype(np.uint8),
     "long": ORGANS.astype(np.int64),
     "with gaps": np.array([0, 7, 100, 117])[ORGANS],
     "one in the other": sum(mask.astype(np.uint8) for mask in (box() < 0, box() < -2.5, box() < 2)),

@@ -201,7 +201,6 @@ WRONG = {
     "flat.off": (off(BOX * [1, 1, 0], FACES), "is flat: it encloses no volume"),
     "cloud.ply": (POINTS, "holds no triangle"),
     "text.ply": (b"no mesh", "cannot be read as a mesh: "),
-    "lines.obj": (b"v 0 0 0\nv 1 0 0\nl 1 2\n", "holds no triangle"),
     "empty.stl": (b"", "is empty"),
     "deep.gltf": (b"[" * 99999, "cannot be read"),
 }

@@ -255,9 +255,7 @@ def test_what_is_missing_for_cuda_is_named(cuda_session, monkeypatch, missing, r
     if missing == "the provider":
         monkeypatch.setattr(ort, "get_available_providers", lambda: [CPU])
     monkeypatch.setattr(ctypes, "CDLL", no_library(missing))
-    with pytest.raises(DeviceError) as caught:
-        onnx.check_cuda()
-    assert str(caught.value) == reason
+    assert refusal(DeviceError, onnx.check_cuda) == reason
 
 
 def test_a_provider_that_falls_back_or_fails_is_an_error(cuda_session):
