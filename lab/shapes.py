@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from super_sdf.arrays import BoolArray, FloatArray, IntArray
 from super_sdf.errors import FileError, OptionError, seen
-from super_sdf.evaluation import Sampled, frame_of, in_frame
+from super_sdf.evaluation import Sampled, frame_of
 from super_sdf.files.meshes import MESH_SUFFIXES
 from super_sdf.grid.sdf_grid import SdfGrid, make_grid
 from super_sdf.options import OPTIONS
@@ -73,7 +73,7 @@ class Shape(Sampled):
 
 def normalise(mesh: Mesh) -> Mesh:
     """Return a mesh, float64, centred on its bounding box and scaled to a box diagonal of 1."""
-    return in_frame(mesh, *frame_of(mesh))
+    return mesh.transformed(*frame_of(mesh))
 
 
 def name_seed(name: str, *stream: int) -> tuple[int, ...]:

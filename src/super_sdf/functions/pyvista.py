@@ -10,19 +10,14 @@ entry point ``pyvista.accessors`` of the package.
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import pyvista
 from typing_extensions import Unpack
 
 from .. import SdfGrid, grid_from_image, reconstruct
 from ..errors import check_modules
-from ..options import MesherName, Options, Quality, Values
-
-if TYPE_CHECKING:
-    from ..network.contract import Decoder
-    from ..threads import Progress
+from ..options import Options, Values
 
 
 @pyvista.register_dataset_accessor("super_sdf", pyvista.ImageData)
@@ -61,15 +56,8 @@ class ImageAccessor:
         factor: int | None = None,
         *,
         scalars: str | None = None,
-        quality: Quality | str | Path | None = None,
-        network: Decoder | None = None,
         residuals: bool = False,
-        offset: float = 0.0,
-        cap: bool = True,
-        mesher: MesherName = "auto",
-        max_memory: int | None = None,
-        progress: Progress | None = None,
-        **values: Unpack[Values],
+        **how: Any,
     ) -> pyvista.PolyData:
         """Return the surface of the solid, refined, as triangles in world coordinates.
 
@@ -77,9 +65,9 @@ class ImageAccessor:
 
         Parameters
         ----------
-        factor, quality, network, offset, cap, mesher, max_memory, progress
-            See ``reconstruct``.
-        scalars, inside, field, label, level, scale, unknown
+        factor, **how
+            Keywords of ``reconstruct``, and what the values are, as in ``grid``.
+        scalars : str, optional
             See ``grid``.
         residuals : bool
             Also return the array "residual" of the points, float32: how far the surface is from
@@ -98,22 +86,15 @@ class ImageAccessor:
         """
         if residuals:
             check_modules("residuals=True", "report", ("igl",))
-        grid = self.grid(scalars, max_memory=max_memory, **values)
-        mesh = reconstruct(
-            grid,
-            network,
-            factor,
-            quality=quality,
-            offset=offset,
-            cap=cap,
-            mesher=mesher,
-            max_memory=max_memory,
-            progress=progress,
-        )
+        most = how.get("max_memory")
+        values = {name: how.pop(name) for name in Values.__annotations__ if name in how}
+        grid = self.grid(scalars, max_memory=most, **cast(Any, values))
+        mesh = reconstruct(grid, factor=factor, **how)
         surface = pyvista.PolyData.from_regular_faces(mesh.vertices, cast(Any, mesh.faces))
         if residuals:
             from ..check import check_mesh
 
-            found = check_mesh(mesh, grid, Options(offset=offset, max_memory=max_memory))
+            options = Options(offset=how.get("offset", 0.0), max_memory=most)
+            found = check_mesh(mesh, grid, options)
             surface.point_data["residual"] = found.residuals_at(mesh.vertices)
         return surface

@@ -34,7 +34,7 @@ ONE_WAY = 0.1  # least cosine by which a triangle may have turned
 IN_PLANE, TOUCHING = 1e-7, 1e-5  # fine spacings off a plane, and by which triangles may overlap
 FLAT = 1e-6  # twice the area of triangles, in squared fine spacings, whose vertices may coincide
 COMPARED, MOST_OTHER = 1000, 0.25  # samples at which function and grid are compared
-DISTANCES, HALVINGS = (0.5, 1.0, 2.0, 4.0), 10  # fine spacings to a surface farther off, and then
+FARTHEST, TRIES = 4.0, 12  # fine spacings to a surface that is found by its change of sign
 ROUNDS = 4  # of steps along the gradient
 REACHED = 0.25  # of the value at the start, above which the surface is not in reach
 TURNED = 0.96592  # cosine of 15 degrees: triangles at 30 are half of it from their mean
@@ -153,19 +153,14 @@ def cross_over(value: Value, start: Vectors, before: Numbers, normals: Vectors) 
 
     The surface is sought in doubled steps, to the side that the sign says, and then by halving.
     """
-    ways, points = -np.sign(before)[:, None] * normals, start.copy()
-    low, high = np.zeros(len(start)), np.full(len(start), np.nan)
-    for distance in DISTANCES:
-        rows = np.flatnonzero(np.isnan(high))
-        crossed = value(start[rows] + distance * ways[rows]) * before[rows] <= 0
-        high[rows[crossed]], low[rows[~crossed]] = distance, distance
-    rows = np.flatnonzero(~np.isnan(high))
-    for _ in range(HALVINGS):
-        middle = (low[rows] + high[rows]) / 2
-        crossed = value(start[rows] + middle[:, None] * ways[rows]) * before[rows] <= 0
-        high[rows[crossed]], low[rows[~crossed]] = middle[crossed], middle[~crossed]
-    points[rows] += (low[rows] + high[rows])[:, None] / 2 * ways[rows]
-    return points
+    ways = -np.sign(before)[:, None] * normals
+    low, high = np.zeros(len(start)), np.full(len(start), np.inf)
+    for _ in range(TRIES):
+        middle = np.minimum((low + high) / 2, np.clip(2 * low, REACH, FARTHEST))
+        crossed = value(start + middle[:, None] * ways) * before <= 0
+        low, high = np.where(crossed, low, middle), np.where(crossed, middle, high)
+    found = np.isfinite(high)
+    return start + np.where(found, (low + high) / 2, 0)[:, None] * ways
 
 
 def step_down(value: Value, start: Vectors, before: Numbers) -> tuple[Vectors, Numbers]:
@@ -229,10 +224,10 @@ def without_folds(
         now = rounded(points)
         normals = face_normals(now, faces)
         folded = faces[(dot(unit(normals), original) < ONE_WAY) | (length(normals) < FLAT)]
-        pairs = np.stack(overlapping_boxes(now, faces, suspect))
-        flat = faces[pairs[:, overlapping_in_plane(now, *faces[pairs])]]
-        pairs = np.concatenate(intersecting(now, *faces[pairs]), axis=1)
-        back = np.unique(np.concatenate([part.ravel() for part in (pairs, flat, folded)]))
+        pairs = faces[np.stack(overlapping_boxes(now, faces, suspect))]  # (2, m, 3)
+        flat = pairs[:, overlapping_in_plane(now, *pairs)]
+        crossed = intersecting(now, *pairs)
+        back = np.unique(np.concatenate([each.ravel() for each in (*crossed, flat, folded)]))
         back = back[(points[back] != before[back]).any(1)]
         if not len(back):
             break
@@ -246,18 +241,14 @@ def overlapping_in_plane(points: Vectors, first: NDArray[Any], second: NDArray[A
 
     Two convex shapes do unless a side of one of them separates them.
     """
-    one, other = points[first], points[second]  # (m, 3, 3)
-    normals = unit(face_normals(points, first))
-    heights = dot(other - one[:, :1], normals[:, None])
+    both, normals = points[np.stack([first, second])], unit(face_normals(points, first))
+    heights = dot(both[1] - both[0, :, :1], normals[:, None])
     overlap: BoolArray = np.abs(heights).max(1, initial=0) < IN_PLANE
-    rows = np.flatnonzero(overlap)
-    one, other, normals = one[rows], other[rows], normals[rows]
-    for triangle in (one, other):
-        for k in range(3):
-            across = np.cross(normals, triangle[:, k] - triangle[:, k - 1])[:, None]
-            mine, theirs = dot(one, across), dot(other, across)
-            beyond = np.minimum(mine.max(1), theirs.max(1)) - np.maximum(mine.min(1), theirs.min(1))
-            overlap[rows] &= beyond > TOUCHING
+    both = both[:, overlap]  # (2, k, 3, 3)
+    sides = np.concatenate(both - np.roll(both, 1, axis=2), axis=1)  # (k, 6, 3)
+    along = np.cross(normals[overlap, None], sides) @ both.swapaxes(2, 3)  # (2, k, 6, 3)
+    beyond = along.max(3).min(0) - along.min(3).max(0)
+    overlap[overlap] = (beyond > TOUCHING).all(1)
     return overlap
 
 

@@ -14,7 +14,6 @@ neighbours stay neighbours; a mesh is the wall round one label.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cached_property
 from itertools import product
 from threading import Lock
@@ -22,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import BoolArray, face_normals, length
+from ..arrays import BoolArray
 from ..surface.mesh import Mesh, row_keys
-from ..truth import Points, Solid, smallest_angles
+from ..truth import Points, Solid
 from .measuring import Original, find
 from .walls import Walls, irregular, labels_apart
 
@@ -34,8 +33,6 @@ ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # the error, those of the second do at some places, and leave a fifth fewer triangles.
 PLANE_DISTANCES = (1.0,), (1.4, 1.4, 1.4), (1.7, 1.7)
 ROUNDS, RISE = 15, 4.0  # of the threshold; fewer leave exact planes in pieces
-FEW_SLIVERS = 0.002  # of the triangles, which stay
-THIN, LOW, STEADY = 0.5, 0.3, 0.7  # of slivers: degrees; height over the error; cosine of normals
 MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
 # A number of triangles is sought by the error that leaves as many.
 MOST_ERRORS = 12  # that are tried
@@ -113,8 +110,6 @@ def collapsed(
             kept.append(np.asarray(held[result.faces].all(1)))
             for distance in steps:
                 result, held = collapse_edges(result, held, distance * unit)
-            if number == len(passes) - 1:
-                result = turn_edges(result, held, LOW * error)
             stages.append((result, Solid(result)))
         wrong = examine(of, *stages[-1], error)
         if wrong is None or not len(wrong):
@@ -220,41 +215,3 @@ def collapse_edges(
     held = np.zeros(len(moved), bool)
     held[pinned[:, 0]] = True
     return Walls(vertices, faces[~is_mark], sides), held
-
-
-def turn_edges(walls: Walls, held: BoolArray, distance: float) -> Walls:
-    """Turn the longest edges of slivers that are lower than a distance, where that makes none.
-
-    So the surface moves by less than the distance. Triangles whose corners are all ``held``, (n,),
-    stay.
-    """
-    points, faces, count = walls.vertices.astype(np.float64), walls.faces.copy(), len(held)
-    kept = np.asarray(held[faces].all(1))
-    for _ in range(4):  # not all edges can be turned at once
-        corners = points[faces]
-        thin = np.flatnonzero((smallest_angles(corners) < THIN) & ~kept)
-        if len(thin) <= FEW_SLIVERS * len(faces):
-            break
-        sides = length(corners[thin] - np.roll(corners[thin], -1, axis=1))
-        normals, start = face_normals(points, faces), faces.ravel().astype(np.int64)
-        is_low = length(normals[thin]) < distance * sides.max(1)
-        half, opposite = (3 * thin + sides.argmax(1))[is_low], Mesh(points, faces).pair_edges()[0]
-        half = half[(opposite[half] >= 0) & ~kept[opposite[half] // 3]]
-        one, other = half // 3, opposite[half] // 3
-        a, b, c = (start[3 * one + (half + turn) % 3] for turn in range(3))
-        d = start[3 * other + (opposite[half] + 2) % 3]
-        new = np.stack([c, a, d, d, b, c], axis=1).reshape(-1, 3)
-        better = smallest_angles(points[new]).reshape(-1, 2).min(1) > THIN
-        after, before = face_normals(points, new), normals[other].repeat(2, 0)
-        steady = (after * before).sum(1) > STEADY * length(after) * length(before)
-        edges = start * count + np.roll(faces, -1, axis=1).ravel()
-        free = (find(c * count + d, edges) < 0) & (find(d * count + c, edges) < 0)
-        taken = np.zeros(count, bool)
-        for row in np.flatnonzero(better & steady.reshape(-1, 2).all(1) & free):
-            quad = new[2 * row : 2 * row + 2]
-            if not taken[quad].any():
-                taken[quad] = True
-                faces[[one[row], other[row]]] = quad
-        if not taken.any():
-            break
-    return replace(walls, faces=faces)

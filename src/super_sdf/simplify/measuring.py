@@ -63,7 +63,7 @@ class Original:
         on_edges = self._bent_edges(other, keys, face, bar)
         feet, *back = self._back(other, keys, limit)
         area = length(face_normals(vertices, faces))
-        mean = float((self.distance[faces].mean(1) * area).sum() / area.sum())
+        mean = float(np.average(self.distance[faces].mean(1), weights=area))
         largest = float(max(self.distance.max(), self.off.max(initial=0)))
         wrong = np.concatenate([vertices[self.distance > limit], on_edges, feet])
         return wrong, Deviation(largest, mean, *back)
@@ -130,8 +130,7 @@ class Original:
         np.maximum.at(known[0], np.append(owner, np.tile(owner[near], 4)), off)
         self.keys, self.back = places, known
         mean = known[1, : len(faces)] / 2 + known[1, ends[1] + edge.reshape(-1, 3)].mean(1) / 2
-        area = length(face_normals(vertices, faces))
-        mean = float((mean * area).sum() / area.sum())
+        mean = float(np.average(mean, weights=length(face_normals(vertices, faces))))
         return feet[off > limit], float(known[0].max()), mean
 
 
