@@ -67,22 +67,12 @@ def said_of(path: str, **options: Any) -> str:
     return said
 
 
-def count_fans(faces: np.ndarray) -> np.ndarray:
-    """Return for each used vertex how many closed fans of triangles meet there: 1 in a manifold."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+def is_manifold(mesh: Mesh) -> bool:
+    """Say whether the triangles round each edge and each used vertex are one fan."""
+    import igl
 
-    turns = np.concatenate([np.roll(faces, shift, axis=1) for shift in range(3)]).astype(np.int64)
-    size = faces.max() + 1
-    keys, spoke = np.unique(
-        np.concatenate([turns[:, 0] * size + turns[:, 1], turns[:, 0] * size + turns[:, 2]]),
-        return_inverse=True,
-    )
-    pairs = spoke.reshape(2, -1)
-    graph = coo_matrix((np.ones(len(turns)), pairs), shape=(len(keys),) * 2)
-    _, fan = connected_components(graph, directed=False)
-    _, first = np.unique(fan, return_index=True)
-    return np.bincount(keys[first] // size)[np.unique(faces)]
+    faces = np.unique(mesh.faces, return_inverse=True)[1].reshape(-1, 3).astype(np.int64)
+    return bool(igl.is_edge_manifold(faces)[0] and igl.is_vertex_manifold(faces).all())
 
 
 @pytest.fixture(scope="session")

@@ -21,6 +21,12 @@ def box_distance(points: np.ndarray, half: ArrayLike) -> np.ndarray:
     return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(-1), 0)
 
 
+def wedge(n: int = 24) -> np.ndarray:
+    """Return distances to a box with sides of three lengths, off the middle, in spacings."""
+    ijk = np.moveaxis(np.indices((n, n, n)), 0, -1)
+    return box_distance(ijk - [11.3, 12.1, 11.7], [8.2, 5.3, 3.1]).astype(np.float32)
+
+
 def square(z: float = 0.0) -> Mesh:
     """Return the unit square at height z, two triangles looking up."""
     corners = np.array([[0, 0, z], [1, 0, z], [1, 1, z], [0, 1, z]], float)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from conftest import ball
-from pages import wedge
 from PIL import Image
 from playwright.sync_api import Error, sync_playwright
+from solids import wedge
 
 from super_sdf.cli.main import cli
 

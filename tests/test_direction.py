@@ -178,16 +178,6 @@ def test_what_is_no_distance_is_meshed_on_axes_that_lean(kind):
     assert volume_of_samples(grid) == pytest.approx(4 / 3 * np.pi * 125, rel=0.03)
 
 
-def test_labels_are_meshed_on_axes_that_lean(folder, command):
-    affine = np.eye(4)
-    affine[:3, :3], affine[:3, 3] = LEANING * LEAN["spacing"], LEAN["origin"]
-    labels = np.where(leaning_ball() < 0, 4, 0).astype(np.uint8)
-    nibabel.save(nibabel.Nifti1Image(labels, affine), "a.nii.gz")
-    code, out, err = command("upsample", "a.nii.gz", "a.ply", "--labels", "all", "--json")
-    (row,) = json.loads(out)["labels"]
-    assert code == 0 and row["volume"] == pytest.approx(4 / 3 * np.pi * 125, rel=0.03), err
-
-
 def test_the_network_takes_no_distances_on_axes_that_lean():
     said = refusal(GridError, make_grid, leaning_ball(), **LEAN, field="distance")
     assert said.startswith("direction is 1, 0.3, 0; 0, 0.9539, 0.2; 0, 0, 0.9798: its axes are not")

@@ -10,7 +10,7 @@ from conftest import refusal, trilinear
 from scipy import ndimage
 from solids import box_distance
 
-from super_sdf import SdfGrid, make_grid, reconstruct
+from super_sdf import make_grid, reconstruct
 from super_sdf.errors import GridError, OptionError
 from super_sdf.grid import look, samples
 from super_sdf.grid.sdf_grid import crop
@@ -83,12 +83,10 @@ KINDS = {
     "a plane half-way between samples": (np.indices((12, 12, 12))[0] - 5.5, "distance"),
     "two balls": (np.minimum(torus(), box()), "distance"),
     "a wall": (thin_frame(), "distance"),
-    "cut off far away": (np.clip(box(), -3.5, 4), "distance"),
     "cut off at 1": (np.clip(box(), -1, 1), "distance"),
     "cut off unevenly": (np.clip(box(), -1, 2.5), "distance"),
     "cut off at 0.5": (np.clip(box(), -0.5, 0.5), "distance"),
     "unknown beyond 2": (np.where(np.abs(torus()) > 2, np.nan, torus()), "distance"),
-    "unknown beyond 3": (np.where(np.abs(box()) > 3, np.nan, box()), "distance"),
     "rounded to tenths": (np.rint(10 * box()) / 10, "distance"),
     "rounded to whole numbers": (np.rint(torus()), "noisy"),
     "the whole part": (np.trunc(torus()), "noisy"),
@@ -118,6 +116,8 @@ def test_the_samples_show_what_they_are(name):
     inside = "negative" if "plane" in name else "auto"
     grid = make_grid(values, **PLACE, inside=inside)
     assert grid.field.kind == kind and not grid.field.given
+    if kind == "mask" and name != "city-block, 0 outside":  # where 0 may be either side
+        np.testing.assert_array_equal(grid.values < 0, MASK)
     assert (kind == "distance") == (not any("values taken as" in note for note in grid.notes))
 
 
@@ -152,15 +152,6 @@ def test_the_user_may_overrule_the_evidence(field):
     assert reconstruct(grid, trilinear).is_closed()
 
 
-def test_all_forms_of_a_mask_give_the_same_mesh():
-    forms = [MASK, MASK.astype(np.uint8), np.where(MASK, -1.0, 1.0), MASK * 7.0]
-    forms += TRANSFORMS.values()
-    meshes = [reconstruct(make_grid(form, **PLACE), trilinear) for form in forms]
-    for mesh in meshes[1:]:
-        np.testing.assert_array_equal(mesh.vertices, meshes[0].vertices)
-        np.testing.assert_array_equal(mesh.faces, meshes[0].faces)
-
-
 def test_of_0_and_another_value_the_other_is_inside_even_if_it_fills_the_border():
     rock = ~MASK * np.uint8(1)
     np.testing.assert_array_equal(make_grid(rock, **PLACE).values < 0, ~MASK)
@@ -184,7 +175,6 @@ def stack() -> np.ndarray:
 
 ORGANS = MASK * 2 + (box() < 0)
 LABELS = {
-    "bytes": ORGANS.astype(np.uint8),
     "long": ORGANS.astype(np.int64),
     "with gaps": np.array([0, 7, 100, 117])[ORGANS],
     "one in the other": sum(mask.astype(np.uint8) for mask in (box() < 0, box() < -2.5, box() < 2)),
@@ -334,11 +324,8 @@ def test_shares_of_voxels_are_no_steps():
 BAD = {
     "inside is 'out': give one of auto, negative, positive": {"inside": "out"},
     "field is 'wrong': give one of auto, distance, noisy, mask, smooth": {"field": "wrong"},
-    "label is 'a': give a whole number, -2^63 to 2^64 - 1": {"label": "a"},
     f"label is {2**64}: give a whole number, -2^63 to 2^64 - 1": {"label": 2**64},
-    f"label={2**53 + 1} and level=2.5: give only one of them": {"label": 2**53 + 1, "level": 2.5},
     "level is nan: give a finite number": {"level": float("nan")},
-    "scale is -1: give a number greater than 0": {"scale": -1},
     "label=1 and field='noisy': the samples of a label are a mask": {"label": 1, "field": "noisy"},
 }
 
@@ -346,10 +333,6 @@ BAD = {
 @pytest.mark.parametrize("message", BAD)
 def test_wrong_options_are_refused(message):
     assert refusal(OptionError, make_grid, torus(), **PLACE, **BAD[message]) == message
-
-
-def test_the_constructor_takes_a_mask():
-    assert SdfGrid(MASK.astype(int), 1.0).field.kind == "mask"
 
 
 def test_a_mask_shows_no_spacing():
@@ -361,13 +344,9 @@ def test_a_mask_shows_no_spacing():
     ]
 
 
-def opposite(patches, table, voxels, offsets):
-    """Stand in for a network that is always wrong."""
-    return -trilinear(patches, table, voxels, offsets)
-
-
 def test_a_smooth_field_of_another_slope_is_that_of_its_spline():
-    mesh = reconstruct(make_grid(ellipsoid(), **PLACE, field="smooth"), opposite)
+    grid = make_grid(ellipsoid(), **PLACE, field="smooth")
+    mesh = reconstruct(grid, lambda *given: -trilinear(*given))  # always wrong
     x, y, z = (mesh.vertices.T + 0.5) / 32 - 0.5
     value = (x / 0.4) ** 2 + (y / 0.25) ** 2 + (z / 0.15) ** 2 - 1
     assert np.abs(value).max() < 0.02  # a twentieth of a change from sample to sample

@@ -1,9 +1,9 @@
 """Meshes to files, nothing half-written, and from files: what is wrong is said in a line."""
 
 import os
+import stat
 import warnings
 from pathlib import Path
-from unittest.mock import Mock
 from zipfile import ZipFile
 
 import numpy as np
@@ -14,9 +14,10 @@ from solids import cube, sphere
 
 from super_sdf import Mesh, reconstruct, write_mesh
 from super_sdf.convert import convert
-from super_sdf.errors import FileError, MeshError, OptionError, SuperSdfError
+from super_sdf.errors import FileError, MeshError, SuperSdfError, WriteError
 from super_sdf.files import meshes
 from super_sdf.files.meshes import MESH_SUFFIXES, World, write_meshes
+from super_sdf.files.output import check_free, replacing
 from super_sdf.options import Options
 from super_sdf.truth import load_solid, merged, read_mesh
 
@@ -26,19 +27,6 @@ pytestmark = pytest.mark.usefixtures("folder")
 @pytest.fixture(scope="module")
 def mesh():
     return reconstruct(ball(14, 4.0), trilinear, 2)
-
-
-def test_a_failed_write_leaves_what_was_there(mesh, monkeypatch):
-    Path("out.ply").write_text("before")
-    full = OSError(28, "No space left on device")
-    monkeypatch.setitem(meshes.WRITERS, ".ply", Mock(side_effect=full))
-    said = refusal(FileError, write_mesh, mesh, "out.ply", force=True)
-    assert said == "out.ply cannot be written: No space left on device"
-    said = refusal(FileError, write_mesh, mesh, "out.ply")
-    assert said == "out.ply exists: remove it or use force=True"
-    said = refusal(OptionError, write_mesh, mesh, "out.xyz")
-    assert f"give one of {', '.join(MESH_SUFFIXES)}" in said
-    assert Path("out.ply").read_text() == "before" and os.listdir() == ["out.ply"]
 
 
 def test_of_several_files_all_appear_or_none(mesh):
@@ -213,7 +201,6 @@ WRONG = {
     "flat.off": (off(BOX * [1, 1, 0], FACES), "is flat: it encloses no volume"),
     "cloud.ply": (POINTS, "holds no triangle"),
     "text.ply": (b"no mesh", "cannot be read as a mesh: "),
-    "lines.obj": (b"v 0 0 0\nv 1 0 0\nl 1 2\n", "holds no triangle"),
     "empty.stl": (b"", "is empty"),
     "deep.gltf": (b"[" * 99999, "cannot be read"),
 }
@@ -245,3 +232,56 @@ def test_a_mesh_is_not_open_along_the_seams_of_its_texture():
     Path("box.obj").write_text("\n".join(rows))
     solid, notes = load_solid("box.obj")
     assert notes == [] and solid.unbalanced_edges == 0 and len(solid.mesh.vertices) == 8
+
+
+# Files that appear whole or not at all, and what is left of those that did not
+
+
+def make(path, *, force=False, meanwhile=lambda: None):
+    """Write a file as all are written; something happens meanwhile."""
+    with replacing(Path(path), force=force) as part:
+        part.write_text("mine")
+        meanwhile()
+
+
+def why(path, *, force=False):
+    """Return why a file cannot be made there, before the work."""
+    return refusal(WriteError, check_free, Path(path), force=force)
+
+
+def test_a_file_that_appears_meanwhile_is_kept_unless_forced():
+    make("one.ply")
+    want = "^out.ply exists: remove it or use force=True$"
+    with pytest.raises(WriteError, match=want):
+        make("out.ply", meanwhile=lambda: Path("out.ply").write_text("theirs"))
+    assert Path("out.ply").read_text() == "theirs"
+    make("out.ply", force=True, meanwhile=lambda: Path("out.ply").write_text("theirs"))
+    assert Path("out.ply").read_text() == "mine"
+    with pytest.raises(WriteError, match=r"^new.ply exists: remove"):
+        make("new.ply", meanwhile=lambda: os.symlink("gone.ply", "new.ply"))  # is not followed
+    assert sorted(os.listdir()) == ["new.ply", "one.ply", "out.ply"]
+
+
+@pytest.mark.parametrize("there", ["old", None])
+def test_by_force_a_link_stays_one_and_what_it_leads_to_is_written(there):
+    os.mkdir("disk")
+    if there:
+        Path("disk/there.ply").write_text(there)
+    os.symlink("disk/there.ply", "out.ply")
+    assert why("out.ply") == "out.ply exists: remove it or use force=True"
+    make("out.ply", force=True)
+    assert os.readlink("out.ply") == "disk/there.ply"
+    assert Path("disk/there.ply").read_text() == "mine" and os.listdir("disk") == ["there.ply"]
+
+
+@pytest.mark.parametrize("name", ["out.ply", "x" * 251 + ".ply", "ä" * 125 + ".ply"])
+def test_a_file_that_is_replaced_keeps_its_mode_and_a_protected_one_stays(name):
+    make(name)
+    os.chmod(name, 0o664)
+    make(name, force=True)
+    assert os.listdir() == [name] and stat.S_IMODE(os.stat(name).st_mode) == 0o664
+    Path(name).write_text("old")
+    with pytest.raises(WriteError, match="is write-protected: allow writing to it, or give ano"):
+        make(name, force=True, meanwhile=lambda: os.chmod(name, 0o444))
+    assert "is write-protected" in why(name, force=True)  # also for root
+    assert Path(name).read_text() == "old" and os.listdir() == [name]

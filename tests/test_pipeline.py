@@ -4,8 +4,9 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from conftest import ball, trilinear
+from conftest import ball, cut_ball, trilinear
 from scipy.spatial import cKDTree
+from solids import box_distance
 
 from super_sdf import SdfGrid, load_network, pipeline, reconstruct, upsample
 from super_sdf.errors import GridError
@@ -69,18 +70,6 @@ def test_noisy_samples_are_corrected(network):
     wanted = clean.values[tuple(field.voxel_ijk.T)]
     near = np.abs(wanted) < 0.5
     assert np.abs(after - wanted)[near].mean() < 0.5 * np.abs(before)[near].mean()
-
-
-def test_unit_and_origin_only_scale_and_move_the_vertices(network):
-    """Grids need not be cubes."""
-    grid = ball(shape=(17, 20, 26))
-    mesh = reconstruct(grid, network, 2)
-    middle = np.array(grid.shape) / 2 - 0.37
-    np.testing.assert_allclose((mesh.vertices.max(0) + mesh.vertices.min(0)) / 2, middle, atol=0.05)
-    for unit, origin in ((2.0**-10, (0, 0, 0)), (1024.0, (0, 0, 0)), (1.0, (-3, 5, 7))):
-        other = reconstruct(SdfGrid(grid.values * unit, (unit,) * 3, origin), network, 2)
-        np.testing.assert_array_equal(mesh.faces, other.faces)
-        np.testing.assert_allclose((other.vertices - origin) / unit, mesh.vertices, atol=2e-5)
 
 
 SYMMETRIES = [
@@ -149,3 +138,119 @@ def test_a_field_without_a_surface_is_refused(low, high):
             SdfGrid.trusted(values, (1.0,) * 3),
             lambda patches, table, voxels, offsets: np.ones((len(voxels), 125), np.float32),
         )
+
+
+@pytest.mark.parametrize("factor", [2, 4])
+def test_a_surface_that_leaves_is_left_open_or_closed_along_the_border(factor):
+    grid = cut_ball()
+    assert reconstruct(ball(), trilinear, factor, cap=False).open_edges() == 0
+    assert reconstruct(grid, trilinear, factor, cap=False).open_edges() > 0
+    mesh = reconstruct(grid, trilinear, factor)
+    assert mesh.open_edges() == 0
+    low = np.array(grid.origin) - 0.15  # the fine lattice starts half a voxel before the samples
+    assert np.abs(mesh.vertices.min(0) - low).max() < 0.02 * 0.3 / factor
+    points = low + (np.indices((100,) * 3).reshape(3, -1).T + 0.5) * 2.7 / 100
+    inside = np.linalg.norm(points - np.array(grid.origin) - 2.3 * 0.3, axis=1) < 1.8
+    assert mesh.volume() == pytest.approx(inside.mean() * 2.7**3, rel=0.01)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("end", [False, True])
+@pytest.mark.parametrize("beyond", [-0.004, 0.01])
+def test_a_bar_that_ends_beside_the_outermost_samples_is_closed(beyond, axis, end):
+    """Half a voxel beyond them is the border: both leave the lattice, one leaves the samples."""
+    length, ijk = 12 + beyond, np.moveaxis(np.indices((17, 14, 15)), 0, -1)
+    away = box_distance(ijk - [4 + length / 2, 6.4, 7.3], [length / 2, 3.2, 2.7])
+    values = np.moveaxis(away, 0, axis)
+    grid = SdfGrid.trusted(values if end else values[::-1, ::-1, ::-1], 1.0)
+    assert (reconstruct(grid, trilinear, cap=False).open_edges() > 0) == (beyond > 0)
+    mesh = reconstruct(grid, trilinear)
+    assert mesh.open_edges() == 0
+    assert mesh.volume() == pytest.approx(12 * 6.4 * 5.4, rel=0.1)
+
+
+# The fit to the samples' spheres, and the bounds that they set
+
+MIDDLE = 10 - 0.37  # of the ball
+
+
+def away(points):
+    """Return the distances of points (..., 3) from the ball."""
+    return np.linalg.norm(points - MIDDLE, axis=-1) - 6
+
+
+def network_for(grid, error):
+    """Return a network that knows the ball, with an error: one number, or some by voxel."""
+    places, error = band.survey(grid).voxel_ijk, np.atleast_2d(error)
+
+    def values(patches, table, voxels, offsets):
+        found = 2 * away(places[voxels, None] + offsets / 2)  # in half voxels
+        return (found + error[voxels % len(error)]).astype(np.float32)
+
+    return values
+
+
+def without(monkeypatch, *steps):
+    """Leave out steps of the method."""
+    for step in steps:
+        monkeypatch.setattr(pipeline, step, lambda *_: None)
+
+
+@pytest.mark.parametrize("bias", [-0.2, 0.1])
+def test_a_constant_error_of_the_network_is_corrected(bias):
+    field = upsample(ball(), network_for(ball(), bias))
+    truth = away(field.positions())
+    off = 2 * np.abs(field.distances() - truth)[np.abs(truth) < 0.15]
+    assert off.max() < 0.4 * abs(bias) and off.mean() < 0.2 * abs(bias)
+
+
+def test_noisy_samples_move_nothing(monkeypatch):
+    grid = ball()
+    noise = np.random.default_rng(0).uniform(-0.3, 0.3, grid.shape)
+    grid = SdfGrid.trusted(grid.values + noise, grid.spacing)
+    moved = upsample(grid, trilinear).values
+    without(monkeypatch, "fit_to_spheres", "keep_within_bounds")
+    np.testing.assert_array_equal(upsample(grid, trilinear).values, moved)
+
+
+@pytest.mark.parametrize(
+    "step, other, least",
+    [("fit_to_spheres", (), 0.35), ("keep_within_bounds", ("fit_to_spheres",), 0.7)],
+)
+def test_a_step_improves_an_interpolated_ball(monkeypatch, step, other, least):
+    """The bounds without the fit, after which little is left."""
+
+    def error():
+        return np.abs(away(reconstruct(ball(), trilinear).vertices)).mean()
+
+    without(monkeypatch, *other)
+    improved = error()
+    without(monkeypatch, step)
+    assert improved < least * error()
+
+
+def test_a_wall_between_the_samples_is_found():
+    """It is a third of a voxel thick and contains no sample: all values are positive."""
+    outer = box_distance(np.moveaxis(np.indices((16, 16, 16)), 0, -1) - 7.5, [4.6, 0.17, 4.6])
+    assert outer.min() > 0
+    mesh = reconstruct(SdfGrid.trusted(outer, (1.0,) * 3, (-7.5,) * 3), load_network())
+    assert mesh.is_closed()
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx([9.2, 0.34, 9.2], abs=0.25)
+    assert mesh.volume() == pytest.approx(9.2 * 9.2 * 0.34, rel=0.2)
+
+
+@pytest.mark.parametrize(("factor", "limit"), [(4, 100), (4, 1.7), (8, 3.0)])
+def test_bounds_move_no_value_away_from_the_truth_and_many_nearer(monkeypatch, factor, limit):
+    """Wherever samples are cut off; values that are the truth stay."""
+    without(monkeypatch, "fit_to_spheres")
+    grid = SdfGrid.trusted(np.clip(ball().values, -limit, limit), 1.0)
+    noisy = network_for(grid, np.random.default_rng(0).normal(0, 0.2, (9999, (factor + 1) ** 3)))
+    exact, moved = (upsample(grid, network, factor) for network in (network_for(grid, 0), noisy))
+    truth = away(exact.positions())
+    np.testing.assert_allclose(exact.distances(), truth, atol=1e-5)
+    without(monkeypatch, "keep_within_bounds")
+    before, after = (
+        np.abs(field.distances() - truth) for field in (upsample(grid, noisy, factor), moved)
+    )
+    assert (after <= before + 1e-5).mean() > 0.999  # but for means of shared nodes
+    assert after.mean() < (0.7 if limit == 100 else 1) * before.mean()

@@ -38,19 +38,16 @@ CLOUDS = sum(
     np.exp(-((POINTS - at[:, None, None, None]) ** 2).sum(0) / 6)
     for at in RANDOM.uniform(-12, 12, (9, 3))
 )
+SOFT, SOFTER = gaussian_filter(MASK + 0.0, 1), gaussian_filter(MASK + 0.0, 1.5)
+OCCUPANCY = 1 / (1 + np.exp(1.7 * ball(13)))
+CT = np.uint16(np.maximum(BODY + RANDOM.normal(0, 20, BODY.shape), 0))
 TAKEN = [  # report, values, spacing, kind, volume or None
     ("isl-org/Open3D 519: cut off", np.clip(ball(13), -3, 3), 1, "distance", volume_of(13)),
     ("ethz-asl/vgn 20: cut off outside", np.minimum(ball(13), 2.5), 1, "distance", volume_of(13)),
     ("occupancy_networks 83: 0 and 1", (ball(13) < 0).astype(int), 1, "mask", volume_of(13)),
     ("cpederkoff/stl-to-voxel: 0 and 255", np.uint8(255 * (ball(12) < 0)), 1, "mask", None),
     ("nv-tlabs/GET3D 150: inside is above 0", -ball(13), 1, "distance", volume_of(13)),
-    (
-        "pmneila/PyMCubes 27: blurred mask",
-        gaussian_filter(MASK + 0.0, 1.5) - 0.5,
-        1,
-        "smooth",
-        None,
-    ),
+    ("pmneila/PyMCubes 27: blurred mask", SOFTER - 0.5, 1, "smooth", None),
     ("pmneila/PyMCubes: smooth()", gaussian_filter(BLURRED, 1.2), 1, "smooth", None),
     ("deadsy/sdfx 85: a union", np.minimum(box(8, 8, 3), box(3, 3, 11)), 1, "distance", None),
     ("deadsy/sdfx 85: scaled", np.minimum(box(8, 8, 3), 2 * box(3, 3, 11)), 1, "smooth", None),
@@ -61,22 +58,12 @@ TAKEN = [  # report, values, spacing, kind, volume or None
     ("1000 where nothing is known", np.where(ball(13) < 3, ball(13), 1000), 1, "distance", None),
 ]
 REFUSED = [  # report, values, spacing, words of the advice
-    (
-        "niujinshuchong/sdfstudio 297: occupancy",
-        1 / (1 + np.exp(1.7 * ball(13))),
-        None,
-        "level=0.5",
-    ),
+    ("niujinshuchong/sdfstudio 297: occupancy", OCCUPANCY, None, "level=0.5"),
     ("VAST-AI/TripoSR 12: density", 25 * np.exp(-0.8 * ball(13)), None, "level="),
     ("molstar 612: density of electrons", 40 * CLOUDS, None, "level="),
     ("molstar 612: an orbital", POINTS[0] * np.exp(-(POINTS**2).sum(0) / 40), None, "level="),
-    ("sxyu/svox2 11: raw density", 30 * (gaussian_filter(MASK + 0.0, 1)) - 0.5, None, "level="),
-    (
-        "CT of 16 bits",
-        np.uint16(np.maximum(BODY + RANDOM.normal(0, 20, BODY.shape), 0)),
-        1,
-        "level=",
-    ),
+    ("sxyu/svox2 11: raw density", 30 * SOFT - 0.5, None, "level="),
+    ("CT of 16 bits", CT, 1, "level="),
     ("resampled labels", 0.9999999998 * MASK + 2 * (ball(5, -10) < 0), None, "label=1"),
     ("unsigned distances", np.abs(ball(13)), 1, "offset=1"),
     ("another unit", 0.87 * ball(13), 1, "scale=1.149"),

@@ -134,6 +134,7 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
     os.symlink("../out.raw", "link.raw")
     os.symlink("..", "up")
     above = ("../out.raw", "below/../../out.raw", "link.raw", "up/out.raw")
+    above += ("LIST\n../out.raw", "../p%03d.raw 3 19 1")
     for data, said in {
         **dict.fromkeys((str(tmp_path / "out.raw"), *above), APART),
         "pipe.raw": "pipe.raw is no regular file: give a file",
@@ -145,13 +146,6 @@ def test_data_is_read_beside_its_header_alone(name, tmp_path):
         assert said_of(name).endswith(said)
     write(name, DETACHED[name], "below/a.raw\n")
     assert read_grid(name, spacing=0.5).shape == (24, 20, 17)
-
-
-@pytest.mark.parametrize("entry", ["LIST\n../p003.raw\n", "../p%03d.raw 3 19 1\n"])
-def test_lists_of_data_files_name_them_beside_the_header(entry):
-    write("list.mhd", MHA, f"ElementDataFile = {entry}")
-    write("list.nhdr", DETACHED["a.nhdr"].replace("data file: ", ""), f"data file: {entry}")
-    assert said_of("list.mhd").endswith(APART) and said_of("list.nhdr").endswith(APART)
 
 
 def test_numbers_of_hdf5_in_other_files_are_refused():

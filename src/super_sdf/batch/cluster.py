@@ -87,10 +87,8 @@ def connect(address: str, workers: int = 0, max_memory: int | None = None) -> It
             raise ClusterError(f"{lack}: start some with 'dask worker {address}'")
         for worker, version in answers.items():
             if version != __version__:
-                said = (
-                    f"worker {worker} has another super-sdf ({version}) than here ({__version__})"
-                )
-                raise ClusterError(f"{said}: install the same version there and here")
+                said = f"worker {worker} has another super-sdf ({version}) than here"
+                raise ClusterError(f"{said} ({__version__}): install the same on both sides")
         yield client
 
 
@@ -124,8 +122,6 @@ def completed(
                     result = future.result()
                 except (SuperSdfError, *CANCELLED):
                     raise
-                except ImportError as error:
-                    raise ClusterError(f"a worker cannot import super-sdf: {error}") from None
                 except Exception as error:
                     said = f"ended with {type(error).__name__}: {error}".split("\n")[0]
                     if isinstance(error, KilledWorker):

@@ -32,7 +32,6 @@ class Job:
     source: Path  # as it was given
     mesh: str  # the mesh, below the output folder
     options: Options
-    wrong: str = ""  # why there is nothing to convert: of a folder that cannot be read
     state: str = "to_do"  # or done, failed, done_before, failed_before, refused
     row: Row = field(default_factory=dict)  # its line of the report, once there is one
 
@@ -68,7 +67,7 @@ def find_jobs(
     ``suffix`` is the mesh file format, such as ".ply"; a list may say otherwise, and have other
     options. ``names`` are those of labels, ``member`` the array to take from files that are not in
     lists. OptionError if an argument names no grid, or if two inputs would become one output;
-    FileError if a list, or the only folder, cannot be read.
+    FileError if a list or a folder cannot be read.
     """
     by_target = dict[str, Job]()
     for argument in arguments:
@@ -84,14 +83,13 @@ def find_jobs(
 
 
 def _expand(argument: str, suffix: str, options: Options, member: str) -> list[Job]:
-    """Return the jobs that one argument stands for, with those of folders that cannot be read."""
+    """Return the jobs that one argument stands for."""
     path, kinds, paths = Path(argument), ", ".join(GRID_SUFFIXES), list[Path]()
-    unread = list[OSError]()
     if path.suffix.lower() in LIST_SUFFIXES and path.is_file():
         return list(_read_list(path, suffix, options))
     if argument and path.is_dir() and not is_store(path):
         root = path
-        for at, folders, files in os.walk(path, onerror=unread.append):
+        for at, folders, files in os.walk(path, onerror=_refuse_folder):
             stores = [name for name in folders if is_store(Path(at, name))]
             folders[:] = [name for name in folders if name not in stores]
             paths += [Path(at, n) for n in (*stores, *files) if not n.lower().endswith(".dcm")]
@@ -114,16 +112,13 @@ def _expand(argument: str, suffix: str, options: Options, member: str) -> list[J
     if member:
         grids = [p if split_member(p)[1] else Path(f"{p}:{member}") for p in grids]
     if not grids:
-        if unread:
-            raise FileError(f"{unread[-1].filename} {reason_of(unread[-1])}")
         raise OptionError(f"{argument} holds no grid ({kinds})")
     targets = (mesh_path(grid.relative_to(root), suffix, options.label) for grid in grids)
-    jobs = [Job(grid, target.as_posix(), options) for grid, target in zip(grids, targets)]
-    for error in unread:
-        folder, why = Path(error.filename), f"{error.filename} {reason_of(error)}"
-        target = Path(folder.relative_to(root), f"*{suffix}").as_posix()
-        jobs.append(Job(folder, target, options, wrong=why))
-    return jobs
+    return [Job(grid, target.as_posix(), options) for grid, target in zip(grids, targets)]
+
+
+def _refuse_folder(error: OSError) -> None:
+    raise FileError(f"{error.filename} {reason_of(error)}")
 
 
 def _read_list(path: Path, suffix: str, options: Options) -> Iterator[Job]:

@@ -56,17 +56,12 @@ class Record:
             raise FileError(f"{self.path} is not a batch's report: {way_out}")
 
     def add(self, row: Row) -> None:
-        """Append a row to the file, in place of an unfinished line, and keep it in memory.
-
-        After an error, of a full disk, say, the file holds the lines that it held before.
-        """
+        """Append a row to the file, in place of an unfinished line, and keep it in memory."""
         line = f"{json.dumps(row)}\n".encode()
-        with naming(self.path), self.path.open("ab", buffering=0) as file:
+        with naming(self.path), self.path.open("ab") as file:
             self.size = min(self.size, file.seek(0, os.SEEK_END))
             file.truncate(self.size)
-            if file.write(line) < len(line):  # a full disk may take a part of it
-                file.truncate(self.size)
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            file.write(line)
         self.size += len(line)
         self._take(row)
 

@@ -58,18 +58,17 @@ class Batch:
 
     def listed(self, *states: str) -> list[dict[str, Any]]:
         """Return the grids and the outputs of jobs in some states, and why they failed."""
-
-        def known(job: Job) -> dict[str, Any]:
-            reason = {"reason": job.row["reason"]} if job.row.get("reason") else {}
-            return {"in": os.path.abspath(job.source), "out": job.target, **reason}
-
-        return [known(job) for job in self.of(*states)]
+        return [
+            {"in": os.path.abspath(job.source), "out": job.target}
+            | {key: job.row[key] for key in ("reason",) if job.row.get(key)}
+            for job in self.of(*states)
+        ]
 
     def run(self, progress: Progress | None = None) -> None:
         """Convert what is to be converted; call ``progress`` after each file is in the report."""
         for job in self.of("refused"):
             known = self.record.rows.get(job.target, {})
-            if not job.wrong and job.row["reason"] != known.get("reason"):
+            if job.row["reason"] != known.get("reason"):
                 self.record.add(job.row)
         left = sorted(self.of("to_do"), key=size_of, reverse=True)
         total, done, died = len(left), 0, set[str]()  # outputs whose worker died once
@@ -175,7 +174,7 @@ class Batch:
                 return
         # of files of labels those of the row are known; others show when the job has made its own
         targets = [job.target] if not job.has_label_files else outputs_of(row) if row else []
-        if why := job.wrong or self._why_not(job, targets):
+        if why := self._why_not(job, targets):
             job.row, job.state = job.failed(why) | how, "refused"
 
     def _how(self, job: Job) -> Row:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..errors import FileError, MeshError, OptionError, flag
-from ..files.formats import check_regular_file, files_of, reason_of
+from ..files.formats import check_regular_file, files_of
 from ..files.grids import names_in
 from ..files.meshes import World, check_mesh_suffix, has_parts, write_meshes
 from ..files.output import check_apart, check_free
@@ -80,8 +80,12 @@ def convert_labels(
     rows = list[dict[str, Any]]()
     for (n, (name, _)), path, mesh in zip(called.items(), paths, meshes):
         files[path][name] = mesh
-        row = {"label": n, "name": name, "output": str(path)}
-        rows.append(row | facts_of(mesh, n) | {"sample_volume": image.volumes[n]})
+        if mesh.open_edges():
+            raise MeshError(f"the mesh of label {n} is torn: run it again, and report it")
+        counts = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
+        volumes = {"volume": mesh.volume(), "sample_volume": image.volumes[n]}
+        row = {"label": n, "name": name, "output": str(path), **counts, **volumes}
+        rows.append({**row, "components": mesh.components()[0], "closed": True})
     colours = {name: colour for name, colour in called.values() if colour}
     write_meshes(files, force=force, world=World(options.unit, image.grid.space, colours))
     watch.lap("write")
@@ -93,14 +97,6 @@ def convert_labels(
     facts = {"labels": rows, "missing": missing, "closed": True, "warnings": warnings}
     facts |= {"inferred": [*image.grid.flagged, *notes], **describe_place(image.grid)}
     return LabelConversion(facts, watch.seconds)
-
-
-def facts_of(mesh: Mesh, label: int) -> dict[str, Any]:
-    """Return what is known of a label's mesh, for JSON; MeshError unless it is closed."""
-    if mesh.open_edges():
-        raise MeshError(f"the mesh of label {label} is torn: run it again, and report it")
-    counts = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-    return {**counts, "volume": mesh.volume(), "components": mesh.components()[0], "closed": True}
 
 
 def paths_of(target: Path, called: Names, known: Names) -> list[Path]:
@@ -173,8 +169,6 @@ def read_names(path: str | Path) -> Names:
             if plain := plain[:LONGEST].strip():
                 colour: Any = tuple(map(int, rgb)) if any(rgb) else None
                 names[int(label)] = plain, colour
-    except OSError as error:
-        raise FileError(f"{path} {reason_of(error)}") from error
     except (ValueError, TypeError, AttributeError, RecursionError):
         names = {}
     if not names:

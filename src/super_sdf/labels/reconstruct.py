@@ -114,9 +114,7 @@ def find_image(
     elif asked.axes is not None:
         raise OptionError(f"--axes is {seen(asked.axes)}: that is for files; transpose the array")
     samples, spacing, origin = placed(values, place["spacing"], place["origin"])
-    counts, numbers, missing = find_labels(
-        as_labels(samples), in_order(asked.labels), partly=partly
-    )
+    counts, numbers, missing = find_labels(samples, in_order(asked.labels), partly=partly)
     if spacing is None:
         notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
     if origin is None:

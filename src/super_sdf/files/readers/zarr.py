@@ -2,19 +2,18 @@
 
 They are (z, y, x) unless OME metadata, names of dimensions as xarray writes them, or ``--axes`` say
 otherwise. OME's are levels of an image, of versions 0.4 and 0.5 of OME-NGFF: see
-https://ngff.openmicroscopy.org/0.5/, ``multiscales`` metadata. zarr makes the codecs that the
-metadata names when it opens an array: they are checked before.
+https://ngff.openmicroscopy.org/0.5/, ``multiscales`` metadata. The codecs of all arrays are checked
+before anything is unpacked.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import zipfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import ZipFile
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from ...errors import FileError, GridError, seen
 from ..formats import check_beside
 from . import Axis, Request, Volume, measured, placed, stored
 
-METADATA = (".zarray", ".zmetadata", "zarr.json")
 CODECS_IN = ("compressor", "filters", "codecs", "index_codecs")  # keys of metadata
 # None of these runs what the store names, and all return numbers.
 CODECS = {
@@ -40,16 +38,20 @@ def read_zarr(request: Request) -> Volume:
 
     path = request.path
     store: Any = str(path)
-    for metadata in _metadata_in(path):
-        for codec in _codecs_in(json.loads(metadata)):
-            if codec not in CODECS:
-                known = f"those that are read ({', '.join(sorted(CODECS))})"
-                said = f"{path} names the codec {seen(codec)}, which is not among {known}"
-                raise FileError(f"{said}: store it with one of these")
+    for at, folders, files in os.walk(path):  # no link may lead out of a store
+        for each in (Path(at, name) for name in (*folders, *files)):
+            if each.is_symlink() or not (each.is_dir() or each.is_file()):
+                check_beside(path, each.relative_to(path).as_posix())
     if not path.is_dir():
+        ZipFile(path).close()  # names what is no zip file, as zarr does not
         store = request.files.enter_context(zarr.storage.ZipStore(store, mode="r"))
     root = zarr.open(store, mode="r")
     nodes = {"": root, **dict(root.members(None) if isinstance(root, zarr.Group) else ())}
+    for codec in (each for node in nodes.values() for each in _codecs_in(node.metadata.to_dict())):
+        if codec not in CODECS:
+            known = f"those that are read ({', '.join(sorted(CODECS))})"
+            said = f"{path} names the codec {seen(codec)}, which is not among {known}"
+            raise FileError(f"{said}: store it with one of these")
     levels = _levels(nodes)
     name = _choose(nodes, levels, request)
     array = nodes.get(name)
@@ -67,25 +69,10 @@ def read_zarr(request: Request) -> Volume:
     return Volume(*stored(array, attributes, none), **place)
 
 
-def _metadata_in(path: Path) -> Iterator[bytes]:
-    """Yield the files with metadata in a store, out of which no link may lead."""
-    if not path.is_dir():
-        with zipfile.ZipFile(path) as archive:
-            keys = [key for key in archive.namelist() if Path(key).name in METADATA]
-            yield from map(archive.read, keys)
-        return
-    for at, inner, names in os.walk(path):
-        for each in (Path(at, name) for name in (*inner, *names)):
-            if each.is_symlink() or not (each.is_dir() or each.is_file()):
-                check_beside(path, each.relative_to(path).as_posix())
-            if each.name in METADATA:
-                yield each.read_bytes()
-
-
 def _codecs_in(metadata: Any) -> Iterator[str]:
     """Yield the names of all codecs in metadata, those within a codec, too."""
     for key, value in metadata.items() if isinstance(metadata, dict) else ():
-        inner = value if isinstance(value, list) else [value]
+        inner = value if isinstance(value, (list, tuple)) else [value]
         for codec in inner if key in CODECS_IN and value is not None else ():
             named = codec if isinstance(codec, dict) else {"id": codec}
             names = {named[key] for key in ("id", "name") if key in named} or {None}
