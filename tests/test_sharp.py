@@ -141,7 +141,7 @@ def test_edges_of_a_rounded_box_are_dropped_since_they_are_off_the_spheres(monke
 
     monkeypatch.setattr(features, "SURE_COSINE", np.inf)
     assert worst(extract_sharp(field)) < 0.04
-    monkeypatch.setattr(features, "no_gain", lambda *of: np.zeros(len(of[2]), bool))
+    monkeypatch.setattr(features, "are_farther", lambda *of: np.zeros(len(of[2]), bool))
     assert worst(extract_sharp(field)) > 0.14
 
 

@@ -41,7 +41,7 @@ BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a r
     "grid": 2210,  # 1,800
     "network": 500,
     "refine": 1293,
-    "surface": 2327,  # 2,200; and features that bring no gain are dropped, what is noted of a mesh
+    "surface": 2327,  # 2,200; and features off the spheres are dropped, what is noted of a mesh
     "tiles": 300,
     "files": 2699,  # 2,700; and readers and writers of other packages
     "functions": 684,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached

@@ -9,8 +9,8 @@
    way on an edge, a part of it on rounded ground. Where it is little, marching cubes is kept. The
    rule, ``rule.json``, was fitted by ``export.edges`` to where the true surface of shapes lies.
 5. Beside features, vertices are moved as much of the way onto the settled planes.
-6. A feature that is not sure, and brings the mesh no nearer to the samples' spheres that pass by,
-   is dropped: a detail narrower than a voxel, say.
+6. A feature that is not sure, and leaves the mesh farther from the samples' spheres that pass by,
+   is dropped: of a detail narrower than a voxel, say.
 7. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
 
 References
@@ -77,12 +77,12 @@ OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its ce
 OF_PATCH = 4  # numbers of evidence that are not averaged along the chain
 LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and normals say nothing
 # Of features that are surely sharp: share, cosine of the two faces, logarithm of the trust in the
-# flattest ground. With all others of 63 shapes at 32^3 come nine tenths of what brings no gain.
+# flattest ground.
 SURE_SHARE, SURE_COSINE, SURE_TRUST = 0.9, -0.3, -0.6
 # Coarse spacings from a sphere: to a feature round which triangles are measured, to a feature that
 # is compared, to the nearer of both meshes
 PASSES_BY, COMPARED_TO, OFF_MESH = 0.1, 1.5, 0.15
-LEAST_GAIN, EXACT = 0.2, 0.01  # of what is left after, beyond what is exact in coarse spacings
+SURELY = 1.0  # times its deviation, by which the sum of all distances must have grown
 SIDES: tuple[Literal["left", "right"], ...] = "left", "right"
 TEMPORARIES = 500  # numbers per patch in the search for its spheres among 125 samples
 # Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
@@ -169,7 +169,7 @@ def find_features(
     placed = place(patches, own, candidates, share := candidates.share())
     doubtful = np.flatnonzero(candidates.are_doubtful(share))
     if len(doubtful):
-        share[doubtful[no_gain(patches, placed, candidates.patch[doubtful], own, field)]] = 0
+        share[doubtful[are_farther(patches, placed, candidates.patch[doubtful], own, field)]] = 0
         placed = place(patches, own, candidates, share)
     box = field.factor * border.astype(np.float64)
     position = _kept_in_grid(placed.position, own.point, box)
@@ -211,13 +211,13 @@ def place(patches: Patches, own: Planes, candidates: Candidates, share: Numbers)
     return placed.unfolded(patches)
 
 
-def no_gain(
+def are_farther(
     patches: Patches, placed: Placed, feature: Index, own: Planes, field: FineField
 ) -> BoolArray:
-    """Return which features, (f,), bring the mesh no nearer to the spheres that pass by.
+    """Return which features, (f,), surely leave the mesh farther from the spheres that pass by.
 
-    Compared are means along the chain of how far the triangles round a feature are from spheres:
-    those of marching cubes, and those with features. Details narrower than a voxel are told so.
+    Summed along the chain is by how much farther from spheres the triangles round a feature are
+    than those of marching cubes. Details narrower than a voxel are told so.
     """
     fans, spheres, factor = patches.chosen(feature), field.spheres, field.factor
     number = samples_around((fans.low // factor).astype(np.int32), spheres)
@@ -236,10 +236,10 @@ def no_gain(
     off = np.abs(off - radius)
     near = usable & (beyond < COMPARED_TO) & (off.min(0) < OFF_MESH)[number]
     fan, sphere = np.nonzero(near)[0], number[near]
-    weights = *off[:, sphere], np.ones(len(fan))
-    sums = [np.bincount(fan, each, len(feature)) for each in weights]
-    before, after, count = _mean_along_chain(fans, np.stack(sums, 1)).T
-    return np.asarray(before - after <= LEAST_GAIN * (after - EXACT * count))
+    farther = off[1, sphere] - off[0, sphere]
+    sums = [np.bincount(fan, each, len(feature)) for each in (farther, farther**2)]
+    total, squares = _mean_along_chain(fans, np.stack(sums, 1)).T
+    return np.asarray(total > SURELY * np.sqrt(squares))
 
 
 def _distance_from_fans(
