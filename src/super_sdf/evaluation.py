@@ -180,15 +180,11 @@ class Sampled:
         by more than the angle of sharp edges, whatever its sign: the two sides of a thin sheet are
         no edge.
         """
-        (points, normals), is_edge = self.drawn, []
-        for some in np.array_split(np.arange(len(points)), len(points) // 10_000 + 1):
-            at, reach = points[some], EDGE_RADIUS
-            nearby = self.tree.query(at, EDGE_NEIGHBOURS, distance_upper_bound=reach)
-            # Missing neighbours have the index n; the point itself replaces them, which is no edge.
-            other = np.where(nearby[1] == len(points), some[:, None], nearby[1])
-            cosine = np.abs(dot(normals[some, None], normals[other]))
-            is_edge.append((cosine < SHARP_COSINE).any(1))
-        found = points[np.concatenate(is_edge)]
+        points, normals = self.drawn
+        near = self.tree.query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
+        or_none = np.append(normals, [[np.nan] * 3], axis=0)  # missing neighbours have the index n
+        cosine = np.abs(dot(normals[:, None], or_none[near]))
+        found = points[(cosine < SHARP_COSINE).any(1)]
         return found if len(found) else DOT.vertices
 
 

@@ -175,9 +175,8 @@ def sample_near(at: At, shape: IntArray, step: Numbers, reach: float) -> tuple[F
     ``reach`` within it (Kalra and Barr, "Guaranteed ray intersections with implicit surfaces",
     1989).
     """
-    samples, last = np.full(shape, np.nan, np.float32), shape - 1
+    samples, last, steepest = np.full(shape, np.nan, np.float32), shape - 1, 0.0
     cells = (STRIDES[0] * np.argwhere(np.ones(-(-last // STRIDES[0]), bool))).astype(np.int32)
-    steepest = _steepest_at(samples, at, cells, step)
     for stride in STRIDES:
         sizes = np.minimum(stride, last - cells)  # on the border cells are smaller
         corners = [cells + sizes * corner for corner in CORNERS]
@@ -198,22 +197,6 @@ def sample_near(at: At, shape: IntArray, step: Numbers, reach: float) -> tuple[F
         cells = cells[(cells < last).all(1)]
     _evaluate(samples, at, (cells + corner for corner in CORNERS))
     return samples, steepest * reach if steepest else np.inf
-
-
-def _steepest_at(samples: FloatArray, at: At, cells: IntArray, step: Numbers) -> float:
-    """Return the largest slope at the lowest samples of cells, by their neighbours on either side.
-
-    Of the two slopes of a sample the lesser counts: beside a kink the other one is too large.
-    """
-    last, axes = np.array(samples.shape, np.int32) - 1, np.eye(3, dtype=np.int32)
-    beside = [np.clip(cells + side * axis, 0, last) for side in (-1, 1) for axis in axes]
-    _evaluate(samples, at, [cells, *beside])
-    with np.errstate(invalid="ignore"):
-        rises = [samples[tuple(places.T)] - samples[tuple(cells.T)] for places in beside]
-    slopes = np.linalg.norm(np.stack(rises, 1).reshape(-1, 2, 3) / step, axis=2)
-    on_border = ((cells == 0) | (cells == last)).any(1)  # has no neighbour on one side
-    slope = np.where(on_border, slopes.max(1), slopes.min(1))
-    return float(slope[np.isfinite(slope)].max(initial=0))
 
 
 def _evaluate(samples: FloatArray, at: At, corners: Iterable[NDArray[Any]]) -> None:
