@@ -56,6 +56,9 @@ def test_a_hyphen_is_standard_input_or_output(here, command, monkeypatch):
     monkeypatch.setattr("sys.stdin", TextIOWrapper(BytesIO()))
     said = "stdin.npy is empty: give a file with something in it"
     assert command("upsample", "-", "a.ply") == (1, "", f"Error: {said}\n")
+    monkeypatch.setattr("sys.stdin", None)
+    said = "- is a standard stream, which is closed: give a file"
+    assert command("upsample", "-", "a.ply") == (2, "", f"Error: {said}\n")
 
 
 @pytest.mark.parametrize(

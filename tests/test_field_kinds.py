@@ -93,6 +93,7 @@ KINDS = {
     "the whole part of halves": (np.trunc(2 * torus()) / 2, "noisy"),
     "noise": (noisy(box()), "noisy"),
     "little noise": (noisy(box(), 0.05), "noisy"),
+    "a ball of 8^3": (8 * np.linalg.norm(lattice(8), axis=0) - 2.7, "smooth"),
     "an ellipsoid's polynomial": (ellipsoid() * 32 / 14, "smooth"),
     "a smooth union": (smooth_union(), "smooth"),
     "tanh": (2 * np.tanh(box() / 2), "smooth"),
@@ -404,3 +405,5 @@ def test_blurred_steps_of_a_thousand_are_no_noisy_distances():
 def test_distances_cut_off_near_show_their_spacing(cut):
     grid = make_grid(np.clip(box(), -cut, cut), origin=0)
     assert grid.field.kind == "distance" and grid.spacing == pytest.approx((1, 1, 1), rel=0.03)
+    inside_only = make_grid(np.maximum(torus(15), -0.3 * cut), **PLACE)  # few are amid equal ones
+    assert inside_only.field.facts["cut"] == [-0.3 * cut]

@@ -154,6 +154,7 @@ ASKED = {"function": torus, "bounds": BOX, "spacing": H}
     ({"function": 3}, OptionTypeError, "function is 3: give a function of points (n, 3)"),
     ({}, OptionTypeError, "grid is None: make one with make_grid(values, spacing=...) or "),
     ({"function": torus}, OptionError, "a function needs bounds and spacing, or a grid of its "),
+    ({**ASKED, "level": 0.1}, OptionError, "level is of arrays: leave it out, a grid or function "),
     ({**ASKED, "bounds": (1, -1)}, OptionError, "bounds are (1, -1): give (lowest, highest), "),
     ({**ASKED, "function": lambda p: p}, OptionTypeError,
      "the function returns an array of shape (8, 3) for 8 points: return a real number for each"),
@@ -266,6 +267,7 @@ def test_without_a_level_it_is_half_way_as_there():
 
 @pytest.mark.parametrize(("wrong", "said"), [
     ({"level": 99}, "level is 99: give one within the values, "),
+    ({"level": "one"}, "level is 'one': give a finite number"),
     ({"step_size": 2}, "step_size is 2: all samples are refined, leave it out"),
     ({"mask": BALL > 0}, "mask is given: all samples are refined, leave it out"),
     ({"method": "dual"}, "method is 'dual': give one of lewiner, lorensen"),

@@ -132,7 +132,7 @@ def test_an_array_of_any_library_goes_in_with_its_place(folder, kind):
 
 def test_a_grid_has_its_own_place():
     said = refusal(OptionError, reconstruct, GRID, trilinear, level=0.5)
-    assert said == "level is given with a grid, which has its own: leave it out"
+    assert said == "level is of arrays: leave it out, a grid or function has its own"
 
 
 def test_notes_are_logged_and_warnings_issued_in_the_words_of_python(caplog, command, folder):

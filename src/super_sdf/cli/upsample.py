@@ -65,10 +65,8 @@ def command(source: str, target: str, **given: Any) -> None:
         network, certificate = load_network(**options.network()), None
         seconds = {"load network": time.perf_counter() - start}
         done = converted(grid, mesh, network, options, **given)
-        report = {
-            "input": source,
-            "output": target,
-            "version": __version__,
+        report: dict[str, Any] = {"input": source, "output": target, "version": __version__}
+        report |= {
             "asked": options.digest(),
             "model": options.network()["model"],
             "precision": network.precision,
@@ -91,9 +89,8 @@ def command(source: str, target: str, **given: Any) -> None:
         if page:
             from ..pages.html import page_of_conversion, write_page
 
-            text = page_of_conversion(
-                {**report, "notes": network.notes}, options, done, certificate
-            )
+            shown = {**report, "notes": network.notes}
+            text = page_of_conversion(shown, options, done, certificate)
             write_page(text, page, force=given["force"])
         if given["as_json"]:
             main.print_stdout(report)
@@ -110,6 +107,8 @@ def standard_streams(source: str, target: str, kind: str | None) -> Iterator[tup
     if "-" not in (source, target):
         yield source, target
         return
+    if (source == "-" and not sys.stdin) or (target == "-" and not sys.stdout):
+        raise OptionError("- is a standard stream, which is closed: give a file")
     from tempfile import TemporaryDirectory  # imported here, as few need it
 
     with TemporaryDirectory() as folder:
@@ -153,7 +152,8 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     lines += [f"Warning: {warning}" for warning in report.get("warnings", ())]
     seconds = f"{sum(report['seconds'].values()):.1f} s"
     for row in report.get("labels", ()):
-        line = f"{row['output']}: {row['name']}, {row['triangles']:,} triangles, volume "
+        name = report["output"] if report["output"] == "-" else row["output"]
+        line = f"{name}: {row['name']}, {row['triangles']:,} triangles, volume "
         lines.append(f"{line}{row['volume']:.6g}, of its samples {row['sample_volume']:.6g}")
     if "labels" in report:
         return [*lines, f"{len(report['labels'])} labels, {seconds}"]

@@ -15,7 +15,7 @@ from ..arrays import CORNERS, FloatArray, IntArray, Numbers, Vectors, without_de
 from ..errors import GridError, OptionError, OptionTypeError, seen
 from ..grid.interpret import ORDINARY
 from ..grid.samples import as_triple, check_spacing
-from ..grid.sdf_grid import SdfGrid, make_grid
+from ..grid.sdf_grid import SdfGrid, as_grid, make_grid
 
 BATCH = 1 << 18  # points of a call at most
 MOST_SAMPLES = 1 << 31
@@ -137,12 +137,11 @@ class DistanceFunction:
                 "is 0: subtract a level, or give a finer spacing or other bounds"
             )
         np.clip(samples, -cut, cut, out=samples)
-        place: Any = {"spacing": spacing, "origin": low}
         try:
-            return make_grid(samples, **place)
+            return make_grid(samples, spacing=spacing, origin=low)
         except GridError:  # the spacing is right: what contradicts it is no distance
             with suppress(GridError):
-                return make_grid(samples, **place, field="smooth")
+                return make_grid(samples, spacing=spacing, origin=low, field="smooth")
             raise
 
 
@@ -161,11 +160,11 @@ def sampled(grid: Any, function: Any, bounds: Any, told: dict[str, Any], offset:
     """Return the samples that an offset needs of a function in bounds, at the ``told`` spacing."""
     if grid is not None or function is None:
         raise OptionError("bounds are those of a function's samples: give function, and no grid")
-    exact, spacing = DistanceFunction(function), told["spacing"]  # checks it
+    exact, spacing = DistanceFunction(function), told.pop("spacing")  # checks it
     if bounds is None or spacing is None:
         raise OptionError("a function needs bounds and spacing, or a grid of its samples")
     reach = REACH * max(check_spacing(spacing)) + abs(offset)
-    return exact.sample(bounds, spacing, reach)
+    return as_grid(exact.sample(bounds, spacing, reach), **told)
 
 
 def sample_near(at: At, shape: IntArray, step: Numbers, reach: float) -> tuple[FloatArray, float]:

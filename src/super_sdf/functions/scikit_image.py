@@ -17,7 +17,7 @@ from .. import SdfGrid, make_grid, reconstruct
 from ..arrays import CORNERS, FloatArray, IntArray, Triple
 from ..errors import GridError, OptionError, SuperSdfWarning, seen
 from ..grid.samples import as_samples, check_spacing
-from ..options import one_of
+from ..options import ANY, one_of
 from .zero import normals_at
 
 if TYPE_CHECKING:
@@ -82,8 +82,9 @@ def marching_cubes(
         raise OptionError(f"{given}: all samples are refined, leave it out")
     samples = np.asarray(as_samples(volume))
     samples = samples.astype(np.promote_types(samples.dtype, np.float32))
-    low, high = float(np.nanmin(samples)), float(np.nanmax(samples))
-    level = (low + high) / 2 if level is None else level
+    known = samples[np.isfinite(samples)]
+    low, high = float(known.min(initial=np.inf)), float(known.max(initial=-np.inf))
+    level = (low + high) / 2 if level is None else ANY.check(level, "level")
     if not low <= level <= high:
         raise OptionError(f"level is {level:g}: give one within the values, {low:g} to {high:g}")
     samples -= level

@@ -240,10 +240,8 @@ def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
         return _of_sides(case)
     if answer.kind == "smooth":
         if answer.why:
-            case.notes.append(
-                f"values taken as smooth (--field smooth), since {answer.why}: the surface is that "
-                "of their cubic spline"
-            )
+            how = "the surface is that of their cubic spline"
+            case.notes.append(f"values taken as smooth (--field smooth), since {answer.why}: {how}")
         return _of_spline(case)
     if case.spacing is None:
         case.spacing = _estimated(case)
@@ -299,9 +297,8 @@ def _of_mask(case: Case, above: Above) -> dict[str, Any]:
 
     positive = case.choose_side(above)
     case.set_spacing(1, "since a mask shows none (give --spacing)")
-    case.notes.append(
-        "values taken as a mask (--field mask): they show the surface to half a voxel only"
-    )
+    said = "they show the surface to half a voxel only"
+    case.notes.append(f"values taken as a mask (--field mask): {said}")
     h = min(steps_of(case.spacing or (1, 1, 1)))
     case.samples = MadePlanes(
         case.samples, lambda x: mask_distances(above(x) == positive).astype(float) * h, REACH
@@ -383,11 +380,9 @@ def _estimated(case: Case) -> Triple:
         found = case.facts.get("unit") or _slope_at_surface(case.look, np.ones(3))
     x, y, z = (np.ones(3) * found).tolist()
     if not LEAST_SPACING <= min(x, y, z) <= max(x, y, z) <= MOST_SPACING:
-        raise GridError(
-            f"spacing not given: the values change by {max(x, y, z):.6g} from sample to sample; "
-            f"give --spacing, in a unit in which it is between {LEAST_SPACING:g} and "
-            f"{MOST_SPACING:g}"
-        )
+        said = f"spacing not given: the values change by {max(x, y, z):.6g} from sample to sample; "
+        said += "give --spacing, in a unit in which it is between "
+        raise GridError(f"{said}{LEAST_SPACING:g} and {MOST_SPACING:g}")
     shown = f"{x:.6g}" if x == y == z else f"{x:.6g}, {y:.6g}, {z:.6g} along x, y, z"
     case.notes.append(f"spacing not given: estimated as {shown} {APPROXIMATE}")
     return check_spacing((x, y, z))

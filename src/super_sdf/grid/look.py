@@ -26,7 +26,7 @@ Extremes: TypeAlias = tuple[float, float]
 SMALL_GRID = 1 << 18  # samples of a grid that is a part as it is
 SLABS, CLOSER = (4, 8), 1 << 20  # how many planes, least and most; samples of all of them, about
 BOXES, LINES, PAIRS = 3000, 8000, 5300  # that are kept
-FREQUENT = 0.01  # share of the samples, amid equal ones, that have one value
+FREQUENT = 0.01  # share of the samples of a sign, amid equal ones, that have one value
 MOST_LABELS = 1000  # different values that are listed
 TELLING = 30  # samples that tell a slope
 LEVELS = 63  # that are tried
@@ -78,8 +78,9 @@ class Look:
     def frequent(self) -> set[float]:
         """Values of many samples amid equal ones."""
         found, times = np.unique(self.part[equal_neighbours(self.part) == 6], return_counts=True)
-        least = FREQUENT * np.count_nonzero(~np.isnan(self.part))
-        return set(found[times > least].tolist())
+        sides = self.part == self.part, self.part >= 0, self.part <= 0  # of values 0, over, below
+        least = FREQUENT * np.array([np.count_nonzero(side) for side in sides])
+        return set(found[times > least[np.sign(found).astype(int)]].tolist())
 
     @cached_property
     def boxes(self) -> Floats:

@@ -81,7 +81,8 @@ STEEP = 0.25  # spacings
 # surface at 0 than at the level that parts them best; valleys per sample of a face. Distances may
 # be rounded, to this part of the spacing.
 ROUNDED = 1.0
-IMAGE = 1 << 17  # 16 bits have 65,535, floats 1e6 and more
+IMAGE = 1 << 17  # 16 bits have 65,535, floats 1e6 and more; of few samples less, ...
+NEAREST, WHOLE = 16, 0.15  # ... but their nearest values are no whole digits apart: images to .08
 ALIKE = 0.05  # by which ends differ between which distances were cut off: .004, images .2 to 1
 CENTRED = 0.13  # maps of density and statistics to .11, fields from .15
 # 7. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
@@ -383,8 +384,9 @@ def _steps_of_cut(look: Look, given: Floats | None, facts: dict[str, Any]) -> Fl
 def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answer:
     values = np.unique(np.append(look.pairs, look.boxes[:, 2, 2, 2]))
     values = values[np.isfinite(values)]
-    digit = float(np.diff(values).min())
-    if np.ptp(values) < IMAGE * digit:
+    gaps = np.diff(values)
+    gaps = gaps[gaps < NEAREST * (digit := float(gaps.min()))] / digit
+    if np.ptp(values) < IMAGE * digit and np.abs(gaps - np.rint(gaps)).max() < WHOLE:
         steps = _before_rounding(look, digit, given, facts)
         if steps is not None and given is not None and steps is not given:
             return _in_unit(look, float(steps[0] / given[0]), given, facts)
@@ -413,7 +415,8 @@ def _before_rounding(
     if facts.get("by_rank", 0) >= BY_RANK and abs(steps.max() - 1) < SLOPE_OFF:
         return steps  # whole numbers, of neighbours one apart
     rise = (look.lines[..., 4] - look.lines[..., 0]) / (4 * steps)
-    slope = float(np.nanmedian(np.sqrt((rise**2).sum(1))))
+    slopes = np.sort(np.append(np.sqrt((rise**2).sum(1)), np.nan))  # thin stacks have no others
+    slope = float(slopes[np.isfinite(slopes).sum() // 2])
     is_off = not abs(slope - 1) < SLOPE_OFF  # in another unit, if they are
     steps = steps * slope if given is None or is_off else steps
     least = MOST_DIGIT if given is not None and is_off else 0.0  # images have finer digits

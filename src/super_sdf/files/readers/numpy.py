@@ -31,7 +31,7 @@ SDF_TEXT = re.compile(rb"[\s\d.+\-a-zA-Z]+")
 
 def read_npy(request: Request) -> Volume:
     """Read an ``.npy`` file, which is mapped into memory."""
-    values = np.load(request.path, mmap_mode="r", allow_pickle=False)
+    values = npy.open_memmap(request.path, mode="r")
     return Volume(*stored(values), **placed(request, values.shape, {}), is_mapped=True)
 
 
