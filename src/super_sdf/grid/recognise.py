@@ -255,6 +255,8 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
             continue
         if (steps > JUMP * np.quantile(change[~at], 0.99)).mean() > 0.5:
             found.append(value)
+    # far inside and far outside, a value may stand for "unknown" with either sign
+    found += [x for x in (look.low, look.high) if -x in found and x not in found]
     if not found:
         return look
     for value in found:
