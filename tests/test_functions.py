@@ -129,8 +129,9 @@ def test_a_module_of_pytorch_is_taken(columns):
     assert off(lambda points: np.linalg.norm(points, axis=1) - 0.6, mesh).max() < 1e-4
 
 
+@pytest.mark.programs
 def test_tensors_with_gradients_and_half_the_digits_are_taken():
-    torch = pytest.importorskip("torch")
+    import torch
 
     def values(points):
         return torch.tensor(torus(points), dtype=torch.bfloat16, requires_grad=True)
@@ -225,7 +226,9 @@ corners = mesh.triangles
 """
 
 
-@pytest.mark.parametrize("script", [LEVEL_SET, NEURAL_FIELD, SCAN])
+@pytest.mark.parametrize(
+    "script", [LEVEL_SET, pytest.param(NEURAL_FIELD, marks=pytest.mark.programs), SCAN]
+)
 def test_only_the_import_changes(script):
     volumes = []
     for home in ("skimage.measure", "super_sdf"):
