@@ -352,12 +352,8 @@ def test_nothing_of_the_current_folder_is_run(tmp_path_factory):
     script.write_text(COMMAND.replace("main()", "if __name__ == '__main__': main()"))
     words = ("batch", "in", "--out", "out", "--jobs", 2, *SMALL)
     sources = str(Path(super_sdf.__file__).parent.parent)
-    done = subprocess.run(
-        [sys.executable, script, *map(str, words)],
-        env=os.environ | {"PYTHONPATH": sources},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    call, env = [sys.executable, script, *map(str, words)], os.environ | {"PYTHONPATH": sources}
+    done = subprocess.run(call, env=env, stderr=subprocess.PIPE, text=True)
     assert "3 done, 1 failed" in done.stderr and not Path("ran.txt").exists()
 
 

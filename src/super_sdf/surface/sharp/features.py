@@ -76,8 +76,7 @@ FARTHEST_MOVE = 0.5  # fine spacings
 OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
 OF_PATCH = 4  # numbers of evidence that are not averaged along the chain
 LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and normals say nothing
-# Of features that are surely sharp: share, cosine of the two faces, logarithm of the trust in the
-# flattest ground.
+# Of features that are surely sharp: share, cosine of the faces, logarithm of the largest trust
 SURE_SHARE, SURE_COSINE, SURE_TRUST = 0.9, -0.3, -0.6
 # Coarse spacings from a sphere: to a feature round which triangles are measured, to a feature that
 # is compared, to the nearer of both meshes
