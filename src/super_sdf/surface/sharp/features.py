@@ -168,8 +168,9 @@ def find_features(
     candidates = find_candidates(patches, own, kinked, field, threads)
     placed = place(patches, own, candidates, share := candidates.share())
     doubtful = np.flatnonzero(candidates.are_doubtful(share))
-    if len(doubtful):
-        share[doubtful[are_farther(patches, placed, candidates.patch[doubtful], own, field)]] = 0
+    some = candidates.patch[doubtful]
+    if len(some) and (dropped := are_farther(patches, placed, some, own, field)).any():
+        share[doubtful[dropped]] = 0
         placed = place(patches, own, candidates, share)
     box = field.factor * border.astype(np.float64)
     position = _kept_in_grid(placed.position, own.point, box)
