@@ -21,8 +21,10 @@ def torus(n: int, unit: float = 1.0) -> np.ndarray:
 
 @pytest.mark.parametrize("unit", [64.0, 10.0])
 def test_exact_distances_show_their_spacing(unit):
-    grid = make_grid(torus(64, unit))
-    assert grid.spacing == pytest.approx((unit / 64,) * 3, rel=0.003)
+    grid, h = make_grid(torus(64, unit)), unit / 64
+    assert grid.spacing == pytest.approx((h,) * 3, rel=0.003)
+    saturating = 2 * h * np.tanh(torus(64, unit) / (2 * h))
+    assert make_grid(saturating).spacing[0] == pytest.approx(h, rel=0.15)
     assert f"spacing not given: estimated as {grid.spacing[0]:.6g} from the values" in grid.notes[0]
 
 

@@ -99,11 +99,9 @@ KINDS = {
     "tanh": (2 * np.tanh(box() / 2), "smooth"),
     "steeper from place to place": (box() * WAVES, "smooth"),
     "thin, and steeper from place to place": (thin_frame() * WAVES, "smooth"),
-    "touching cubes": (np.minimum(cube(0.2), cube(-0.2)), "smooth"),
     "touching cubes, aside": (np.minimum(cube(0.21), cube(-0.19)), "smooth"),
     "truth": (MASK, "mask"),
-    "bytes": (MASK.astype(np.uint8), "mask"),
-    "255": (MASK * np.float32(255), "mask"),
+    "255": (MASK * np.uint8(255), "mask"),
     "signs": (np.where(MASK, -1.0, 1.0), "mask"),
     "chessboard, 0 inside": (CHESS(~MASK) - np.maximum(CHESS(MASK) - 1, 0), "mask"),
     "city-block, 0 outside": (np.maximum(CITY(~MASK) - 1, 0) - CITY(MASK), "mask"),
@@ -373,8 +371,9 @@ def gyroid(period: float) -> np.ndarray:
 
 @pytest.mark.parametrize("period", [12, 16, 25.3])
 def test_a_lattice_whose_cells_repeat_with_the_samples_is_no_mask(period):
-    grid = make_grid(gyroid(period), **PLACE)
-    assert grid.field.kind == "smooth"
+    values = gyroid(period)
+    for each in (values, values / np.linalg.norm(np.gradient(values), axis=0)):
+        assert make_grid(each + 1e-9, **PLACE).field.kind == "smooth"
 
 
 @pytest.mark.parametrize("most", [100, 255])

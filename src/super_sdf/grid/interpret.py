@@ -377,7 +377,8 @@ def _estimated(case: Case) -> Triple:
     """Return the spacing that the values show, with a note; GridError if they show none."""
     found = case.facts.get("spacing")
     if found is None:
-        found = case.facts.get("unit") or _slope_at_surface(case.look, np.ones(3))
+        is_common = case.facts.get("slopes", 0) > 0.5  # else the surface may have another slope
+        found = case.facts["unit"] if is_common else _slope_at_surface(case.look, np.ones(3))
     x, y, z = (np.ones(3) * found).tolist()
     if not LEAST_SPACING <= min(x, y, z) <= max(x, y, z) <= MOST_SPACING:
         said = f"spacing not given: the values change by {max(x, y, z):.6g} from sample to sample; "

@@ -85,6 +85,7 @@ IMAGE = 1 << 17  # 16 bits have 65,535, floats 1e6 and more; of few samples less
 NEAREST, WHOLE = 16, 0.15  # ... but their nearest values are no whole digits apart: images to .08
 ALIKE = 0.05  # by which ends differ between which distances were cut off: .004, images .2 to 1
 CENTRED = 0.13  # maps of density and statistics to .11, fields from .15
+UNEVEN = 1.45  # quartiles of slopes at 0: lattices over their gradient to 1.31, maps from 1.66
 # 7. Noise: contradictions left when noise of the size of fourth differences is allowed; smooth
 # samples of all.
 NOISE = 0.05  # uniform noise of .05 to .5 voxel and Gaussian to .033; logits .087, networks .096
@@ -402,7 +403,11 @@ def _of_both_sides(look: Look, given: Floats | None, facts: dict[str, Any]) -> A
     if len(middle) >= ENOUGH:
         size = np.abs(middle)
         facts["centred"] = float(np.median(size) / np.quantile(size, 0.995))
-        if facts["centred"] < CENTRED:
+        rise = np.diff(look.box_lines[..., 1:4]).mean(2)
+        slopes = np.sort(np.sqrt((rise**2).sum(1)))
+        quarter = np.isfinite(slopes).sum() // 4
+        facts["uneven"] = float(slopes[3 * quarter] / slopes[quarter])
+        if facts["centred"] < CENTRED and facts["uneven"] > UNEVEN:
             return Answer("density", "", facts)
     if given is not None and _is_noise(look, given, facts):
         return Answer("noisy", "distances with noise", facts | {"spacing": given})
