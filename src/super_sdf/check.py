@@ -134,6 +134,7 @@ class Certificate:
         wrong, strays = int(self.wrong_side.sum()), self.strays or 0
         found = [f"{wrong:,} samples on the wrong side"] * (wrong > 0)
         found += [f"{strays:,} vertices where the grid has no surface"] * (strays > 0)
+        found += ["every vertex lies beyond the grid"] * (0 < self.surface.vertices == self.beyond)
         return self.surface.faults() + found
 
     def lines(self) -> list[str]:
