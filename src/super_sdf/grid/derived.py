@@ -157,12 +157,27 @@ class Resampled(SamplePlanes):
         values = np.moveaxis(self._along(np.ascontiguousarray(lines), places), 0, self.axis)
         return values if self.axis == 0 else values[first - low : last - low]
 
+    def _rise_of_distances(self, lines: Floats) -> tuple[Floats, Floats]:
+        """Return the least and largest rise per spacing at samples: the gradient has length 1."""
+        least, most = np.zeros((2, *lines.shape))  # squared slopes across the lines
+        for axis, step in enumerate(self.across, 1):
+            longer = np.pad(np.moveaxis(lines, axis, 0), ((1, 1), (0, 0), (0, 0)), "edge")
+            slopes = np.abs(np.diff(longer, axis=0)) / step
+            same = np.diff(longer, axis=0)[1:] * np.diff(longer, axis=0)[:-1] >= 0
+            lower = np.where(same, np.minimum(slopes[1:], slopes[:-1]), 0)
+            least += np.moveaxis(lower, 0, axis) ** 2
+            most += np.moveaxis(np.maximum(slopes[1:], slopes[:-1]), 0, axis) ** 2
+        low, high = (self.h * np.sqrt(np.maximum(1 - x, 0)) for x in (most, least))
+        return low, high
+
     def _along(self, lines: Floats, places: Floats) -> Floats:
         """Return the values at places, (m, p, q), along lines of samples, (n, p, q)."""
         wide = np.pad(lines, ((0, 0), *((ACROSS, ACROSS),) * 2), constant_values=np.nan)
         longer = np.pad(lines, ((2, 2), (0, 0), (0, 0)), "reflect", reflect_type="odd")
         steps = np.diff(longer, axis=0)  # of sample n: n + 1 before it, n + 2 after it
         rises = (7 * (steps[1:-2] + steps[2:-1]) - steps[:-3] - steps[3:]) / 12  # of fourth order
+        low, high = self._rise_of_distances(lines)
+        rises = np.sign(rises) * np.clip(np.abs(rises), low, high)
         values = np.empty((len(places), *lines.shape[1:]))
         for start in range(0, len(places), PLACES):
             some = slice(start, start + PLACES)
