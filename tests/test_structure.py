@@ -38,7 +38,7 @@ ROOMS = [
 TOP = "pipeline convert options errors threads arrays __init__ __main__"
 BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a reason, larger
     TOP: 1311,  # 1,250; and arrays, notes and warnings in Python, a line for each public name
-    "grid": 2232,  # 1,800
+    "grid": 2233,  # 1,800
     "network": 500,
     "refine": 1293,
     "surface": 2327,  # 2,200; and features off the spheres are dropped, what is noted of a mesh

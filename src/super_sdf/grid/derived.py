@@ -9,8 +9,9 @@ point x - d n. The distance of a sample that was cut off is that to the nearest 
 others, and no less than where it was cut off.
 
 Between two samples of an axis that is resampled the values are those of a cubic polynomial
-(Hermite), or of a wall between them. Two distances differ by no more than their points are apart:
-the samples round a point bound its value (McShane, Whitney), unless they contradict each other.
+(Hermite), or of a wall between them. The gradient has length 1, so the differences across the line
+bound the slope along it. Two distances differ by no more than their points are apart: the samples
+round a point bound its value (McShane, Whitney), unless they contradict each other.
 """
 
 from __future__ import annotations
@@ -162,11 +163,11 @@ class Resampled(SamplePlanes):
         least, most = np.zeros((2, *lines.shape))  # squared slopes across the lines
         for axis, step in enumerate(self.across, 1):
             longer = np.pad(np.moveaxis(lines, axis, 0), ((1, 1), (0, 0), (0, 0)), "edge")
-            slopes = np.abs(np.diff(longer, axis=0)) / step
-            same = np.diff(longer, axis=0)[1:] * np.diff(longer, axis=0)[:-1] >= 0
-            lower = np.where(same, np.minimum(slopes[1:], slopes[:-1]), 0)
+            slopes = np.diff(longer, axis=0) / step
+            before, after = np.abs(slopes[:-1]), np.abs(slopes[1:])
+            lower = np.where(slopes[:-1] * slopes[1:] >= 0, np.minimum(before, after), 0)
             least += np.moveaxis(lower, 0, axis) ** 2
-            most += np.moveaxis(np.maximum(slopes[1:], slopes[:-1]), 0, axis) ** 2
+            most += np.moveaxis(np.maximum(before, after), 0, axis) ** 2
         low, high = (self.h * np.sqrt(np.maximum(1 - x, 0)) for x in (most, least))
         return low, high
 
@@ -176,8 +177,7 @@ class Resampled(SamplePlanes):
         longer = np.pad(lines, ((2, 2), (0, 0), (0, 0)), "reflect", reflect_type="odd")
         steps = np.diff(longer, axis=0)  # of sample n: n + 1 before it, n + 2 after it
         rises = (7 * (steps[1:-2] + steps[2:-1]) - steps[:-3] - steps[3:]) / 12  # of fourth order
-        low, high = self._rise_of_distances(lines)
-        rises = np.sign(rises) * np.clip(np.abs(rises), low, high)
+        rises = np.sign(rises) * np.clip(np.abs(rises), *self._rise_of_distances(lines))
         values = np.empty((len(places), *lines.shape[1:]))
         for start in range(0, len(places), PLACES):
             some = slice(start, start + PLACES)

@@ -344,6 +344,7 @@ def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
 
 
 def _levels_off(look: Look) -> bool:
+    """Return whether most samples between both ends are beside the surface."""
     between = (look.part > look.low) & (look.part < look.high)
     return bool(beside_surface(look.part)[between].mean() > BESIDE)
 

@@ -121,7 +121,7 @@ class Candidates:
     patch: Index  # (f,), their rows in all patches
     middle: Vectors  # (f, 3), mean of the crossings of each
     edge: Vectors  # (f, 3), the edge's nearest point, or the corner, kept near the patch's cell
-    evidence: Vectors  # (f, 10): see ``evidence_of``
+    evidence: Vectors  # (f, 10): see ``_measure``
     spheres: IntArray  # (f,), how many spheres pass near the edge
     planes: Planes  # the settled planes of all crossings
     inside: Index  # (i,), the patches whose crossings were settled
