@@ -177,6 +177,36 @@ def test_of_a_mask_the_volume_is_beside_that_of_its_samples(here, command):
     assert report["sample_volume"] is None
 
 
+def test_each_label_of_a_scene_is_checked(here, command):
+    inside = sphere_values() < 0
+    labels = inside * (1 + (np.indices(inside.shape)[0] > len(inside) // 2))
+    np.savez("labels.npz", values=labels, spacing=H, origin=(-0.6, -0.6, -0.6))
+    Path("names.csv").write_text("1,left\n2,right\n")
+    how = ("--unit", "mm", "--names", "names.csv")
+    command("upsample", "labels.npz", "both.glb", "--labels", "all", *how, "-q")
+    code, out, err = command("check", "both.glb", "--unit", "mm")
+    found = re.findall(
+        r"^(\w+): .* 1 piece, volume (\S+) \((\S+) ml\), .*; faults: none$", out, re.M
+    )
+    assert (code, err, [name for name, _, _ in found]) == (0, "", ["left", "right"])
+    counts = [np.count_nonzero(labels == n) * H**3 for n in (1, 2)]
+    np.testing.assert_allclose([float(each[1]) for each in found], counts, rtol=0.03)
+    np.testing.assert_allclose([1000 * float(each[2]) for each in found], counts, rtol=0.03)
+    code, out, _ = command("check", "both.glb", "labels.npz", *how)
+    shares = re.findall(r"volume [+-]\d\.\d+% off that of the samples, (\S+); faults: none", out)
+    assert code == 0 and shares == [f"{count:.6g}" for count in counts]
+    code, _, err = command("check", "both.glb", "labels.npz", "--unit", "mm")
+    assert code == 2 and "both.glb has a part 'left': give the --names that it was made with" in err
+    code, _, err = command("check", "both.glb", "labels.npz", *how[2:])  # in metres
+    assert code == 1 and "left has " in err and " vertices where the grid has no surface" in err
+    scene = trimesh.load_scene("both.glb")
+    scene.geometry["right"].update_faces(np.arange(len(scene.geometry["right"].faces)) > 0)
+    scene.export("open.glb")
+    code, out, err = command("check", "open.glb", "--json")
+    assert (code, err) == (1, "Limit exceeded: right has 3 open edges\n")
+    assert [part["closed"] for part in json.loads(out)["parts"]] == [True, False]
+
+
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     """A folder with a grid of the sphere, its mesh, and a shifted one."""

@@ -80,9 +80,9 @@ def command(source: str, target: str, **given: Any) -> None:
 
             report["network"] = sha256(network.path.read_bytes()).hexdigest()
         if given["check"]:
-            from ..check import check_mesh, read_for_check
+            from ..check import check_mesh
 
-            certificate = check_mesh(*read_for_check(mesh, grid, options, done), options)
+            certificate = check_mesh(done.mesh, done.grid, options)
             report["check"] = certificate.report()
             seconds["check"] = time.perf_counter() - start
         report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
