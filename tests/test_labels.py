@@ -318,10 +318,10 @@ def test_labels_are_chosen_by_name(command, boxes):
     made = Path("one.ply").read_bytes()
     assert command(*run, "--label", "left_kidney", "--names", "names.ctbl")[0] == 0
     assert Path("one.ply").read_bytes() == made
-    known = "names of the table (Background, liver&co, left_kidney)"
+    known = "of the table (Background, liver&co, left_kidney)"
     for words, said in (
-        (("--labels", "lung"), f"--labels has 'lung': give numbers, or {known}"),
-        (("--label", "lung"), "--label is 'lung': give a whole number, -2^63 to 2^64 - 1"),
+        (("--labels", "lung"), f"--labels has 'lung': give numbers, or names {known}"),
+        (("--label", "lung"), f"--label lung names 0 labels: give a number, or a name {known}"),
     ):
         run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words
         assert command(*run) == (2, "", f"Error: {said}\n")
