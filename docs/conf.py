@@ -37,9 +37,10 @@ def sort_options(app, ctx, lines):
     shared = {name for name, _ in helps(ctx.command) & others}
     rows = {heading: [] for heading in (GRID, VALUES, MESH, WORK, "Output")}
     for part in re.split(r"^(?=\.\. option::)", "\n".join(lines), flags=re.MULTILINE):
-        names = re.findall(r"--[a-z-]+", part.split("\n")[0])
+        names = re.findall(r"(?<= )-[a-z-]+", part.split("\n")[0])
         if names and names[0] not in shared:
-            rows[HEADINGS.get(names[0][2:].replace("-", "_"), "Output")].append(part)
+            heading = HEADINGS.get(names[0].lstrip("-").replace("-", "_"), "Output")
+            rows[heading].append(part.replace("FILE:", r"FILE\:"))  # no link
     texts = ["\n".join([f"**{heading}**\n", *parts]) for heading, parts in rows.items() if parts]
     lines[:] = "\n\n".join(texts).split("\n")
 
