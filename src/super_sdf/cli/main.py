@@ -101,6 +101,7 @@ def table_option(name: str, text: str = "") -> click.Option:
         return click.Option([f"{word}/--{row.off}" if row.off else word], is_flag=True, **more)
     choices = f"[{'|'.join(row.kind.choices)}]" if row.kind.choices else None
     more |= {"show_default": row.default is not None, "metavar": row.metavar or choices}
+    more["shell_complete"] = lambda *at: [c for c in row.kind.choices if c.startswith(at[2])]
     return click.Option([word], type=click.UNPROCESSED, **more)
 
 

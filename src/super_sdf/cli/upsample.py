@@ -154,9 +154,8 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         return [*lines, f"{len(report['labels'])} labels, {seconds}"]
     few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
     low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in report["bounds"])
-    closed = "closed" if report["closed"] else "open"
-    line = f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, {closed}"
-    line += f", from {low} to {high}, {seconds}"
+    line = f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "
+    line += f"{'closed' if report['closed'] else 'open'}, from {low} to {high}, {seconds}"
     if not few and triangles > MANY:
         line += "; far fewer triangles within 0.02 voxels of these: --simplify 0.02"
     lines.append(line)
