@@ -286,7 +286,7 @@ def test_files_and_parts_have_the_names(command, boxes):
     assert [row["name"] for row in rows] == ["liver&co", "left_kidney"]
     assert [row["sample_volume"] for row in rows] == [180.0, 181.0]
     assert [row["components"] for row in rows] == [1, 2]
-    assert "o-left_kidney.stl: left_kidney, " in err and " of its samples 181" in err
+    assert "o-left_kidney.stl: left_kidney, " in err and " of its voxels 181" in err
     convert(command, boxes, "o.glb", "all", "--names", "names.ctbl")
     parts = trimesh.load("o.glb").geometry
     assert sorted(parts) == ["left_kidney", "liver&co"]

@@ -149,7 +149,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     for row in report.get("labels", ()):
         name = report["output"] if report["output"] == "-" else row["output"]
         line = f"{name}: {row['name']}, {row['triangles']:,} triangles, volume "
-        lines.append(f"{line}{row['volume']:.6g}, of its samples {row['sample_volume']:.6g}")
+        lines.append(f"{line}{row['volume']:.6g}, of its voxels {row['sample_volume']:.6g}")
     if "labels" in report:
         return [*lines, f"{len(report['labels'])} labels, {seconds}"]
     few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
@@ -157,7 +157,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     line = f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "
     line += f"{'closed' if report['closed'] else 'open'}, from {low} to {high}, {seconds}"
     if not few and triangles > MANY:
-        line += "; far fewer triangles within 0.02 voxels of these: --simplify 0.02"
+        line += "; for far fewer triangles, within 0.02 voxel: --simplify 0.02"
     lines.append(line)
     if field:
         shape = " x ".join(map(str, field["shape"]))
