@@ -1,12 +1,13 @@
 """Check the mesh file MESH, also against the signed distance grid GRID that it was made from.
 
 The true surface is not needed. Every exact sample is the radius of an empty ball that touches the
-surface; its residual is its distance to the mesh minus that radius, in voxels: positive if the mesh
-does not reach the ball, negative if it pierces it. Without GRID only the faults are counted.
+surface. The residual of a sample is its distance to the mesh minus that radius, in voxels: positive
+if the mesh does not reach the ball, negative if the mesh pierces the ball. Without GRID only faults
+are counted.
 
-MESH is any mesh file that trimesh reads; vertices at the same position count as one. GRID is what
-upsample takes. Each part of a MESH of several labels is checked, beside its label in GRID. The exit
-code is 1 if a limit is exceeded; without GRID, or with several parts, also if there are faults.
+MESH is any mesh file that trimesh reads; vertices at the same position are merged. GRID is a grid
+file as for upsample. Each part of a MESH of several labels is checked beside its label in GRID. The
+exit code is 1 if a limit is exceeded; without GRID, or with several parts, also if one has faults.
 
   super-sdf check part.ply part.npz
   super-sdf check part.ply part.npz --max-mean 0.01 --no-faults
@@ -31,15 +32,15 @@ TAKES = (
     Option(["--tolerance"], type=FloatRange(0), metavar="D",
         help="Fail if the largest residual of a sample is above D, in world units."),
     Option(["--max-mean"], type=FloatRange(0), metavar="VOXELS",
-        help="Fail if the mean residual is above this."),
+        help="Fail if the mean of the absolute residuals is above VOXELS."),
     Option(["--no-faults"], is_flag=True,
         help="Fail if the mesh is open, not manifold, not oriented outward, intersects itself, has "
         "samples on the wrong side, or vertices where the grid has no surface."),
     *READ, "names",
-    main.table_option("offset", "The --offset that the mesh was made with."),
-    main.table_option("unit", "The unit of the mesh: of a .glb, and for volumes in ml."),
-    main.table_option("max_memory", "Memory limit of the process, such as 1500M or 4G. Default: "
-        "60 % of the free memory. Larger meshes are refused."),
+    main.table_option("offset", "The --offset with which the mesh was made."),
+    main.table_option("unit", "Unit of the mesh: the --unit of a .glb; also for volumes in ml."),
+    main.table_option("max_memory", "Memory limit of the process, such as 4G. Default: 60 % of the "
+        "free memory. Larger meshes are refused."),
     "json", "quiet",
 )  # fmt: skip
 
