@@ -127,8 +127,6 @@ def test_numbers_that_make_no_sense_are_refused():
         fitted_layout(cube(), n=5)
     with pytest.raises(SuperSdfError, match="spacing is nan: it makes nan samples an axis"):
         fitted_layout(cube(), spacing=np.nan)
-    with pytest.raises(SuperSdfError, match=r"band is 1: give at least 1\.5 voxels"):
-        sample_solid(Solid(cube()), CENTRES, band=1)
 
 
 # Meshes beside references: closed forms, in the figures of papers
