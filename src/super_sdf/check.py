@@ -25,7 +25,7 @@ from .refine.band import Band, no_surface, survey
 from .refine.nodes import VoxelIndex
 from .surface.mesh import Mesh
 from .threads import check_fits, give_back, memory_bound, useful_threads
-from .truth import Points, Solid, merged
+from .truth import Points, Solid
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
 BYTES_PER_TRIANGLE, BYTES_PER_SAMPLE = 650, 150
@@ -213,8 +213,9 @@ class Certificate:
 def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certificate:
     """Check a mesh against the grid that it was made from.
 
-    Of the options the offset, the unit and the memory bound count. GridError if the grid has no
-    surface at the offset; OutOfMemoryError if the search trees would not fit in memory.
+    Vertices at the same position must be one vertex, as of ``merged``. Of the options the offset,
+    the unit and the memory bound count. GridError if the grid has no surface at the offset;
+    OutOfMemoryError if the search trees would not fit in memory.
     """
     offset, lattice = options.offset, cubic_grid(grid, options.offset)
     band = survey(lattice, offset, threads=useful_threads(0))
@@ -223,7 +224,6 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certif
     need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
     what, most = f"checking {len(mesh.faces):,} triangles", memory_bound(options.max_memory)
     check_fits(need, what, "allow more (--max-memory)", most)
-    mesh = merged(mesh)
     surface, touched = examine_surface(mesh, options.unit), touch(Solid(mesh), band, grid)
     is_mask, nearest = lattice.field.sides_only, np.rint(lattice.to_index(mesh.vertices))
     beyond = ((nearest < 0) | (nearest >= lattice.shape)).any(1)

@@ -87,10 +87,11 @@ def _check(job: Job, settings: Settings, made: Conversion, sha256: str) -> Row:
     """Return the certificate of a mesh, or why there is none; keep what a page shows of it."""
     from ..check import check_mesh
     from ..pages.items import item_of, keep_item
+    from ..truth import merged
 
     try:
         if settings.items is None:
-            return check_mesh(made.mesh, made.grid, job.options).report()
+            return check_mesh(merged(made.mesh), made.grid, job.options).report()
         item = item_of(made, job.options)
         keep_item(item, settings.items, job.target, sha256)
         return item.certificate or {}

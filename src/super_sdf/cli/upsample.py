@@ -76,8 +76,9 @@ def command(source: str, target: str, **given: Any) -> None:
             report["network"] = sha256(network.path.read_bytes()).hexdigest()
         if given["check"]:
             from ..check import check_mesh
+            from ..truth import merged
 
-            certificate = check_mesh(done.mesh, done.grid, options)
+            certificate = check_mesh(merged(done.mesh), done.grid, options)
             report["check"] = certificate.report()
             seconds["check"] = time.perf_counter() - start
         report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}

@@ -27,6 +27,7 @@ from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
 from ..surface.extract import coarse_surface
 from ..surface.mesh import Mesh
+from ..truth import merged
 
 if TYPE_CHECKING:
     from ..options import Options
@@ -68,7 +69,7 @@ class Item:
 
 def item_of(made: Any, options: Options, certificate: Certificate | None = None) -> Item:
     """Return the item of a conversion; errors are in it."""
-    shown, samples = made.mesh, made.grid
+    shown, samples = merged(made.mesh), made.grid
     try:
         check_modules("a check of the mesh, with residuals,", "report", ("igl",))
         certificate = certificate or check_mesh(shown, samples, options)
