@@ -392,6 +392,11 @@ def test_the_level_is_between_the_plateaus_of_an_image_with_noise():
         assert 0.2 < (level - outside) / (inside - outside) < 0.8
 
 
+def test_the_surface_of_densities_of_both_signs_may_be_at_0():
+    said = refusal(GridError, make_grid, NORMAL**3 + 0.3, **PLACE)
+    assert said.endswith(" (or, if the surface is at 0, field='smooth')")
+
+
 @pytest.mark.parametrize("cut", [1.0, 0.8])
 def test_distances_cut_off_near_show_their_spacing(cut):
     grid = make_grid(np.clip(box(), -cut, cut), origin=0)
