@@ -21,7 +21,7 @@ from solids import (
 )
 
 from super_sdf import Mesh, SdfGrid, SuperSdfError, evaluate, load_network, reconstruct, write_mesh
-from super_sdf.errors import MeshError, OptionError
+from super_sdf.errors import MeshError, OptionError, OptionTypeError
 from super_sdf.truth import Solid, fitted_layout, load_solid, sample_solid
 
 CENTRES = (24, 24, 24), 1 / 24, np.full(3, 0.5 / 24 - 0.5)
@@ -160,6 +160,7 @@ def test_edges_are_within_a_tenth_of_the_spacing():
 @pytest.mark.parametrize(("given", "kind", "said"), [
     (([cube()], [cube()] * 2), OptionError, "there are 1 meshes and 2 references: give as many"),
     (([cube()], [NOTHING]), MeshError, "a reference has no area: give a surface"),
+    ((None, cube()), OptionTypeError, "mesh is None: give one from reconstruct(grid)"),
     (([Mesh(cube().vertices * np.inf, CUBE_FACES)], [cube()]), MeshError,
      "a vertex of the mesh is not finite: repair it"),
 ])  # fmt: skip
