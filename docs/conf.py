@@ -5,6 +5,7 @@ from pathlib import Path
 
 from super_sdf import __version__ as release
 from super_sdf.cli.main import HEADINGS, cli
+from super_sdf.options import GRID, MESH, VALUES, WORK
 
 ROOT = Path(__file__).parents[1]
 FROM_ROOT = {"index": "README.md", "develop/contributing": "CONTRIBUTING.md",
@@ -33,13 +34,14 @@ def helps(command):
 def sort_options(app, ctx, lines):
     """Put options under the headings of the help; leave out those that upsample has, too."""
     others = helps(cli.get_command(ctx, "upsample")) if ctx.command.name != "upsample" else set()
-    shared, rows = {name for name, _ in helps(ctx.command) & others}, {}
+    shared = {name for name, _ in helps(ctx.command) & others}
+    rows = {heading: [] for heading in (GRID, VALUES, MESH, WORK, "Output")}
     for part in re.split(r"^(?=\.\. option::)", "\n".join(lines), flags=re.MULTILINE):
-        names = re.findall(r"--[a-z-]+", part.split("\n")[0])
+        names = re.findall(r"(?<= )-[a-z-]+", part.split("\n")[0])
         if names and names[0] not in shared:
-            heading = HEADINGS.get(names[0][2:].replace("-", "_"), "Output")
-            rows.setdefault(f".. rubric:: {heading}\n", []).append(part)
-    texts = ["\n".join([heading, *parts]) for heading, parts in rows.items()]
+            heading = HEADINGS.get(names[0].lstrip("-").replace("-", "_"), "Output")
+            rows[heading].append(part.replace("FILE:", r"FILE\:"))  # no link
+    texts = ["\n".join([f"**{heading}**\n", *parts]) for heading, parts in rows.items() if parts]
     lines[:] = "\n\n".join(texts).split("\n")
 
 

@@ -3,14 +3,14 @@
 python examples/array_to_mesh.py [OUT.ply]
 """
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from pathlib import Path
 
 import numpy as np
 
 from super_sdf import reconstruct, write_mesh
 
-options = ArgumentParser(description=__doc__)
+options = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
 options.add_argument("out", nargs="?", default="part.ply", help="mesh file")
 out = options.parse_args().out
 

@@ -5,13 +5,13 @@
 The grid is made up: a plate of 40 x 25 x 8 mm with two holes, turned, sampled every millimetre.
 """
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 
 import numpy as np
 
 from super_sdf import make_grid, reconstruct, simplify_mesh, write_mesh
 
-options = ArgumentParser(description=__doc__)
+options = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
 options.add_argument("out", nargs="?", default="plate.3mf", help="mesh file")
 out = options.parse_args().out
 

@@ -6,7 +6,7 @@ The densities are those of a cloud of soft balls. A fog volume in a file is read
 ``read_grid("smoke.vdb:density", level=0.1)`` instead.
 """
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from super_sdf import (
 SPACING, LEVEL = 0.1, 0.5
 BALLS = [((0, 0, 0), 0.9), ((0.8, 0.3, 0.1), 0.6), ((-0.8, 0.2, 0), 0.65), ((0.1, 0.7, 0.2), 0.6)]
 
-options = ArgumentParser(description=__doc__)
+options = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
 options.add_argument("level_set", nargs="?", default="cloud.vdb", help="file for the level set")
 options.add_argument("surface", nargs="?", default="cloud.glb", help="file for the mesh")
 names = options.parse_args()

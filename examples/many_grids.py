@@ -6,12 +6,12 @@ Writes the part and its surface moved outwards by 1, 2 and 3 mm, at factor 2.
 """
 
 import sys
-from argparse import ArgumentParser
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from pathlib import Path
 
 from super_sdf import SuperSdfError, extract_mesh, load_network, read_grid, upsample, write_mesh
 
-options = ArgumentParser(description=__doc__)
+options = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
 options.add_argument("folder", nargs="?", default=".", help="folder for the meshes")
 out = Path(options.parse_args().folder)
 grid = read_grid(Path(__file__).parent / "part.npz")

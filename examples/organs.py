@@ -7,7 +7,7 @@ with thick slices. Neighbours share their walls, vertex for vertex.
 """
 
 import tempfile
-from argparse import ArgumentParser
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 from pathlib import Path
 
 import nibabel
@@ -23,7 +23,7 @@ TABLE = """\
 """
 SPACING = 1.5, 1.5, 4.0  # mm
 
-options = ArgumentParser(description=__doc__)
+options = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
 options.add_argument("target", nargs="?", default="organs.glb", help="mesh file, .glb or .3mf")
 target = options.parse_args().target
 

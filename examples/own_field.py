@@ -5,7 +5,7 @@
 A bowl: the upper half cut off a sphere, hollowed by an offset of the field.
 """
 
-from argparse import ArgumentParser
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 
 import numpy as np
 
@@ -19,7 +19,7 @@ def bowl(points):
     return np.maximum(shell, points[:, 2] - 0.3)
 
 
-options = ArgumentParser(description=__doc__)
+options = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
 options.add_argument("out", nargs="?", default="bowl.stl", help="mesh file")
 out = options.parse_args().out
 

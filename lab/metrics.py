@@ -18,10 +18,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from trimesh.triangles import angles
 
 from super_sdf.arrays import BoolArray, dot, face_normals
-from super_sdf.evaluation import F1_DISTANCE, FIGURES, Comparison as Pair
-from super_sdf.truth import Distances, smallest_angles
+from super_sdf.evaluation import F1_DISTANCE, FIGURES, Comparison as Pair, Distances
 
 from .shapes import Shape
 
@@ -62,7 +62,7 @@ class Comparison(Pair):
     @cached_property
     def least_angles(self) -> Distances:
         """The smallest angle of each triangle, in degrees; 0 without area."""
-        return smallest_angles(self.mesh.vertices.astype(np.float64)[self.mesh.faces])
+        return np.degrees(angles(self.mesh.vertices[self.mesh.faces].astype(float)).min(1))
 
 
 def mean(values: Distances | BoolArray) -> float | None:

@@ -99,8 +99,8 @@ def draw(
         plotter.close()
         corner = (number % columns * wide, number // columns * (high + CAPTION))
         page.paste(image.resize(pixels), (corner[0], corner[1] + CAPTION))
-        font = ImageFont.load_default(size=16)
-        place = (corner[0] + 8, corner[1] + 8)
+        font = ImageFont.load_default(size=wide // 22)
+        place = (corner[0] + 8, corner[1] + 4)
         ImageDraw.Draw(page).text(place, panel.title, fill="black", font=font)
     page.quantize(PALETTE).save(target, optimize=True)
 

@@ -105,7 +105,7 @@ def test_version_help_info_and_usage_errors(command):
     assert command("upsample")[0] == 2
     said = "Error: 'upsmple' is no command: give one of upsample, batch, check, sample, "
     assert command("upsmple") == (2, "", f"{said}view, info\n")
-    for word, meant in {"labl": "label", "qualty": "quality", "memry": "max-memory"}.items():
+    for word, meant in {"labl": "label", "tol": "tolerance", "memry": "max-memory"}.items():
         end = f"Error: No such option '--{word}'. Did you mean '--{meant}'?\n"
         assert command("upsample", "in.npy", "out.ply", f"--{word}", 1) == (2, "", end)
 
@@ -206,4 +206,4 @@ def test_no_permission_and_no_memory_are_one_line_each(here, command, monkeypatc
 def test_the_progress_bar_runs_to_100_percent(here, command, monkeypatch):
     monkeypatch.setattr(type(sys.stderr), "isatty", lambda self: True, raising=False)
     code, _, err = command("upsample", "in.npy", "out.ply", "--spacing", "1")
-    assert code == 0 and err.index("upsampling") < err.index("100%")
+    assert code == 0 and err.index("reading") < err.index("upsampling") < err.index("100%")

@@ -2,6 +2,7 @@
 
 import re
 from functools import partial
+from itertools import product
 
 import numpy as np
 import pytest
@@ -67,11 +68,19 @@ def thin_frame() -> np.ndarray:
     return np.abs(box()) - 0.7
 
 
+def gyroid(period: float, shift: float, over_slope: bool) -> np.ndarray:
+    """Return a gyroid whose cells are that many samples wide, also over its slope."""
+    x, y, z = (np.indices((32,) * 3) + shift) * (2 * np.pi / period)
+    values = np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x) - 0.3
+    return values / np.linalg.norm(np.gradient(values), axis=0) if over_slope else values
+
+
 MASK = torus() < 0
 OUT, INTO = (ndimage.distance_transform_edt(side) for side in (~MASK, MASK))
 TRANSFORMS = {"both sides": OUT - INTO, "inside only": INTO, "in other units": 0.37 * (OUT - INTO)}
 CHESS, CITY = (partial(ndimage.distance_transform_cdt, metric=m) for m in ("chessboard", "taxicab"))
 WAVES = 1 + 0.5 * np.sin(4 * np.pi * sum(lattice(32)))
+NORMAL, PERIODS = np.random.default_rng(0).normal(size=(32,) * 3), (8, 10, 12, 16, 25.3)
 KINDS = {
     "a torus": (torus(), "distance"),
     "a torus of 16^3": (torus(16), "distance"),
@@ -100,6 +109,8 @@ KINDS = {
     "steeper from place to place": (box() * WAVES, "smooth"),
     "thin, and steeper from place to place": (thin_frame() * WAVES, "smooth"),
     "touching cubes, aside": (np.minimum(cube(0.21), cube(-0.19)), "smooth"),
+    "blurred steps of a thousand": (650 * np.tanh(-box()) - 350 + 20 * NORMAL, "smooth"),
+    **{f"a gyroid: {x}": (gyroid(*x), "smooth") for x in product(PERIODS, (0, 0.5), (0, 1))},
     "truth": (MASK, "mask"),
     "255": (MASK * np.uint8(255), "mask"),
     "signs": (np.where(MASK, -1.0, 1.0), "mask"),
@@ -363,19 +374,6 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
         assert said.startswith(f"no value is {side} 0 (") and "give the level" in said
 
 
-def gyroid(period: float) -> np.ndarray:
-    """Return a gyroid whose cells are that many samples wide."""
-    x, y, z = np.indices((32,) * 3) * (2 * np.pi / period)
-    return np.sin(x) * np.cos(y) + np.sin(y) * np.cos(z) + np.sin(z) * np.cos(x)
-
-
-@pytest.mark.parametrize("period", [12, 16, 25.3])
-def test_a_lattice_whose_cells_repeat_with_the_samples_is_no_mask(period):
-    values = gyroid(period)
-    for each in (values, values / np.linalg.norm(np.gradient(values), axis=0)):
-        assert make_grid(each + 1e-9, **PLACE).field.kind == "smooth"
-
-
 @pytest.mark.parametrize("most", [100, 255])
 @pytest.mark.parametrize("width", [1.0, 1.7])
 def test_probabilities_in_whole_numbers_are_densities(most, width):
@@ -394,10 +392,9 @@ def test_the_level_is_between_the_plateaus_of_an_image_with_noise():
         assert 0.2 < (level - outside) / (inside - outside) < 0.8
 
 
-def test_blurred_steps_of_a_thousand_are_no_noisy_distances():
-    noise = np.random.default_rng(0).normal(size=box().shape)
-    values = 650 * np.tanh(-box()) - 350 + 20 * noise
-    assert make_grid(values, **PLACE).field.kind == "smooth"
+def test_the_surface_of_densities_of_both_signs_may_be_at_0():
+    said = refusal(GridError, make_grid, NORMAL**3 + 0.3, **PLACE)
+    assert said.endswith(" (or, if the surface is at 0, field='smooth')")
 
 
 @pytest.mark.parametrize("cut", [1.0, 0.8])

@@ -286,7 +286,7 @@ def test_files_and_parts_have_the_names(command, boxes):
     assert [row["name"] for row in rows] == ["liver&co", "left_kidney"]
     assert [row["sample_volume"] for row in rows] == [180.0, 181.0]
     assert [row["components"] for row in rows] == [1, 2]
-    assert "o-left_kidney.stl: left_kidney, " in err and " of its samples 181" in err
+    assert "o-left_kidney.stl: left_kidney, " in err and " of its voxels 181" in err
     convert(command, boxes, "o.glb", "all", "--names", "names.ctbl")
     parts = trimesh.load("o.glb").geometry
     assert sorted(parts) == ["left_kidney", "liver&co"]
@@ -318,10 +318,10 @@ def test_labels_are_chosen_by_name(command, boxes):
     made = Path("one.ply").read_bytes()
     assert command(*run, "--label", "left_kidney", "--names", "names.ctbl")[0] == 0
     assert Path("one.ply").read_bytes() == made
-    known = "names of the table (Background, liver&co, left_kidney)"
+    known = "of the table (Background, liver&co, left_kidney)"
     for words, said in (
-        (("--labels", "lung"), f"--labels has 'lung': give numbers, or {known}"),
-        (("--label", "lung"), "--label is 'lung': give a whole number, -2^63 to 2^64 - 1"),
+        (("--labels", "lung"), f"--labels has 'lung': give numbers, or names {known}"),
+        (("--label", "lung"), f"--label lung names 0 labels: give a number, or a name {known}"),
     ):
         run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words
         assert command(*run) == (2, "", f"Error: {said}\n")

@@ -133,9 +133,7 @@ def test_without_the_extra_a_page_says_that_nothing_is_checked(command, opened, 
 
 def test_the_page_of_a_batch_made_without_one_names_failures_first(command, grid_folder):
     command(*BATCH)
-    before = Path("out/a.ply").stat().st_mtime_ns
     assert command(*BATCH, "--report", "page.html")[0] == 1
-    assert Path("out/a.ply").stat().st_mtime_ns == before
     bad, *made = files_of("page.html")
     assert [entry["name"] for entry in made] == ["a.ply", "deep/b.ply", "deep/er/c.d.ply"]
     assert all(entry["status"] == "ok" and entry["residual"] > 0 for entry in made)

@@ -95,8 +95,6 @@ def features_everywhere():
     with pytest.MonkeyPatch.context() as patch:
         for name in ("LEAST_SLOPE_TRUST", "LEAST_SPHERES"):
             patch.setattr(features, name, 0)
-        for name in ("SURE_COSINE", "SURE_TRUST"):
-            patch.setattr(features, name, -np.inf)
         patch.setattr(features, "SHARP_COSINE", 1.1)
         patch.setattr(features, "HALF_ANGLE_COSINE", 1.1)
         patch.setattr(features, "load_rule", lambda: features.Rule(1.0, ()))
@@ -109,7 +107,7 @@ def noise(seed, least):
     return dense_field(lattice)
 
 
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 10**6), st.sampled_from([0.05, 0.3, 1.0]))
 def test_any_lattice_gives_a_closed_manifold_of_features(features_everywhere, seed, least):
     mesh = extract_sharp(*noise(seed, least))
@@ -126,23 +124,6 @@ def test_no_triangles_intersect_with_features_everywhere(features_everywhere):
     assert all(intersections(extract_sharp(*field)) <= n for field, n in zip(fields, plain))
     features_everywhere.setattr(features, "without_folds", lambda *of: of[1])
     assert intersections(extract_sharp(*fields[0])) > 100
-
-
-@pytest.mark.parametrize("radius", [0.5, 0.8])
-def test_edges_of_a_rounded_box_are_dropped_since_they_are_off_the_spheres(monkeypatch, radius):
-    """A rule that takes all for edges sets hundreds of features there."""
-    half, middle = np.array([4.2, 3.1, 2.3]), 10.13
-    grid = SdfGrid.trusted(box_grid(half, 20, middle) - radius, 1.0)
-    field = upsample(grid, load_network("fast"), 4)
-    monkeypatch.setattr(features, "load_rule", lambda: features.Rule(1.0, ()))
-
-    def worst(mesh):
-        return np.abs(box_distance((mesh.vertices - middle) @ TURN, half) - radius).max()
-
-    monkeypatch.setattr(features, "SURE_COSINE", np.inf)
-    assert worst(extract_sharp(field)) < 0.04
-    monkeypatch.setattr(features, "are_farther", lambda *of: np.zeros(len(of[2]), bool))
-    assert worst(extract_sharp(field)) > 0.14
 
 
 def test_a_blade_and_a_gap_do_not_intersect():

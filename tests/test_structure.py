@@ -41,15 +41,15 @@ BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a r
     "grid": 2233,  # 1,800
     "network": 500,
     "refine": 1293,
-    "surface": 2327,  # 2,200; and features off the spheres are dropped, what is noted of a mesh
+    "surface": 2321,  # 2,200; and features off the spheres are dropped, what is noted of a mesh
     "tiles": 300,
     "files": 2699,  # 2,700; and readers and writers of other packages
     "functions": 684,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached
     "labels": 882,
     "simplify check truth evaluation": 1412,  # 1,100; and the evaluation, which lab imports
-    "batch": 885,
-    "pages": 400,
-    "cli": 839,  # 800; and standard input and output
+    "batch": 888,  # and what a page lacks is made again
+    "pages": 385,
+    "cli": 873,  # 800; and standard input and output, a row for each label of a mesh
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 90, 45, 114  # 90, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 17_800, 36_000

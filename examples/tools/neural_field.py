@@ -6,11 +6,15 @@ A small network learns the distances of a ring for half a minute. ``reconstruct`
 coarse samples and at the vertices, instead of at every node of a fine lattice.
 """
 
-import sys
+from argparse import ArgumentParser, RawDescriptionHelpFormatter
 
 import torch
 
 from super_sdf import DistanceFunction, reconstruct, write_mesh
+
+options = ArgumentParser(description=__doc__, formatter_class=RawDescriptionHelpFormatter)
+options.add_argument("out", nargs="?", default="ring.ply", help="mesh file")
+out = options.parse_args().out
 
 
 def ring(points):
@@ -33,7 +37,7 @@ for _ in range(600):
 
 field = DistanceFunction(model)
 mesh = reconstruct(function=field, bounds=(-1, 1), spacing=2 / 31)
-write_mesh(mesh, sys.argv[1] if len(sys.argv) > 1 else "ring.ply", force=True)
+write_mesh(mesh, out, force=True)
 
 dense = (4 * 31 + 1) ** 3
 off = model(torch.as_tensor(mesh.vertices)).abs().mean().item() / (2 / 31)

@@ -11,14 +11,13 @@ pierces it. All lengths are in voxels unless they are named otherwise.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from trimesh.triangles import angles
 
 from .arrays import CENTRE, BoolArray, FloatArray, length, sums_at
-from .files.grids import read_grid
 from .grid.derived import ON_SAMPLE
 from .grid.sdf_grid import SdfGrid, cubic_grid, volume_of_samples
 from .options import LENGTHS, Options
@@ -26,7 +25,7 @@ from .refine.band import Band, no_surface, survey
 from .refine.nodes import VoxelIndex
 from .surface.mesh import Mesh
 from .threads import check_fits, give_back, memory_bound, useful_threads
-from .truth import Points, Solid, merged, read_mesh, smallest_angles
+from .truth import Points, Solid
 
 # Bytes for each triangle and each voxel of the band, beside mesh and band: search trees.
 BYTES_PER_TRIANGLE, BYTES_PER_SAMPLE = 650, 150
@@ -52,6 +51,7 @@ class Surface:
     components: int  # that share no vertex
     self_intersections: int  # pairs of triangles that meet off a common vertex or edge
     volume: float  # in cubic world units, negative if the triangles face inward
+    volume_ml: float | None  # in millilitres, if the unit is stated
     area: float
     slivers: int  # triangles with an angle under half a degree
     needles: int  # vertices at the tip of a spike: all their edges are in a narrow cone
@@ -77,6 +77,17 @@ class Surface:
             **asdict(self),
         }
 
+    def counts(self) -> str:
+        """Return counts and volume, as a part of a line."""
+        ml = "" if self.volume_ml is None else f" ({self.volume_ml:.6g} ml)"
+        pieces = f"{self.components:,} piece{'s' * (self.components != 1)}"
+        text = f"{self.vertices:,} vertices, {self.triangles:,} triangles, {pieces}, "
+        return f"{text}volume {self.volume:.6g}{ml}, area {self.area:.6g}"
+
+    def summary(self) -> str:
+        """Return the faults in one line."""
+        return f"faults: {'; '.join(self.faults() or ['none'])}"
+
 
 @dataclass(frozen=True, eq=False)
 class Certificate:
@@ -97,7 +108,6 @@ class Certificate:
     strays: int | None  # vertices where the grid has no surface; None if no sample is exact
     beyond: int  # vertices outside the grid
     sample_volume: float | None  # of a mask: of its samples inside, each of which is a box
-    volume_ml: float | None  # of the mesh, in millilitres, if its unit is stated
 
     def figures(self) -> dict[str, Any]:
         """Return mean, quantile and maximum of the absolute residuals; nothing without samples."""
@@ -124,7 +134,6 @@ class Certificate:
             "strays": self.strays,
             "beyond": self.beyond,
             "sample_volume": self.sample_volume,
-            "volume_ml": self.volume_ml,
             "faults": self.faults(),
             "inferred": list(self.grid.flagged),
         }
@@ -140,10 +149,8 @@ class Certificate:
     def lines(self) -> list[str]:
         """Return the certificate as lines for users."""
         of, samples = self.surface, self.samples
-        ml = "" if self.volume_ml is None else f" ({self.volume_ml:.6g} ml)"
         lines = [
-            f"mesh: {of.vertices:,} vertices, {of.triangles:,} triangles, {of.components:,} "
-            f"piece{'s' * (of.components != 1)}, volume {of.volume:.6g}{ml}, area {of.area:.6g}",
+            f"mesh: {of.counts()}",
             f"shape: {of.slivers:,} slivers (triangles with an angle under {SLIVER:g} degrees), "
             f"{of.needles:,} needles (vertices at the tip of a spike)",
         ]
@@ -203,24 +210,12 @@ class Certificate:
         return np.copysign(size, (weight * there).sum(1)).astype(np.float32)
 
 
-def read_for_check(
-    mesh: str | Path, grid: str | Path, options: Options, made: Any = None
-) -> tuple[Mesh, SdfGrid]:
-    """Return a mesh and its grid: those that were ``made``, else read as it was made from them."""
-    if made is not None:
-        return merged(made.mesh), made.grid
-    samples, read = read_grid(grid, **options.reading()), read_mesh(mesh)
-    if options.unit and Path(mesh).suffix.lower() == ".glb":  # it is in metres
-        read = Mesh(read.vertices / LENGTHS[options.unit], read.faces)
-    return read, samples
-
-
 def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certificate:
     """Check a mesh against the grid that it was made from.
 
-    Vertices at the same position must be one vertex, as ``read_mesh`` returns them. Of the options
-    the offset, the unit and the memory bound count. GridError if the grid has no surface at the
-    offset; OutOfMemoryError if the search trees would not fit in memory.
+    Vertices at the same position must be one vertex, as of ``merged``. Of the options the offset,
+    the unit and the memory bound count. GridError if the grid has no surface at the offset;
+    OutOfMemoryError if the search trees would not fit in memory.
     """
     offset, lattice = options.offset, cubic_grid(grid, options.offset)
     band = survey(lattice, offset, threads=useful_threads(0))
@@ -229,7 +224,7 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certif
     need = len(mesh.faces) * BYTES_PER_TRIANGLE + len(band.voxel_ijk) * BYTES_PER_SAMPLE
     what, most = f"checking {len(mesh.faces):,} triangles", memory_bound(options.max_memory)
     check_fits(need, what, "allow more (--max-memory)", most)
-    surface, touched = examine_surface(mesh), touch(Solid(mesh), band, grid)
+    surface, touched = examine_surface(mesh, options.unit), touch(Solid(mesh), band, grid)
     is_mask, nearest = lattice.field.sides_only, np.rint(lattice.to_index(mesh.vertices))
     beyond = ((nearest < 0) | (nearest >= lattice.shape)).any(1)
     away = VoxelIndex(band.voxel_ijk, lattice.shape).find(nearest.astype(np.int64)) < 0
@@ -241,11 +236,10 @@ def check_mesh(mesh: Mesh, grid: SdfGrid, options: Options = AS_GIVEN) -> Certif
         strays=int((away & ~beyond).sum()) if is_mask or touched[0]["exact"] else None,
         beyond=int(beyond.sum()),
         sample_volume=volume_of_samples(grid, offset) if is_mask else None,
-        volume_ml=surface.volume * (100 * LENGTHS[options.unit]) ** 3 if options.unit else None,
     )
 
 
-def examine_surface(mesh: Mesh) -> Surface:
+def examine_surface(mesh: Mesh, unit: str | None = None) -> Surface:
     """Return what a mesh is as a surface; vertices at the same position must be one vertex."""
     whole = Mesh(mesh.vertices, mesh.faces[(mesh.faces != np.roll(mesh.faces, 1, 1)).all(1)])
     opposite, uses, flipped = whole.pair_edges()
@@ -254,7 +248,7 @@ def examine_surface(mesh: Mesh) -> Surface:
     sides = (np.roll(corners, -1, axis=1) - corners).reshape(-1, 3)
     sides /= np.maximum(length(sides), 1e-300)[:, None]
     directions = length(sums_at(at.astype(np.int64), sides, len(fans)))
-    degrees = np.bincount(at, minlength=len(fans))
+    degrees, volume = np.bincount(at, minlength=len(fans)), whole.volume()
     tips = (directions > NEEDLE * degrees) & (degrees > 2)
     return Surface(
         open_edges=int((uses % 2).sum()),
@@ -265,9 +259,10 @@ def examine_surface(mesh: Mesh) -> Surface:
         pinched_vertices=int(np.count_nonzero(fans > 1)),
         components=whole.components()[0],
         self_intersections=len(Solid(mesh).intersecting()),
-        volume=whole.volume(),
+        volume=volume,
+        volume_ml=volume * (100 * LENGTHS[unit]) ** 3 if unit else None,
         area=whole.area(),
-        slivers=int(np.count_nonzero(smallest_angles(corners) < SLIVER)),
+        slivers=int(np.count_nonzero(np.degrees(angles(corners).min(1)) < SLIVER)),
         needles=int(np.count_nonzero(tips)),
     )
 

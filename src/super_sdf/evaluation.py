@@ -81,7 +81,7 @@ def evaluate(
         no area; if a file cannot be read, or the extra ``eval`` is not installed.
     """
     check_modules("evaluating", "eval")
-    some, true = ([each] if isinstance(each, Given) else each for each in (meshes, references))
+    some, true = (np.array(each, object, ndmin=1) for each in (meshes, references))
     if len(some) != len(true):
         raise OptionError(f"there are {len(some)} meshes and {len(true)} references: give as many")
     steps = np.ravel(np.nan if spacing is None else spacing).astype(np.float64)

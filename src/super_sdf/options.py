@@ -143,7 +143,7 @@ def _option(default: Any, *row: Any, **more: Any) -> Any:
     return field(default=default, metadata={"row": Option(*row, **more)})
 
 
-GRID, VALUES, MESH, WORK = "The grid", "Its values", "The mesh", "The work"
+GRID, VALUES, MESH, WORK = "The grid", "The values", "The mesh", "The work"
 
 
 class Values(TypedDict, total=False):
@@ -178,64 +178,64 @@ class Options:
         "World position of sample (0, 0, 0). Default: from the file, else 0,0,0.", "X,Y,Z")
     direction: tuple[float, ...] | None = _option(None, GRID, "read list labels",
         Kind("nine numbers, row by row", partial(numbers, (9,))),
-        "World directions of the array's axes, a matrix with a unit vector in each column, as nine "
-        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other files state it.", "MATRIX")
+        "World directions of the array's axes: a matrix with a unit vector in each column, as nine "
+        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other formats state it.", "MATRIX")
     axes: AxisOrder | None = _option(None, GRID, "read list labels", one_of(AxisOrder),
         "Axis order of an array in NumPy, TIFF, HDF5 or Zarr. Default: by the names of the axes, "
         "else xyz for NumPy, zyx for the others.")
     space: Space | None = _option(None, GRID, "read list labels", one_of(Space),
-        "Anatomical space of the mesh, for files that state theirs. Default: that of the file.")
+        "Anatomical space of the mesh, for files that state a space. Default: the file's space.")
     inside: Inside = _option("auto", VALUES, "read list", one_of(Inside),
         "Sign of the values inside the solid; auto takes the border of the grid as outside.")
     field: FieldKind = _option("auto", VALUES, "read list", one_of(FieldKind),
-        "What the values are: distances, distances with noise, a mask or its transform, or a "
-        "smooth field, which has the surface of its own cubic spline; auto goes by the samples.")
+        "What the values are: distances, distances with noise, a mask or a distance transform of a "
+        "mask, or a smooth field, meshed by its cubic spline; auto decides by the values.")
     label: int | None = _option(None, VALUES, "read list", LABEL,
-        "Mesh the samples with the value N of a label image, or its name by --names.", "N")
+        "Mesh the samples with the value N of a label image.", "N")
     labels: str | tuple[int | str, ...] | None = _option(None, VALUES, "list labels",
         Kind("all, or some labels such as 1,2,3", _labels),
-        "Mesh all labels of a label image but 0, or those listed, with shared walls: as parts of "
-        "a .glb or .3mf, else each in its own file, NAME-N.ply.", "all|N,N")
+        "Mesh all labels of a label image but 0, or the listed labels, with shared walls: as parts "
+        "of a .glb or .3mf, else as a file for each label, NAME-N.ply.", "all|N,N")
     level: float | None = _option(None, VALUES, "read list", ANY,
         "Mesh the surface at the value L of densities; above L is inside, unless --inside is "
         "negative.", "L")
     scale: float | None = _option(None, VALUES, "read list", ABOVE_0,
-        "World units per unit of the values, if they have another unit than the spacing.", "S")
+        "World units per unit of the values, if values and spacing have different units.", "S")
     unknown: float | None = _option(None, VALUES, "read list", ANY,
-        "Samples with the value V are unknown, as those that are NaN.", "V")
+        "Take samples with the value V as unknown, like NaN.", "V")
     offset: float = _option(0.0, MESH, "list", number("a finite number, in world units"),
         "Mesh the offset surface at distance D, in world units; a positive D grows the solid.", "D")
     cap: bool = _option(True, MESH, "list", FLAG,
-        "Close the surface along the border of the grid (default), or leave it open there, as one "
-        "that ends at unknown samples must be.", off="open")
+        "Close the surface along the border of the grid (default), or leave the surface open. A "
+        "surface that ends at unknown samples needs --open.", off="open")
     mesher: MesherName = _option("auto", MESH, "list", one_of(MesherName),
         "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
         "them; auto is sharp for distances, marching for masks and noise.")
     simplify: float | None = _option(None, MESH, "list labels",
         number("a number greater than 0, in voxels (--tolerance takes world units)", above=0),
-        "Simplify the mesh within ERROR voxels of the unsimplified one, such as 0.02, both ways. "
-        "Needs the extra simplify.", "ERROR")
+        "Simplify the mesh to within ERROR voxels, such as 0.02, of the unsimplified mesh. Needs "
+        "the extra simplify.", "ERROR")
     tolerance: float | None = _option(None, MESH, "list labels",
         number("a number greater than 0, in world units", above=0),
-        "Simplify as with --simplify, but within D in world units.", "D")
+        "Simplify as with --simplify, but to within D in world units.", "D")
     triangles: int | None = _option(None, MESH, "list",
         number("a whole number, 4 or more, as a closed mesh has", above=3, step=1),
         "Simplify the mesh to at most N triangles, instead of --simplify.", "N")
     keep_volume: bool = _option(False, MESH, "list labels", FLAG,
-        "Of masks and labels: move each surface by a small part of a voxel until its volume is "
-        "that of its samples, as boxes.")
+        "For masks and labels: move each surface, by an eighth of a voxel at most, until the mesh "
+        "has the volume of the voxels inside.")
     unit: Unit | None = _option(None, MESH, "list labels", one_of(Unit),
-        "Unit of the world, which .3mf (default: millimetres) and .glb (metres) state. "
-        "Coordinates stay as they are.")
+        "Unit of the world coordinates, stated in .3mf (default: millimetres) and .glb (default: "
+        "metres). Coordinates stay as they are.")
     quality: Quality | None = _option(None, WORK, "labels", one_of(Quality),
-        "Network: fast is quicker than base, the default; best averages base over 4 turns of the "
-        "grid, and takes 4 times as long.")
+        "Network: fast is quicker than base, the default; best averages base over 4 rotations of "
+        "the grid, and takes 4 times as long.")
     model: str | None = _option(None, WORK, "labels",
         PATH._replace(make=lambda value: str(Path(value))),
         "Use the network in this ONNX file instead of --quality.", "FILE")
     precision: Precision = _option("auto", WORK, "labels", one_of(Precision),
-        "Arithmetic of the network: auto is int8, twice as fast, on the CPU if the network has "
-        "it, else float32.")
+        "Arithmetic of the network: auto is int8, twice as fast, on the CPU for networks that have "
+        "int8 weights, else float32.")
     device: Device = _option("auto", WORK, "labels", one_of(Device),
         "Where the network runs; auto uses CUDA if it works here, else the CPU.")
     threads: int = _option(0, WORK, "labels",
@@ -244,7 +244,7 @@ class Options:
     max_memory: int | None = _option(None, WORK, "labels",
         Kind("a number of bytes greater than 0, such as 1500M or 4G", _bytes),
         "Memory limit of the process, such as 4G. Default: 60 % of the free memory. Larger grids "
-        "are refined in boxes, whose meshes are joined.", "SIZE")
+        "are refined in tiles, whose meshes are joined.", "SIZE")
     # fmt: on
 
     def __post_init__(self) -> None:

@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import length
 from .errors import FileError, MeshError, OptionError
 from .files.formats import check_regular_file
 from .grid.sdf_grid import SdfGrid
+from .options import LENGTHS
 from .surface.mesh import Mesh
 from .threads import check_fits, chunks_of
 
@@ -43,7 +43,6 @@ SMALLEST_STEP = 1e-18  # of the largest coordinate, so that multiples of it fit 
 EDGE = 8  # samples along a cube
 EXACT_SAMPLES = 1 << 24  # up to 256^3 every sample is exact unless a band is given
 BIG_GRID_BAND = 4.0  # voxels; upsampling uses none beyond 1.5 + sqrt(3)
-LEAST_BAND = 1.5  # voxels; the band of the pipeline
 MOST_ALONG_AXIS = 1e9  # samples; a larger number can only be a mistake
 POSITION_ERROR = 1e-4  # largest error of a sample's position, over the spacing
 PADDING = 2.37  # voxels; a whole number puts faces of a box on planes of samples
@@ -52,9 +51,18 @@ WORK_BYTES = 500_000_000  # for search trees and chunks, besides the values
 
 
 def read_mesh(path: str | Path) -> Mesh:
-    """Read any mesh file that trimesh reads, with merged float64 vertices.
+    """Read a mesh file as one mesh, its parts together: see ``read_parts``."""
+    parts = list(read_parts(path).values())
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)], dtype=np.int32)
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, first)])
+    return merged(Mesh(np.concatenate([part.vertices for part in parts]), faces))
 
-    FileError if no mesh can be read, MeshError if what the file holds is no finite surface.
+
+def read_parts(path: str | Path, unit: str | None = None) -> dict[str, Mesh]:
+    """Read the parts of any mesh file that trimesh reads, by name, with merged float64 vertices.
+
+    A ``.glb`` is in metres: its vertices are divided by the ``unit``. FileError if no mesh can be
+    read, MeshError if what the file holds is no finite surface.
     """
     path = check_regular_file(path)
     try:
@@ -64,21 +72,31 @@ def read_mesh(path: str | Path) -> Mesh:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # unprocessed: otherwise faces with non-finite vertices would be dropped silently
-            found = trimesh.load_mesh(path, process=False, skip_materials=True)
-            vertices = np.array(getattr(found, "vertices", ()), np.float64).reshape(-1, 3)
-            faces = np.array(getattr(found, "faces", ()), np.int64).reshape(-1, 3)
+            scene: Any = trimesh.load_scene(path, process=False, skip_materials=True)
+            order = list(scene.geometry)
+            some = [part for part in scene.dump() if len(getattr(part, "faces", ()))]
+            some.sort(key=lambda part: order.index(part.metadata["name"]))
+            arrays = {}
+            for part in some:
+                vertices = np.array(part.vertices, np.float64).reshape(-1, 3)
+                faces = np.array(part.faces, np.int64).reshape(-1, 3)
+                arrays[part.metadata["node"]] = vertices, faces
     except Exception as error:  # the readers of trimesh raise all kinds of errors
         reason = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
         raise FileError(f"{path} cannot be read as a mesh: {reason}") from error
-    if not len(faces):
+    if not arrays:
         raise MeshError(f"{path} holds no triangle: give a surface mesh")
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError(f"{path} has a face of a vertex that it does not hold: repair it")
-    used, corners = np.unique(faces, return_inverse=True)
-    mesh = Mesh(vertices[used], corners.astype(np.int32).reshape(-1, 3))
-    if not (largest := np.abs(mesh.vertices).max()) <= LARGEST_COORDINATE:
-        raise MeshError(f"{path} reaches to {largest:.3g}: repair it, or scale it to under 1e30")
-    return merged(mesh)
+    scale, meshes = LENGTHS[unit] if unit and path.suffix.lower() == ".glb" else 1.0, {}
+    for name, (vertices, faces) in arrays.items():
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise MeshError(f"{path} has a face of a vertex that it does not hold: repair it")
+        used, corners = np.unique(faces, return_inverse=True)
+        if not (largest := np.abs(vertices[used]).max()) <= LARGEST_COORDINATE:
+            how = "repair it, or scale it to under 1e30"
+            raise MeshError(f"{path} reaches to {largest:.3g}: {how}")
+        mesh = Mesh(vertices[used] / scale, corners.astype(np.int32).reshape(-1, 3))
+        meshes[name] = merged(mesh)
+    return meshes
 
 
 def merged(mesh: Mesh) -> Mesh:
@@ -121,15 +139,12 @@ class Solid:
 
     @cached_property
     def unbalanced_edges(self) -> int:
-        """How many edges faces do not use equally often in both directions: 0 if closed.
+        """How many edges are open, or of two faces in the same direction: 0 if closed.
 
         An edge of four faces counts as closed: the winding number is an integer on all its sides.
         """
-        faces = self.mesh.faces.astype(np.int64)
-        start, end = faces.ravel(), np.roll(faces, -1, 1).ravel()
-        key = np.minimum(start, end) * (start.max(initial=0) + 1) + np.maximum(start, end)
-        _, edge = np.unique(key, return_inverse=True)
-        return int(np.count_nonzero(np.bincount(edge, np.sign(end - start))))
+        _, uses, flipped = self.mesh.pair_edges()
+        return int((uses % 2).sum()) + flipped
 
     def nearest(self, points: Points) -> tuple[Distances, NDArray[np.int64], Points]:
         """Return the distance to the nearest triangle, that triangle, and its nearest point."""
@@ -165,20 +180,12 @@ class Solid:
         return whole[igl.predicates.find_self_intersections(self.mesh.vertices, faces[whole])[1]]
 
 
-def smallest_angles(corners: Points) -> Distances:
-    """Return the smallest angle of each triangle, (m,), in degrees; corners are (m, 3, 3)."""
-    a, b, c = np.moveaxis(corners, 1, 0)
-    sides = np.sort(length(corners - np.roll(corners, 1, axis=1)), axis=1)
-    sine = length(np.cross(b - a, c - a)) / np.maximum(sides[:, 1] * sides[:, 2], 1e-300)
-    return np.degrees(np.arcsin(np.minimum(sine, 1)))
-
-
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:
     """Read a mesh file as a solid; return it with notes on its faults.
 
-    An inverted mesh is reversed. FileError or MeshError if it cannot
-    be read, is flat, or is open and ``allow_open`` is not set. With ``allow_open`` the sign comes
-    from the generalised winding number, a guess near the holes.
+    An inverted mesh is reversed. FileError or MeshError if it cannot be read, is flat, or is open
+    and ``allow_open`` is not set. With ``allow_open`` the sign comes from the generalised winding
+    number, a guess near the holes.
     """
     solid, notes = Solid(read_mesh(path)), []
     mesh, open_edges, volume = solid.mesh, solid.unbalanced_edges, solid.mesh.volume()
@@ -228,16 +235,14 @@ def sample_solid(
 ) -> SdfGrid:
     """Sample the signed distance to a solid.
 
-    ``band`` is the distance in voxels up to which values are exact (to float32), at least 1.5; they
-    are clamped there, as the grid's notes say. Default: ``BIG_GRID_BAND`` in grids of over 256^3
+    ``band`` is the distance in voxels up to which values are exact (to float32); they are clamped
+    there, as the grid's notes say. Default: ``BIG_GRID_BAND`` in grids of over 256^3
     samples, else none. ``progress`` is called with (cubes done, all cubes). MeshError if floating
     point cannot hold the distances or the positions; OutOfMemoryError.
     """
     shape, spacing, origin = layout
     if band is None:
         band = BIG_GRID_BAND if prod(shape) > EXACT_SAMPLES else np.inf
-    if not band >= LEAST_BAND:
-        raise OptionError(f"--band is {band:g}: give at least {LEAST_BAND:g} voxels")
     reach = float(np.abs(origin).max()) + spacing * max(shape)
     if not (spacing > 1e-30 and reach < 1e30 and np.spacing(reach) <= POSITION_ERROR * spacing):
         said = f"a spacing of {spacing:g} in a grid that reaches to {reach:g} is too fine for "

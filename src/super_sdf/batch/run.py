@@ -163,7 +163,7 @@ class Batch:
         settings, how, row = self.settings, self._how(job), self.record.rows.get(job.target)
         if row:
             is_ok, same_path = row["status"] == "ok", row["in"] == os.path.abspath(job.source)
-            again = settings.check and "check" not in row if is_ok else settings.retry
+            again = self._lacks(job, row) if is_ok else settings.retry
             if (
                 not (settings.force or row["retry"] or again)
                 and all(row.get(key) == value for key, value in how.items() if key != "model")
@@ -177,6 +177,14 @@ class Batch:
         if why := self._why_not(job, targets):
             job.row, job.state = job.failed(why) | how, "refused"
 
+    def _lacks(self, job: Job, row: Row) -> bool:
+        """Say whether what is asked for beside a mesh is missing: its check, or that of a page."""
+        if self.settings.items is None:
+            return self.settings.check and "check" not in row
+        from ..pages.items import find_item
+
+        return find_item(self.settings.items, job.target, row["output"]["sha256"]) is None
+
     def _how(self, job: Job) -> Row:
         """Return what a row says of how a mesh was made: enough to make it again."""
         asked, names = job.options.digest(), self.settings.names
@@ -186,24 +194,19 @@ class Batch:
 
     def write_page(self, path: Path, lead: str) -> None:
         """Write the page of the batch, ``lead`` first; also of other runs' rows, not of labels."""
-        from ..pages import html, items
+        from ..pages.html import write_batch_page
 
-        folder, jobs = self.settings.folder, {job.target: job for job in self.jobs}
-        rows = self.record.rows | {name: job.row for name, job in jobs.items()}
+        folder, rows = self.settings.folder, {job.target: job.row for job in self.jobs}
+        rows = self.record.rows | rows
         for name, row in list(rows.items()):
             is_gone = row.get("status") == "ok" and not is_unchanged(folder / name, row["output"])
             if is_gone or row.get("asked", {}).get("labels") is not None:
                 del rows[name]
 
-        def draw(name: str) -> items.Item | None:
-            if job := jobs.get(name):
-                return items.item_of_files(folder / name, job.source, job.options)
-            return None
-
         left = len(self.of("to_do"))
         alert = f"Incomplete: {left} not finished; run it again to go on" if left else ""
         facts = {"title": f"Batch: {folder}", "lead": lead, "alert": alert}
-        html.write_batch_page(path, facts, rows, draw, force=self.settings.force)
+        write_batch_page(path, facts, rows, force=self.settings.force)
 
 
 def size_of(job: Job) -> int:

@@ -71,7 +71,7 @@ def convert_job(
         row |= {"output": known if job.has_label_files else known[job.mesh], **made.facts}
         row["stages"] = {name: round(seconds, 4) for name, seconds in made.seconds.items()}
         if settings.check or settings.items:
-            row["check"] = _check(job, settings, target, made, row["output"]["sha256"])
+            row["check"] = _check(job, settings, made, row["output"]["sha256"])
         row |= {"status": "ok", "reason": None, "retry": False}
     except Exception as error:  # a bug that one file shows must not cost the others
         by_input = isinstance(error, (GridError, OptionError, FileError))
@@ -83,16 +83,16 @@ def convert_job(
     return dict(json.loads(json.dumps(row).replace(staged, final)))
 
 
-def _check(job: Job, settings: Settings, mesh: Path, made: Conversion, sha256: str) -> Row:
+def _check(job: Job, settings: Settings, made: Conversion, sha256: str) -> Row:
     """Return the certificate of a mesh, or why there is none; keep what a page shows of it."""
-    from ..check import check_mesh, read_for_check
-    from ..pages.items import item_of_files, keep_item
+    from ..check import check_mesh
+    from ..pages.items import item_of, keep_item
+    from ..truth import merged
 
     try:
         if settings.items is None:
-            both = read_for_check(mesh, job.source, job.options, made)
-            return check_mesh(*both, job.options).report()
-        item = item_of_files(mesh, job.source, job.options, made)
+            return check_mesh(merged(made.mesh), made.grid, job.options).report()
+        item = item_of(made, job.options)
         keep_item(item, settings.items, job.target, sha256)
         return item.certificate or {}
     except Exception as error:  # the mesh is good all the same

@@ -1,13 +1,11 @@
 """Convert many grids to meshes in the folder DIR, each as upsample would.
 
-Each IN is a grid file, a folder (searched with its subfolders), a pattern such as '**/*.npy', or a
-list of inputs: .txt with one path per line, or .jsonl with one object per line such as
-{"in": "a.npy", "out": "a.ply", "spacing": 0.5}. Paths are relative to the list.
+Each IN is a grid file as for upsample, a folder (searched with its subfolders), a pattern such as
+'**/*.npy', or a list of inputs: .txt with one path per line, or .jsonl with one object per line
+such as {"in": "a.npy", "out": "a.ply", "spacing": 0.5}. Paths are relative to the list.
 
-Grid files are $grids. FILE:NAME names one of several arrays in a $several file.
-
-A file that fails is reported and does not stop the others. Run the command again to resume
-after an interruption, or with more inputs or other options: only what is missing is done.
+A file that fails is reported and does not stop the batch. Run the command again to resume after an
+interruption, or with more inputs or other options: only missing meshes are made.
 
   super-sdf batch grids/ --out meshes/
   super-sdf batch 'scans/**/*.npz' more.txt --out meshes/ --format stl --factor 2
@@ -39,8 +37,8 @@ TAKES = (
     Argument(["sources"], metavar="IN...", nargs=-1, required=True, type=main.NAME),
     Option(["--out", "folder"], metavar="DIR", required=True, type=main.FILE,
         help="Folder for the meshes and report.jsonl; subfolders of IN are kept."),
-    Option(["--grid", "member"], metavar="NAME", default="",
-        help="Take the array of this name in files that hold several, as by FILE:NAME."),
+    Option(["--grid"], metavar="NAME", default="",
+        help="Name of the array to take from files with several arrays, as in FILE:NAME."),
     Option(["--format", "kind"], type=Choice(MESH_FORMATS), default=MESH_FORMATS[0],
         show_default=True, help="Mesh file format."),
     *OPTIONS,
@@ -49,7 +47,7 @@ TAKES = (
     Option(["--dry-run"], is_flag=True, help="Show what would be done; write nothing."),
     "check", "report",
     Option(["--force"], is_flag=True,
-        help="Convert everything again; replace files that are not as a batch wrote them."),
+        help="Convert everything again, and replace files that were changed by hand."),
     "json", "quiet",
 )  # fmt: skip
 
@@ -93,8 +91,7 @@ def planned(folder: Path, given: dict[str, Any]) -> tuple[list[Job], Settings]:
     from ..batch.work import Settings
     from ..labels.files import check_options
 
-    how = f".{given['kind']}", options, given["names"], given["member"]
-    jobs = find_jobs(given["sources"], *how)
+    jobs = find_jobs(given["sources"], f".{given['kind']}", options, given["names"], given["grid"])
     for job in jobs:
         if job.options.labels is not None:
             check_options(job.options, [name for name in ("check", "report") if given[name]])

@@ -1,7 +1,7 @@
 """Show versions, devices, networks and extras, and the command that installs missing extras.
 
-With --check, each network also refines a ball on the CPU and on CUDA. With GRID, show instead what
-that grid file states: shape, type, spacing and origin.
+With --check, each network also refines a ball, on the CPU and on CUDA. With GRID, show only what
+the grid file states: shape, type, spacing and origin.
 
   super-sdf info --check --device cuda
   super-sdf info scan.zarr
@@ -28,7 +28,7 @@ MOST_OFF, MOST_OFF_OF_MASK = 0.05, 0.6  # voxels; a mask shows the surface to ha
 TAKES = (
     Argument(["source"], metavar="[GRID]", required=False, type=main.NAME),
     Option(["--check"], is_flag=True, help="Also run the networks."),
-    main.table_option("device", "cpu skips CUDA; cuda makes it a failure if CUDA fails."),
+    main.table_option("device", "cpu leaves CUDA out; with cuda the exit code is 1 if CUDA fails."),
     "json",
 )  # fmt: skip
 
@@ -70,8 +70,7 @@ def run_checks(device: Device, check: bool) -> Iterator[tuple[str, str, str]]:
     from ..network.network import NO_NETWORKS, shipped_models
     from ..network.onnx import VERSION, available_devices, check_cuda
 
-    versions = f"super-sdf {__version__}, Python {platform.python_version()}"
-    yield OK, "versions", f"{versions}, {VERSION}"
+    yield OK, "versions", f"super-sdf {__version__}, Python {platform.python_version()}, {VERSION}"
     devices: list[Device] = ["cpu"]
     if device != "cpu":
         try:

@@ -9,7 +9,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
@@ -101,21 +101,22 @@ def table_option(name: str, text: str = "") -> click.Option:
         return click.Option([f"{word}/--{row.off}" if row.off else word], is_flag=True, **more)
     choices = f"[{'|'.join(row.kind.choices)}]" if row.kind.choices else None
     more |= {"show_default": row.default is not None, "metavar": row.metavar or choices}
+    more["shell_complete"] = lambda *at: [c for c in row.kind.choices if c.startswith(at[2])]
     return click.Option([word], type=click.UNPROCESSED, **more)
 
 
 SHARED: dict[Any, click.Option] = {  # options of several commands, by their names
     "names": click.Option(["--names"], type=FILE, metavar="TABLE",
-        help="With --labels: names and colours of the labels, from a table of 3D Slicer, ITK-SNAP "
-        "or FreeSurfer, CSV, or JSON such as nnU-Net's. --label and --labels take names then."),
+        help="Names and colours of labels, from a table of 3D Slicer, ITK-SNAP or FreeSurfer, CSV, "
+        "or JSON such as nnU-Net's. --label and --labels then take names, too."),
     "cluster": click.Option(["--cluster"], metavar="ADDRESS",
         help="Convert on the workers of the Dask scheduler at ADDRESS, each within --max-memory, "
         "or with 'local' on Dask workers of this machine. Needs the extra cluster."),
     "jobs": click.Option(["--jobs"], type=click.IntRange(0), default=0, metavar="N",
         help="Worker processes of a batch, or of --cluster local; 0 means one per core, or a "
-        "single one on CUDA."),
+        "single process on CUDA."),
     "check": click.Option(["--check"], is_flag=True,
-        help="Check each mesh against its samples, as check does. Needs the extra report."),
+        help="Check each mesh against its grid, like the command check. Needs the extra report."),
     "report": click.Option(["--report"], type=FILE, metavar="PAGE.html",
         help="Also write a page for the browser, with figures, warnings, a check and a 3-D view of "
         "each mesh. The check needs the extra report."),
@@ -132,9 +133,11 @@ def chosen_options(given: dict[str, Any]) -> Options:
         from ..labels.files import read_names
 
         given["names"] = read_names(given["names"])
-        alike = [n for n, (name, _) in given["names"].items() if name == given["label"]]
-        if alike[1:]:
-            raise OptionError(f"--label {given['label']} names {len(alike)} labels: give a number")
+        label, known = str(given["label"] or 0), [name for name, _ in given["names"].values()]
+        alike = [n for n, (name, _) in given["names"].items() if name == label]
+        if len(alike) != 1 and not label.lstrip("+-").isdigit():
+            some = f", or a name of the table ({', '.join(known[:10])})" * (not alike)
+            raise OptionError(f"--label {label} names {len(alike)} labels: give a number{some}")
         given["label"] = alike[0] if alike else given["label"]
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})
     for name in chosen.goals():
@@ -159,13 +162,18 @@ def check_page(word: str, page: Path, sources: Paths, others: Paths, *, force: b
 
 
 @contextmanager
-def progress_bar(label: str, quiet: bool) -> Iterator[Callable[[int, int], None] | None]:
-    """Draw a progress bar on a terminal's stderr."""
+def progress_bar(label: str, quiet: bool, first: str = "") -> Iterator[Any]:
+    """Draw a progress bar on a terminal's stderr; its label is ``first`` until it moves."""
     if quiet or not (sys.stderr and sys.stderr.isatty()):
         yield None
         return
-    with click.progressbar(length=1000, label=label, file=sys.stderr) as shown:
-        yield lambda done, total: shown.update(1000 * done // total - shown.pos)
+    with click.progressbar(length=1000, label=first or label, file=sys.stderr) as shown:
+
+        def show(done: int, total: int) -> None:
+            shown.label = label
+            shown.update(1000 * done // total - shown.pos)
+
+        yield show
 
 
 def print_stderr(*lines: str) -> None:
@@ -226,8 +234,10 @@ def _fault(error: BaseException, heard: list[int]) -> tuple[str, int]:
         cause = error.__cause__ or error  # a command may say what it has kept
         kept = cause.args if isinstance(cause, KeyboardInterrupt) else ()
         return f"{said}: {kept[0]}" if kept else said, 128 + heard[0]
-    if isinstance(error, click.NoSuchOption):  # only the most similar: click sorts them by letters
-        del (error.possibilities or [])[1:]
+    if isinstance(error, click.NoSuchOption) and error.ctx and error.possibilities is not None:
+        known = [name for each in error.ctx.command.params for name in each.opts]
+        longer = [name for name in known if name.startswith(error.option_name)]
+        error.possibilities[:] = longer or error.possibilities[:1]  # the most similar
     if isinstance(error, click.ClickException):
         return error.format_message(), error.exit_code
     if isinstance(error, (SuperSdfError, MemoryError)):

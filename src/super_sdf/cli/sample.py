@@ -1,7 +1,7 @@
 """Sample the signed distance to the closed mesh MESH on a regular grid and write it to OUT.
 
-MESH is any mesh file that trimesh reads. OUT is a .npz file (keys values, spacing, origin); its
-values are in the units of the mesh and negative inside.
+MESH is any mesh file that trimesh reads. OUT is a .npz file with the keys values, spacing and
+origin. The values are in the units of the mesh, and negative inside.
 
   super-sdf sample part.stl part.npz -n 64
   super-sdf sample part.stl part.npz --spacing 0.5 --padding 4
@@ -29,7 +29,7 @@ TAKES = (
     Option(["--band"], type=FloatRange(1.5), metavar="VOXELS",
         help="Exact distances up to this many voxels from the surface, clamped beyond. Default: "
         "exact everywhere up to 256^3 samples, within 4 voxels in larger grids."),
-    Option(["--allow-open"], is_flag=True, help="Accept a mesh with holes; its inside is a guess."),
+    Option(["--allow-open"], is_flag=True, help="Accept a mesh with holes: the inside is a guess."),
     "force", "quiet",
 )  # fmt: skip
 

@@ -3,8 +3,8 @@
 IN is a grid file: $grids. FILE:NAME names one of several arrays in a $several
 file. An .npz file has the keys values, spacing, origin and direction.
 
-OUT is a mesh file: one of $meshes. A - for IN is an .npy
-file on standard input, a - for OUT a mesh on standard output.
+OUT is a mesh file: one of $meshes. With - for IN, an .npy file is
+read from standard input; with - for OUT, the mesh is written to standard output.
 
   super-sdf upsample part.npz part.ply
   super-sdf upsample field.npy part.stl --spacing 0.5 --factor 8
@@ -39,7 +39,7 @@ TAKES = (
     Argument(["source"], metavar="IN", type=main.NAME),
     Argument(["target"], metavar="OUT", type=main.NAME),
     Option(["--format", "kind"], type=Choice(MESH_FORMATS),
-        help="Mesh file format of an OUT that is -. Default: ply."),
+        help="Mesh file format on standard output. Default: ply."),
     *OPTIONS,
     "names", "cluster", "jobs", "check",
     Option(["--save-field"], metavar="FIELD",
@@ -66,23 +66,19 @@ def command(source: str, target: str, **given: Any) -> None:
         seconds = {"load network": time.perf_counter() - start}
         done = converted(grid, mesh, network, options, **given)
         report: dict[str, Any] = {"input": source, "output": target, "version": __version__}
-        report |= {
-            "asked": options.digest(),
-            "model": options.network()["model"],
-            "precision": network.precision,
-            "device": network.device,
-            "device_notes": list(network.notes),
-            **done.facts,
-        }
+        report |= {"asked": options.digest(), "model": options.network()["model"]}
+        report |= {"precision": network.precision, "device": network.device}
+        report |= {"device_notes": list(network.notes), **done.facts}
         seconds, start = seconds | done.seconds, time.perf_counter()
         if given["as_json"] or page:
             from hashlib import sha256  # imported here, as it loads OpenSSL
 
             report["network"] = sha256(network.path.read_bytes()).hexdigest()
         if given["check"]:
-            from ..check import check_mesh, read_for_check
+            from ..check import check_mesh
+            from ..truth import merged
 
-            certificate = check_mesh(*read_for_check(mesh, grid, options, done), options)
+            certificate = check_mesh(merged(done.mesh), done.grid, options)
             report["check"] = certificate.report()
             seconds["check"] = time.perf_counter() - start
         report["seconds"] = {stage: round(spent, 4) for stage, spent in seconds.items()}
@@ -126,7 +122,7 @@ def standard_streams(source: str, target: str, kind: str | None) -> Iterator[tup
 def converted(source: str, target: str, network: Any, options: Options, **given: Any) -> Any:
     """Return the conversion of a grid, here or on a cluster, or that of the labels of an image."""
     with ExitStack() as stack:
-        bar = main.progress_bar("upsampling", given["quiet"])
+        bar = main.progress_bar("upsampling", given["quiet"], "reading")
         how: Any = {"progress": stack.enter_context(bar), "force": given["force"]}
         if options.labels is not None:
             from ..labels.files import check_options, convert_labels
@@ -154,16 +150,15 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     for row in report.get("labels", ()):
         name = report["output"] if report["output"] == "-" else row["output"]
         line = f"{name}: {row['name']}, {row['triangles']:,} triangles, volume "
-        lines.append(f"{line}{row['volume']:.6g}, of its samples {row['sample_volume']:.6g}")
+        lines.append(f"{line}{row['volume']:.6g}, of its voxels {row['sample_volume']:.6g}")
     if "labels" in report:
         return [*lines, f"{len(report['labels'])} labels, {seconds}"]
     few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
     low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in report["bounds"])
-    closed = "closed" if report["closed"] else "open"
-    line = f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, {closed}"
-    line += f", from {low} to {high}, {seconds}"
+    line = f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "
+    line += f"{'closed' if report['closed'] else 'open'}, from {low} to {high}, {seconds}"
     if not few and triangles > MANY:
-        line += "; far fewer triangles within 0.02 voxels of these: --simplify 0.02"
+        line += "; for far fewer triangles, within 0.02 voxel: --simplify 0.02"
     lines.append(line)
     if field:
         shape = " x ".join(map(str, field["shape"]))

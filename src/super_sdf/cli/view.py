@@ -1,8 +1,8 @@
 """Look at meshes, and at grids refined as by upsample, in the browser.
 
-MESH is any mesh file that trimesh reads. GRID is what upsample takes; its refined mesh is shown
-beside coarse marching cubes of the samples, with the residuals of its samples as colours (extra
-report). The page is one file, which needs no server; its address is printed.
+MESH is any mesh file that trimesh reads. GRID is a grid file as for upsample. The refined mesh of a
+grid is shown beside coarse marching cubes, with the residuals of the samples as colours (extra
+report). The page is one file, which needs no server. The address of the page is printed.
 
   super-sdf view part.npz
   super-sdf view part.ply other.stl --out page.html --no-browser
@@ -23,7 +23,7 @@ from . import main
 TAKES = (
     Argument(["sources"], metavar="MESH|GRID...", nargs=-1, required=True, type=main.NAME),
     Option(["--out"], type=main.FILE, metavar="PAGE.html",
-        help="File for the page. Default: one in the temporary folder that only you can read."),
+        help="File for the page. Default: a file that only you can read, in the temporary folder."),
     "force",
     Option(["--no-browser"], is_flag=True, help="Print the address and open no browser."),
     *(name for name in OPTIONS if name != "labels"),

@@ -226,19 +226,18 @@ def border_share(look: Look, is_marked: Callable[[NDArray[Any]], BoolArray]) -> 
 def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float:
     """Return the median slope beside the surface, between samples that are not ``cut`` off.
 
-    Along each axis it is the steeper one to both sides of a sample, if most are beside some that
-    are cut off, else the mean. NaN if it is not known.
+    Along each axis it is the mean to both sides of a sample; if most are beside some that are cut
+    off, the steeper one, and that at least. NaN if it is not known.
     """
     lines = look.box_lines[..., 1:4]
-    lines = np.where(np.isin(lines, cut), np.nan, lines)
-    rise = np.diff(lines) / steps[:, None]
+    rise = np.diff(np.where(np.isin(lines, cut), np.nan, lines)) / steps[:, None]
     mean = np.sqrt((rise.mean(2) ** 2).sum(1))
     known = np.isfinite(mean) & (mean > 0)
     if known.sum() >= max(TELLING, len(lines) / 2) or not len(cut):
         return float(np.median(mean[known])) if known.any() else float("nan")
-    steep = np.nan_to_num(np.abs(rise)).max(2)
-    length = np.sqrt((steep**2).sum(1))[(steep > 0).all(1)]
-    return float(np.median(length)) if len(length) else float("nan")
+    steep = np.fmax(*np.moveaxis(np.abs(np.diff(lines)), 2, 0)) / steps
+    length = np.sqrt((steep**2).sum(1))
+    return float(np.nanmedian(length)) if np.isfinite(length).any() else float("nan")
 
 
 def different_values(samples: SampleArray) -> tuple[NDArray[Any], NDArray[np.int64]] | None:
@@ -375,7 +374,7 @@ def which_level(look: Look) -> str:
         level = float(values[at - 1 if at else 1] + level) / 2
     outside = border_share(look, lambda x: x > level) > MOST_OUTSIDE
     option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
-    other = " (or --field smooth, if it is at 0)" if look.low < 0 < look.high else ""
+    other = " (or, if the surface is at 0, --field smooth)" if look.low < 0 < look.high else ""
     return f"they look like densities: give the level of their surface, such as {option}{other}"
 
 

@@ -50,20 +50,22 @@ PLATEAUS = 0.45  # whole images and integer distances to .43, labels from .55
 BY_RANK = 0.99  # integer distances 1, labels to .97, but where one is in the other
 AMID = 0.1  # of these the share that equal all 6: distances 0, labels inside others .3 and more
 FEW_LABELS = 8  # different values: rounded distances and images from 11, lesions and organs to 8
-# 3. Transforms: share of the samples beside the surface that equal others with the same 27 signs.
+# 3. Transforms: share of the samples beside the surface that equal others of their side, times the
+# root of the number of axes that lead to the other side or not, with unequal spacings by axis.
 # Values that do not jump over 0 need the steps of a mask: a share of these samples with other sides
 # along two axes, and many patterns of signs, or many of all. Else faces are along the axes.
-FOLLOW = 0.953  # distances to .9502 (but where faces are along the axes), transforms from .957
+FOLLOW = 0.97  # distances to .94 (but where faces are along the axes), transforms 1
 STAIRS = 0.2  # solids along the axes to .18, masks of others from .26
 PATTERNS, OF_ALL = 100, 0.4  # such solids have to 96, or .38 of few; masks from 104, or .45
-ROUGH = 1.0  # fourth differences over slopes: lattices of short periods to .5, transforms from 1.5
 COUNTED = 0.98  # that are 1 where they are beside the other side: steps 1, rounded to .96
 JUMPS = 1.2  # times the largest other step: transforms 2, distances 1
+HALVES = 0.4  # of steps, unequal spacings: transforms from .49, boxes midway along an axis to .24
 # 4. Unknown samples: steps to a frequent value over the steepest ones; how many of them jump.
 JUMP = 1.5  # cut off 1.0, sentinels from 2
 # 5. Distances: share of the smooth samples whose slope is the commonest one; share of the samples
 # beside the surface that differ from two others by more than they are apart.
 SLOPES = 0.95  # exact from .98; smooth unions to .83, saturating to .36, noise of .05 to .66
+LEAST_SMOOTH = 0.014  # of all, unless cut off: lattices of whole periods to .009, bars from .021
 CONTRADICTIONS = 0.003  # exact and cut off 0; noise of .05 voxel from .009; other slopes .02
 EXACT = 0.02  # spacings, and share of a slope: the error of differences of exact distances
 SAME_UNIT = 0.01  # from 1: exact to .002; saturating and smooth unions from .019
@@ -76,7 +78,7 @@ SLOPE_NEAR = 0.5, 1.25  # of these: cut off at half a voxel .55 to 1.05, in half
 SLOPE_OFF = 0.25  # of rounded distances from 1
 SEAMS = 0.05  # valleys inside per crossing: single solids to .033, touching parts from .077
 THICK = 0.012  # spacings: walls of unsigned distances have no thickness, a thin ring .025
-STEEP = 0.25  # spacings
+STEEP = 0.25  # slopes to a wall and from it: with .02 to .8, unsigned and walls are told apart
 # 6. Densities: range over the smallest step; median of the sizes over the largest, with more
 # surface at 0 than at the level that parts them best; valleys per sample of a face. Distances may
 # be rounded, to this part of the spacing.
@@ -180,38 +182,34 @@ def _step_of_transform(look: Look, given: Floats | None) -> float:
     best, step, is_stepped = (FOLLOW, 0), 0.0, False
     for sign in (1, -1):  # 0 may be on either side
         sides = sign * around > 0
-        axes = (sides != sides[:, 13:14])[:, FACES].any(2)[:, fine].sum(1)
+        over = (sides != sides[:, 13:14])[:, FACES].any(2)  # which axes lead to the other side
+        axes = over[:, fine].sum(1)
         beside = known & (axes > 0)
         free = beside & ~np.isin(middle, cut)
         if free.sum() < max(ENOUGH, beside.sum() / 2):
             continue
         x, patterns = middle[free], np.packbits(sides[free], axis=1)
         typical = float(np.quantile(np.abs(x), 0.5))
-        many, share = _share_alike(x, patterns)
-        share = max(share, _share_alike(x, (axes[free] * np.sign(x))[:, None])[1])
+        by_axis = over[free] & ~fine.all()
+        share = max(_share_alike(x * y, by_axis, x > 0) for y in (1.0, np.sqrt(axes[free])))
         if (share, len(x)) > best:
             best, step = (share, len(x)), typical
             is_stepped = (axes[free] > 1).mean() > STAIRS and len(cut) < 2
-            is_stepped &= many >= min(PATTERNS, OF_ALL * len(x))
-    if not (step and (is_stepped or _jump_over_0(look))):
+            is_stepped &= len(np.unique(patterns, axis=0)) >= min(PATTERNS, OF_ALL * len(x))
+    if not (step and (is_stepped or _jump_over_0(look, FOLLOW if fine.all() else HALVES))):
         return 0.0
     whole = look.pairs / np.abs(look.pairs[look.pairs != 0]).min()
     is_whole = fine.all() and (np.abs(whole - np.rint(whole)) <= NEARLY).all()
-    if is_whole and not _counts_steps(look.boxes / step):
-        return 0.0
-    rough = np.abs(np.diff(look.box_lines, 4)[..., 0]).sum(1)
-    rise = np.abs(np.diff(look.box_lines[..., 1::2])[..., 0]).sum(1) / 2
-    rough, rise = (x[np.isfinite(rough + rise)] for x in (rough, rise))
-    return step if not len(rise) or np.median(rough) >= ROUGH * np.median(rise) else 0.0
+    return 0.0 if is_whole and not _counts_steps(look.boxes / step) else step
 
 
-def _share_alike(values: Floats, keys: NDArray[Any]) -> tuple[int, float]:
-    """Return how many different keys (n, k) there are, and the share of equal values for these."""
-    found, which = np.unique(keys, axis=0, return_inverse=True)
-    order = np.argsort(which.ravel(), kind="stable")
-    same = np.diff(which.ravel()[order]) == 0
+def _share_alike(values: Floats, *keys: BoolArray) -> float:
+    """Return the share of equal values among those with the same keys, (n,) or (n, k)."""
+    which = np.unique(np.column_stack(keys), axis=0, return_inverse=True)[1].ravel()
+    order = np.argsort(which, kind="stable")
+    same = np.diff(which[order]) == 0
     alike = np.abs(np.diff(values[order])[same]) <= 0.01 * np.quantile(np.abs(values), 0.5)
-    return len(found), float(alike.mean()) if len(alike) >= ENOUGH else 0.0
+    return float(alike.mean()) if len(alike) >= ENOUGH else 0.0
 
 
 def _counts_steps(boxes: Floats) -> bool:
@@ -232,11 +230,13 @@ def _counts_steps(boxes: Floats) -> bool:
     return max(shares) >= COUNTED
 
 
-def _jump_over_0(look: Look) -> bool:
-    """Return whether all steps over 0 are larger than all others."""
+def _jump_over_0(look: Look, halves: float) -> bool:
+    """Return whether all steps over 0 are larger than others, and a share of them has 0 midway."""
     one, other = look.pairs
     size, over = np.abs(one - other), (one > 0) != (other > 0)
-    return bool(over.sum() > ENOUGH and size[over].min() > JUMPS * size[~over].max(initial=0))
+    if over.sum() <= ENOUGH or size[over].min() <= JUMPS * size[~over].max(initial=0):
+        return False
+    return bool((np.abs(one + other) <= NEARLY * size)[over].mean() >= halves)
 
 
 # Question 4: unknown samples
@@ -247,14 +247,14 @@ def _without_sentinels(look: Look, facts: dict[str, Any]) -> Look:
     if not look.low < 0 < look.high:
         return look
     change = np.abs(look.pairs[0] - look.pairs[1])
-    is_frequent, found = np.isin(look.pairs, list(look.frequent)).all(0), []
+    is_frequent, found = np.isin(look.pairs, list(look.frequent)), []
+    if np.count_nonzero(~is_frequent.any(0)) < ENOUGH:
+        return look
     for value in look.frequent:
         at = (look.pairs == value).any(0)
-        steps = change[at & ~is_frequent]
+        steps = change[at & ~is_frequent.all(0)]
         steps = steps if len(steps) else change[at]  # only beside samples that are cut off
-        if not len(steps) or at.all():
-            continue
-        if (steps > JUMP * np.quantile(change[~at], 0.99)).mean() > 0.5:
+        if len(steps) and (steps > JUMP * np.quantile(change[~at], 0.99)).mean() > 0.5:
             found.append(value)
     # far inside and far outside, a value may stand for "unknown" with either sign
     found += [x for x in (look.low, look.high) if -x in found and x not in found]
@@ -274,7 +274,8 @@ def _distances(look: Look, given: Floats | None, facts: dict[str, Any]) -> Answe
     facts["digit"] = last_digit(look)
     unit = _find_unit(np.where(np.isin(look.lines, look.cut), np.nan, look.lines), given, facts)
     ends_at_0 = look.is_one_sided and (look.low if look.low >= 0 else look.high) in look.cut
-    if unit is None or facts["slopes"] < SLOPES or ends_at_0:
+    are_few = facts["smooth"] < LEAST_SMOOTH and not look.cut
+    if unit is None or facts["slopes"] < SLOPES or are_few or ends_at_0:
         return None
     steps = unit * (np.ones(3) if given is None else given)
     facts["contradictions"] = _contradictions(look, steps, facts["digit"])

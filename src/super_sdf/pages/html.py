@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -20,12 +20,11 @@ from urllib.parse import quote
 
 from .. import __version__, check, load_network
 from ..convert import convert
-from ..errors import SuperSdfError
 from ..files.formats import is_grid
 from ..files.output import replacing
 from ..truth import read_mesh
 from . import items
-from .items import Entry, Item, entry_of_report, item_of_files
+from .items import Entry, Item, entry_of_report, item_of
 
 if TYPE_CHECKING:
     from ..options import Options
@@ -91,11 +90,11 @@ def is_page(path: Path) -> bool:
 def page_of_conversion(
     report: Mapping[str, Any],
     options: Options,
-    made: Any = None,
+    made: Any,
     certificate: check.Certificate | None = None,
 ) -> str:
-    """Return the page of a conversion by what ``upsample --json`` says; see ``item_of_files``."""
-    item = item_of_files(report["output"], report["input"], options, made, certificate)
+    """Return the page of a conversion by what ``upsample --json`` says; see ``item_of``."""
+    item = item_of(made, options, certificate)
     entry = entry_of_report(name := Path(report["output"]).name, report, item)
     return _whole_page(name, [(entry, item)])
 
@@ -110,7 +109,7 @@ def viewed_page(sources: Sequence[str], options: Options) -> str:
             with TemporaryDirectory(prefix="super-sdf-") as folder:
                 target = Path(folder, "mesh.ply")
                 done = convert(source, target, network, options)
-                item = item_of_files(target, source, options, done)
+                item = item_of(done, options)
             report = {**done.facts, "input": source, "asked": options.digest()}
             report["seconds"] = done.seconds
         else:
@@ -128,14 +127,12 @@ def write_batch_page(
     path: Path,
     facts: Mapping[str, Any],
     rows: Mapping[str, Mapping[str, Any]],
-    draw: Callable[[str], Item | None],
     *,
     force: bool = False,
 ) -> None:
     """Write the page of a batch, files that failed first; their meshes are beside it.
 
-    ``rows`` are lines of the report by their output, empty of what is not finished; ``draw`` makes
-    the item of an output if its file is missing.
+    ``rows`` are lines of the report by their output, empty of what is not finished.
     """
     folder, entries = items.items_folder(path), list[Entry]()
     for name, row in rows.items():
@@ -145,12 +142,8 @@ def write_batch_page(
                 known = {"reason": row["reason"], "facts": [["grid", row["in"]], ["mesh", name]]}
             entries.append(items.entry_of(name, row.get("status", "waiting"), **known))
             continue
-        digest, file = row["output"]["sha256"], items.item_path(folder, name)
-        item = items.find_item(folder, name, digest)
-        with suppress(SuperSdfError):  # then it is not shown
-            if item is None and (made := draw(name)):
-                items.keep_item(made, folder, name, digest)
-                item = items.find_item(folder, name, digest)
+        item = items.find_item(folder, name, row["output"]["sha256"])
+        file = items.item_path(folder, name)
         entries.append(entry_of_report(name, {**row, "output": name}, item) | {"id": file.stem})
         if item and item.size:
             entries[-1]["meshes"] = quote(f"{folder.name}/{file.name}")

@@ -22,11 +22,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..check import FULL, Certificate, check_mesh, read_for_check
+from ..check import FULL, Certificate, check_mesh
 from ..errors import SuperSdfError, check_modules
 from ..files.output import naming, replacing
 from ..surface.extract import coarse_surface
 from ..surface.mesh import Mesh
+from ..truth import merged
 
 if TYPE_CHECKING:
     from ..options import Options
@@ -66,18 +67,9 @@ class Item:
             self.remarks.append(f"not shown: {error.flagged}")
 
 
-def item_of_files(
-    mesh: str | Path,
-    grid: str | Path,
-    options: Options,
-    made: Any = None,
-    certificate: Certificate | None = None,
-) -> Item:
-    """Return the item of a mesh and its grid, read unless ``made`` has both. Errors are in it."""
-    try:
-        shown, samples = read_for_check(mesh, grid, options, made)
-    except SuperSdfError as error:
-        return Item(certificate={"error": error.flagged}, remarks=[f"not shown: {error.flagged}"])
+def item_of(made: Any, options: Options, certificate: Certificate | None = None) -> Item:
+    """Return the item of a conversion; errors are in it."""
+    shown, samples = merged(made.mesh), made.grid
     try:
         check_modules("a check of the mesh, with residuals,", "report", ("igl",))
         certificate = certificate or check_mesh(shown, samples, options)

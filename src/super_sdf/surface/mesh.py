@@ -103,22 +103,14 @@ class Mesh:
         """Return whether there are faces and no edge is open."""
         return len(self.faces) > 0 and self.open_edges() == 0
 
-    def components(self) -> tuple[int, NDArray[np.int64]]:
-        """Return the number of pieces that share no vertex, and the lowest vertex of each's, (n,).
+    def components(self) -> tuple[int, NDArray[np.int32]]:
+        """Return how many pieces share no vertex, and the number of each vertex's, (n,).
 
-        Unused vertices do not count. In rounds, the roots at both ends of each edge are joined, and
-        the ways to them shortened.
+        Unused vertices do not count, but have numbers.
         """
-        root = np.arange(len(self.vertices))
         start, end = self.faces[:, :2].ravel(), self.faces[:, 1:].ravel()
-        while len(start):
-            one, other = root[start], root[end]
-            apart = one != other
-            start, end, one, other = start[apart], end[apart], one[apart], other[apart]
-            np.minimum.at(root, np.maximum(one, other), np.minimum(one, other))
-            while not np.array_equal(root, above := root[root]):
-                root = above
-        return len(np.unique(root[self.faces[:, 0]])), root
+        piece = _connected(start, end, len(self.vertices))
+        return len(np.unique(piece[self.faces[:, 0]])), piece
 
     def pair_edges(self) -> tuple[IntArray, NDArray[np.intp], int]:
         """Find the neighbour of each triangle across each of its edges, by sorting all edges.
@@ -145,21 +137,23 @@ class Mesh:
     def count_fans(self, opposite: IntArray) -> NDArray[np.int64]:
         """Return for each vertex, (n,), how many fans of triangles meet there: 1 in a manifold.
 
-        The half-edges of a vertex are walked from triangle to triangle, in steps of 1, 2, 4, ... A
-        fan is a cycle, counted at its lowest half-edge, or ends at an edge without a neighbour.
+        A fan are the half-edges of a vertex that lead to one another, from triangle to triangle.
         ``opposite`` is from ``pair_edges``.
         """
-        start, half = self.faces.ravel(), np.arange(self.faces.size, dtype=np.int32)
+        half = np.arange(self.faces.size)
         step = opposite[half.reshape(-1, 3)[:, [2, 0, 1]].ravel()]
-        ends = step < 0
-        step = np.where(ends, half, step)
-        lowest, count = half, len(self.vertices)
-        for _ in range(int(np.bincount(start).max(initial=1)).bit_length()):
-            lowest = np.minimum(lowest, lowest[step])
-            step = step[step]
-        cycles = (lowest == half) & ~ends[step]
-        one_of_each = np.concatenate([start[ends], start[cycles]])
-        return np.bincount(one_of_each, minlength=count)
+        fan = _connected(half[step >= 0], step[step >= 0], len(half))
+        one_of_each = self.faces.ravel()[np.unique(fan, return_index=True)[1]]
+        return np.bincount(one_of_each, minlength=len(self.vertices))
+
+
+def _connected(start: NDArray[Any], end: NDArray[Any], count: int) -> NDArray[np.int32]:
+    """Return the number of the piece, (count,), of nodes that edges from start to end connect."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_matrix((np.ones(len(start), bool), (start, end)), (count, count))
+    return np.asarray(connected_components(graph, directed=False)[1])
 
 
 def check_mesh(mesh: Any) -> None:

@@ -9,9 +9,7 @@
    way on an edge, a part of it on rounded ground. Where it is little, marching cubes is kept. The
    rule, ``rule.json``, was fitted by ``export.edges`` to where the true surface of shapes lies.
 5. Beside features, vertices are moved as much of the way onto the settled planes.
-6. A feature that is not sure, and leaves the mesh farther from the samples' spheres that pass by,
-   is dropped: of a detail narrower than a voxel, say.
-7. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
+6. A feature's vertex that would fold the surface goes half way back to the middle of its patch.
 
 References
 ----------
@@ -28,7 +26,6 @@ import json
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -38,18 +35,8 @@ from ...threads import map_chunks
 from ..marching import CAP_HEIGHT, Crossings, tables
 from ..mesh import CLEARANCE
 from .folds import REACH, Rounding, without_folds
-from .patches import (
-    Patches,
-    Placed,
-    beside,
-    find_patches,
-    nth_of_run,
-    triangles_of,
-    voxels_near_kinks,
-)
+from .patches import Patches, Placed, beside, find_patches, triangles_of, voxels_near_kinks
 from .planes import (
-    LARGEST_RADIUS,
-    NEAR,
     ROUNDS,
     TOUCHED_ALONG,
     TOUCHING,
@@ -58,7 +45,6 @@ from .planes import (
     find_spheres,
     lean,
     planes_at_crossings,
-    samples_around,
     settle_planes,
     wedges_of,
 )
@@ -76,20 +62,11 @@ FARTHEST_MOVE = 0.5  # fine spacings
 OUTSIDE_CELL = 0.5  # fine spacings by which a feature's vertex may leave its cell
 OF_PATCH = 4  # numbers of evidence that are not averaged along the chain
 LEAST_SPHERES = 4  # that pass near a feature: in noise no sample is exact, and normals say nothing
-# Of features that are surely sharp: share, cosine of the faces, logarithm of the largest trust
-SURE_SHARE, SURE_COSINE, SURE_TRUST = 0.9, -0.3, -0.6
-# Coarse spacings from a sphere: to a feature round which triangles are measured, to a feature that
-# is compared, to the nearer of both meshes
-PASSES_BY, COMPARED_TO, OFF_MESH = 0.1, 1.5, 0.15
-SURELY = 1.0  # times its deviation, by which the sum of all distances must have grown
-SIDES: tuple[Literal["left", "right"], ...] = "left", "right"
 TEMPORARIES = 500  # numbers per patch in the search for its spheres among 125 samples
 # Cells to every side that a vertex depends on: gradients reach 2 cells, a patch is 1 wide, and so
 # is the fan beside.
-REACH_IN_CELLS = RINGS + ROUNDS + 2 * CHAIN_ROUNDS + 2 * MOVED_RINGS + REACH + 7
-# Further: whether a voxel is examined depends on those beside it; spheres are compared with the
-# triangles round features near them.
-REACH_IN_VOXELS = 2 + 2 * NEAR
+REACH_IN_CELLS = RINGS + ROUNDS + CHAIN_ROUNDS + MOVED_RINGS + REACH + 5
+REACH_IN_VOXELS = 2  # further: whether a voxel is examined depends on those beside it
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,12 +107,6 @@ class Candidates:
         """Return how far the vertex of each goes from the middle to the edge, (f,), 0 to 1."""
         return np.where(self.spheres < LEAST_SPHERES, 0, load_rule().share(self.evidence))
 
-    def are_doubtful(self, share: Numbers) -> BoolArray:
-        """Return which features, (f,), the spheres may contradict: all but what is surely sharp."""
-        cosine, flattest = self.evidence[:, 0], self.evidence[:, 3]
-        is_sure = (share >= SURE_SHARE) & (cosine > SURE_COSINE) & (flattest > SURE_TRUST)
-        return (share > LEAST_SHARE) & ~is_sure
-
 
 @dataclass(frozen=True, eq=False)
 class Features:
@@ -165,12 +136,7 @@ def find_features(
         return None
     own = planes_at_crossings(field, crossings, used, border, threads)
     candidates = find_candidates(patches, own, kinked, field, threads)
-    placed = place(patches, own, candidates, share := candidates.share())
-    doubtful = np.flatnonzero(candidates.are_doubtful(share))
-    some = candidates.patch[doubtful]
-    if len(some) and (dropped := are_farther(patches, placed, some, own, field)).any():
-        share[doubtful[dropped]] = 0
-        placed = place(patches, own, candidates, share)
+    placed = place(patches, own, candidates, candidates.share())
     box = field.factor * border.astype(np.float64)
     position = _kept_in_grid(placed.position, own.point, box)
     peak = _kept_in_grid(placed.peak, patches.low[placed.feature] + 0.5, box)
@@ -209,70 +175,6 @@ def place(patches: Patches, own: Planes, candidates: Candidates, share: Numbers)
     vertex = candidates.middle + share[:, None] * (candidates.edge - candidates.middle)
     placed = Placed(position, candidates.planes.normal, candidates.patch[kept], vertex[kept])
     return placed.unfolded(patches)
-
-
-def are_farther(
-    patches: Patches, placed: Placed, feature: Index, own: Planes, field: FineField
-) -> BoolArray:
-    """Return which features, (f,), surely leave the mesh farther from the spheres that pass by.
-
-    Summed along the chain is by how much farther from spheres the triangles round a feature are
-    than those of marching cubes. Details narrower than a voxel are told so.
-    """
-    fans, spheres, factor = patches.chosen(feature), field.spheres, field.factor
-    number = samples_around((fans.low // factor).astype(np.int32), spheres)
-    centre: Vectors = np.stack(np.unravel_index(spheres.number, spheres.shape), 1).astype(float)
-    centre = factor * (centre + 0.5)
-    radius = np.abs(spheres.distance) / 2  # in coarse spacings
-    peak = placed.peak[np.searchsorted(placed.feature, feature)]
-    beyond = np.abs(length(centre[number] - peak[:, None]) / factor - radius[number])
-    usable = (number >= 0) & (radius[number] < LARGEST_RADIUS)
-    fan, sphere = np.nonzero(passes := usable & (beyond < PASSES_BY))[0], number[passes]
-    plain = replace(placed, position=own.point, feature=feature[:0], peak=peak[:0])
-    off = np.full((2, len(radius)), np.inf)  # of spheres from the triangles round features
-    for each, mesh in zip(off, (plain, placed)):
-        apart = _distance_from_fans(patches, mesh, feature, fan, centre[sphere])
-        np.minimum.at(each, sphere, apart / factor)
-    off = np.abs(off - radius)
-    near = usable & (beyond < COMPARED_TO) & (off.min(0) < OFF_MESH)[number]
-    fan, sphere = np.nonzero(near)[0], number[near]
-    farther = off[1, sphere] - off[0, sphere]
-    sums = [np.bincount(fan, each, len(feature)) for each in (farther, farther**2)]
-    total, squares = _mean_along_chain(fans, np.stack(sums, 1)).T
-    return np.asarray(total > SURELY * np.sqrt(squares))
-
-
-def _distance_from_fans(
-    patches: Patches, placed: Placed, feature: Index, fan: Index, point: Vectors
-) -> Numbers:
-    """Return the distance of points (n, 3) from the triangles at the crossings of their fans."""
-    around = patches.having(patches.dilate(feature, 1, len(placed.position)))
-    _, triangles = triangles_of(patches, placed, around)
-    corner = np.argsort(triangles, axis=None, kind="stable")
-    ordered, crossing = triangles.ravel()[corner], patches.crossing[feature[fan]]
-    row, side = np.nonzero(crossing >= 0)
-    first, last = (np.searchsorted(ordered, crossing[row, side], end) for end in SIDES)
-    pair = np.repeat(row, last - first)
-    near = triangles[corner[np.repeat(first, last - first) + nth_of_run(last - first)] // 3]
-    distance: Numbers = np.full(len(fan), np.inf)
-    corners = np.ascontiguousarray(np.moveaxis(placed.points[near], 0, 2))
-    apart = _distance_from_triangles(np.ascontiguousarray(point[pair].T), corners)
-    np.minimum.at(distance, pair, apart)
-    return distance
-
-
-def _distance_from_triangles(point: Vectors, corners: Vectors) -> Numbers:
-    """Return the distance of each point (3, n) from its triangle (3, 3, n), corner by corner."""
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[0], axis=0)
-    squared, is_over = np.full(point.shape[1], np.inf), np.ones(point.shape[1], bool)
-    for k in range(3):
-        way, start = corners[k] - corners[k - 1], point - corners[k - 1]
-        share = np.clip(inner(start, way) / np.maximum(inner(way, way), 1e-18), 0, 1)
-        off = start - share * way
-        squared = np.minimum(squared, inner(off, off))
-        is_over &= inner(np.cross(way, start, axis=0), normal) >= 0
-    height = inner(point - corners[0], normal) ** 2 / np.maximum(inner(normal, normal), 1e-18)
-    return np.asarray(np.sqrt(np.where(is_over, height, squared)))
 
 
 def find_candidates(
