@@ -77,8 +77,11 @@ def test_folders_are_mirrored_failures_named_and_meshes_those_of_single_runs(bat
     bad = by_name["bad.ply"]
     assert (bad["status"], bad["reason"], bad["retry"]) == ("failed", CONSTANT, False)
     before = files(), rows()
-    code, facts, _ = batch("in")
+    code, facts, err = batch("in")
     assert code == 1 and facts["done_before"] == 3 and (files(), rows()) == before
+    assert (facts["done"], facts["failed"], facts["failed_before"]) == (0, 0, 1)
+    assert facts["notes"] == {"taken as inside": 1, "the solid runs out of the grid": 1}
+    assert "Notes: taken as inside (1), the solid runs out of the grid (1); see out/repo" in err
 
 
 def test_what_has_changed_is_done_again(batch):
@@ -188,16 +191,19 @@ def test_a_name_chooses_among_the_arrays_of_each_file(batch):
     for name in ("1.npz", "2.npz"):
         values = ball(12, 3.0).values
         np.savez(f"frames/{name}", density=-values, speed=values)
-    facts = batch("frames", "--grid", "density", "--level", 0)[1]
-    assert facts["done"] == 2 and contents().keys() == {"1-density.ply", "2-density.ply"}
-    assert "holds several arrays" in batch("frames/1.npz", out="other")[2]
+    Path("frames/list.txt").write_text("2.npz\n1.npz:speed")
+    facts = batch("frames/1.npz", "frames/list.txt", "--grid", "density", "--level", 0)[1]
+    assert facts["done"] == 3 and contents().keys() == {"1.ply", "2.ply", "1-speed.ply"}
+    err = batch("frames/1.npz", out="other")[2]
+    say = "holds several arrays, density, speed: give --grid density, say"
+    assert f"Failed: frames/1.npz: {say}\n" in err and rows("other")[0]["reason"] == say
 
 
 def test_lists_name_files_from_where_they_lie_and_objects_have_options_of_their_own(batch, command):
     Path("in/list.txt").write_bytes(b"\xef\xbb\xbf# some\r\n\r\n deep/b.npz\r\nnone.npy\n")
     code, _, err = batch("in/list.txt")
     assert code == 1 and contents().keys() == {"deep/b.ply"}
-    assert f"Failed: {Path('in/none.npy')} does not exist\n" in err
+    assert "Failed: in/none.npy: does not exist\n" in err
     np.save("in/a.npy", -2 * ball(12, 3.0).values)
     line = {"in": "in/a.npy", "out": "x/y.stl", "spacing": 2, "origin": [1, 2, 3], "factor": 4}
     lines = [{**line, "inside": "positive", "offset": 1}, {"in": "in/deep/er/c.d.npy"}]
@@ -252,8 +258,8 @@ def test_odd_files_and_names_fail_alone(batch):
     )
     code, facts, err = batch("in", "in/list.jsonl")
     assert code == 1 and (facts["done"], facts["failed"]) == (3, 6), err
-    assert "Failed: in/pipe.npy is no regular file: give a file\n" in err
-    assert "Failed: in/loop.npz cannot be read: " in err
+    assert "Failed: in/pipe.npy: is no regular file: give a file\n" in err
+    assert "Failed: in/loop.npz: cannot be read: " in err
     assert "Failed: in/bad\\n\\udcff.npy: every value is 1" in err
     assert f"{Path('out', 'm' + long)}.ply cannot be written: File name too long\n" in err
 
@@ -327,19 +333,21 @@ def test_a_death_is_the_result_of_its_task_alone():
 def test_a_batch_that_is_ended_or_killed_leaves_no_process_and_goes_on(number, batch):
     larger_grids(8)
     words = ("batch", "in", "--out", "out", "--jobs", 2, "--threads", 1, *SMALL)
-    process = start_command(*words)
+    process = start_command(*words, "--json")
     wait_for_lines(process, Path("out/report.jsonl"))
     workers = psutil.Process(process.pid).children()
     process.send_signal(number)
-    err = process.communicate(timeout=PATIENCE)[1].strip()
+    out, err = process.communicate(timeout=PATIENCE)
     assert len(workers) >= 2 and all_end(workers)
     if number != signal.SIGKILL:
-        assert process.returncode == 128 + number and "\n" not in err
-        assert err.startswith("Error: ") and err.endswith("done and kept; run it again to go on")
+        facts = json.loads(out)
+        assert process.returncode == 128 + number and err.strip() == f"Error: {facts['error']}"
+        assert " done, " in err and err.endswith(" s; run it again to go on\n")
+        assert facts["done"] and facts["done"] + facts["failed"] + facts["to_do"] == 12
         assert not Path("out/.super-sdf-parts").exists()
     finished = len(rows())
     facts = batch("in", "--spacing", 1, "--origin", "0")[1]
-    assert facts["failed"] == 1 and facts["closed"] == 11
+    assert facts["failed"] + facts["failed_before"] == 1 and facts["closed"] == 11
     assert len(rows()) >= 12 and finished >= 2 and not Path("out/.super-sdf-parts").exists()
 
 

@@ -56,6 +56,11 @@ def test_turned_axes_and_the_unit_of_picogk():
     assert "lengths are in millimetres, as PicoGK states" in notes
 
 
+def test_a_level_of_distances_is_refused_with_the_offset_that_it_is():
+    said = refusal(GridError, read_grid, DATA / "two-balls.vdb", level=0.2, scale=2)
+    assert said.endswith("for densities, and the file states distances: give offset=0.4 instead")
+
+
 def test_a_level_set_that_was_cut_keeps_its_inside():
     """The same, with the background from i = 28 on: half of the ball, and no hollow one."""
     values, origin, spacing = voxels(DATA / "cut.vdb")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import glob
 import json
 import os
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
@@ -48,15 +49,13 @@ class Job:
         return path.with_name(path.stem + end).as_posix()
 
     def failed(self, reason: str, content: Any = None) -> Row:
-        """Return the row of the job if it failed, and is to be tried again."""
-        row: Row = {"in": os.path.abspath(self.source), "out": self.target, "status": "failed"}
+        """Return the row of the job if it failed, to be tried again; no path begins the reason."""
+        file, source = str(split_member(self.source)[0]), str(self.source)
+        reason = re.sub(f"^({re.escape(source)}|{re.escape(file)}):? ", "", reason)
+        reason = reason.replace(f"give {file}:", "give --grid ")  # what holds several arrays
+        row: Row = {"in": os.path.abspath(source), "out": self.target, "status": "failed"}
         row |= {"reason": reason, "retry": True, "content": content}
         return {**row, "output": None, "seconds": 0.0}
-
-    def failure(self) -> str:
-        """Return which file failed and why, in one line."""
-        source, reason = str(self.source), str(self.row["reason"])
-        return reason if source in reason else f"{source}: {reason}"
 
 
 def find_jobs(
@@ -65,14 +64,16 @@ def find_jobs(
     """Return the jobs that the arguments name, each once: files, folders, patterns, lists.
 
     ``suffix`` is the mesh file format, such as ".ply"; a list may say otherwise, and have other
-    options. ``names`` are those of labels, ``member`` the array to take from files that are not in
-    lists. OptionError if an argument names no grid, or if two inputs would become one output;
-    FileError if a list or a folder cannot be read.
+    options. ``names`` are those of labels, ``member`` the array of files for which none is named;
+    meshes are not named after it. OptionError if an argument names no grid, or if two inputs would
+    become one output; FileError if a list or a folder cannot be read.
     """
     by_target = dict[str, Job]()
     for argument in arguments:
-        for job in _expand(argument, suffix, options, member):
+        for job in _expand(argument, suffix, options):
             job.options = with_numbers(job.options, names)
+            if member and not split_member(job.source)[1]:
+                job.source = Path(f"{job.source}:{member}")
             other = by_target.setdefault(os.path.normcase(job.target), job)
             same = os.path.abspath(other.source) == os.path.abspath(job.source)
             if not (same and other.options == job.options):
@@ -82,7 +83,7 @@ def find_jobs(
     return list(by_target.values())
 
 
-def _expand(argument: str, suffix: str, options: Options, member: str) -> list[Job]:
+def _expand(argument: str, suffix: str, options: Options) -> list[Job]:
     """Return the jobs that one argument stands for."""
     path, kinds, paths = Path(argument), ", ".join(GRID_SUFFIXES), list[Path]()
     if path.suffix.lower() in LIST_SUFFIXES and path.is_file():
@@ -109,8 +110,6 @@ def _expand(argument: str, suffix: str, options: Options, member: str) -> list[J
         raise OptionError(said)
     # Anything with a grid's suffix counts, but slices. What is no regular file fails and is named.
     grids = sorted({p for p in paths if is_grid(p) and (is_store(p) or not p.is_dir())})
-    if member:
-        grids = [p if split_member(p)[1] else Path(f"{p}:{member}") for p in grids]
     if not grids:
         raise OptionError(f"{argument} holds no grid ({kinds})")
     targets = (mesh_path(grid.relative_to(root), suffix, options.label) for grid in grids)

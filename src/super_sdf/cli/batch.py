@@ -15,6 +15,7 @@ interruption, or with more inputs or other options: only missing meshes are made
 from __future__ import annotations
 
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
     from ..batch.work import Settings
 
 MOST_FAILURES = 20  # printed; the report has all
-STATES = ("done_before", "failed_before", "refused")  # of inputs that are left alone
+FAILED = ("failed", "failed_before", "refused")
+STATES = ("done", "done_before", *FAILED, "to_do")  # each input is in one of them
 
 TAKES = (
     Argument(["sources"], metavar="IN...", nargs=-1, required=True, type=main.NAME),
@@ -60,27 +62,28 @@ def command(folder: Path, **given: Any) -> None:
     from ..batch.run import Batch
 
     if given["dry_run"]:
-        print_plan(Batch(jobs, settings), given["as_json"])
+        print_plan(Batch(jobs, settings), folder, given["as_json"])
         return
     with folder_lock(folder):
         batch = Batch(jobs, settings)
-        total = len(batch.of("to_do"))
         try:
-            with main.progress_bar("converting", quiet or not total) as progress:
+            with main.progress_bar("converting", quiet or not batch.of("to_do")) as progress:
                 batch.run(progress)
             facts = summary(batch, time.perf_counter() - start)
             if page:
                 batch.write_page(page, sentence(facts))
         except KeyboardInterrupt:
-            done = f"{len(batch.of('done'))} of {total} are done and kept"
-            raise KeyboardInterrupt(f"{done}; run it again to go on") from None
+            facts = summary(batch, time.perf_counter() - start)
+            raise KeyboardInterrupt(f"{sentence(facts)}; run it again to go on", facts) from None
     if given["as_json"]:
         main.print_stdout(facts)
-    lines = [f"Failed: {job.failure()}" for job in batch.of("failed_before", "refused", "failed")]
-    more = len(lines) - MOST_FAILURES
-    lines[MOST_FAILURES:] = [f"and {more} more, see {batch.record.path}"] * (more > 0)
-    main.print_stderr(*lines, *[sentence(facts)] * (not quiet))
-    if lines:
+    failures = [f"Failed: {job.source}: {job.row['reason']}" for job in batch.of(*FAILED)]
+    more = len(failures) - MOST_FAILURES
+    failures[MOST_FAILURES:] = [f"and {more} more, see {facts['report']}"] * (more > 0)
+    kinds = ", ".join(f"{kind} ({count})" for kind, count in facts["notes"].items())
+    notes = [f"Notes: {kinds}; see {facts['report']}"] * bool(kinds)
+    main.print_stderr(*failures, *[*notes, sentence(facts)] * (not quiet))
+    if failures:
         sys.exit(1)
 
 
@@ -109,40 +112,37 @@ def planned(folder: Path, given: dict[str, Any]) -> tuple[list[Job], Settings]:
 def summary(batch: Batch, seconds: float) -> dict[str, Any]:
     """Return the counts, and each failure with its reason, as ``--json`` prints them."""
     rows = [job.row for job in batch.of("done", "done_before")]
-    failures = batch.listed("failed_before", "refused", "failed")
     meshes = [bool(row["closed"]) for row in rows for _ in row.get("labels", [row])]
+    heads = (re.split(" ?[:;(]|, ", note)[0] for row in rows for note in row["inferred"])
+    kinds = [re.sub(r"\d[\d,.]*", "N", head) for head in heads]
     return {
-        "done": len(batch.of("done")),
         **{state: len(batch.of(state)) for state in STATES},
-        "failed": len(failures),
-        "not_begun": len(batch.of("to_do")),
         "warned": sum(bool(row["warnings"] or row.get("beside")) for row in rows),
+        "notes": {kind: kinds.count(kind) for kind in sorted(set(kinds))},
         "closed": meshes.count(True),
         "open": meshes.count(False),
         "seconds": round(seconds, 3),
-        "failures": failures,
+        "failures": batch.listed(*FAILED),
         "report": str(batch.record.path),
     }
 
 
 def sentence(facts: dict[str, Any]) -> str:
     """Return in one line what was done."""
-    always = ("done", "failed")
-    words = {key: key.replace("_", " ") for key in (*always, "done_before", "not_begun")}
+    words = {state: state.replace("_", " ") for state in STATES}
     words |= {"failed_before": "failed before (--retry tries again)", "warned": "with warnings"}
-    counts = [f"{facts[key]} {said}" for key, said in words.items() if facts[key] or key in always]
+    counts = [f"{facts[key]} {said}" for key, said in words.items() if facts[key]]
     meshes = f"{facts['closed']} meshes closed, {facts['open']} open"
     return f"{', '.join(counts)}; {meshes}; {facts['seconds']:.1f} s"
 
 
-def print_plan(batch: Batch, as_json: bool) -> None:
+def print_plan(batch: Batch, folder: Path, as_json: bool) -> None:
     """Print what would be done with each file, and the counts."""
-    plan = {state: batch.listed(state) for state in ("to_do", *STATES)}
+    plan = {state: batch.listed(state) for state in ("to_do", "done_before", *FAILED[1:])}
     if as_json:
         main.print_stdout(plan)
-    for state, rows in plan.items() if not as_json else ():
-        for row in rows:
-            end = row.get("reason") or f"-> {batch.settings.folder / row['out']}"
-            main.print_stdout(f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])} {end}")
+    for state, row in ((state, row) for state, rows in plan.items() if not as_json for row in rows):
+        end = f": {row['reason']}" if "reason" in row else f" -> {folder / row['out']}"
+        main.print_stdout(f"{state.replace('_', ' ')}: {os.path.relpath(row['in'])}{end}")
     counts = [f"{len(rows)} {kind.replace('_', ' ')}" for kind, rows in plan.items() if rows]
     main.print_stderr(", ".join(counts) or "nothing to do")

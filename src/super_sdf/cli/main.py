@@ -211,10 +211,12 @@ def main() -> None:
     try:
         code = cli.main(standalone_mode=False)  # a number if a command ended early
     except (Exception, KeyboardInterrupt) as error:
-        line, code = _fault(error, heard)
+        cause = error.__cause__ or error  # a command may say what it has kept, and its results
+        kept = cause.args if isinstance(cause, KeyboardInterrupt) else ()
+        line, code = _fault(error, heard, *kept[:1])
         if "--json" in sys.argv[1:]:
             with suppress(OSError):
-                print_stdout({"error": line})
+                print_stdout({"error": line, **dict(*kept[1:])})
         print_stderr(f"Error: {line}")
     for number, stream in ((1, sys.stdout), (2, sys.stderr)):
         try:
@@ -226,14 +228,12 @@ def main() -> None:
         sys.exit(code)
 
 
-def _fault(error: BaseException, heard: list[int]) -> tuple[str, int]:
+def _fault(error: BaseException, heard: list[int], kept: str = "") -> tuple[str, int]:
     """Return the line and the exit code for an error, 2 for wrong usage; raise a bug again."""
     if heard:  # also what a library has made of the interrupt
         name = signal.Signals(heard[0]).name
         said = "interrupted" if name == "SIGINT" else f"ended by {name}"
-        cause = error.__cause__ or error  # a command may say what it has kept
-        kept = cause.args if isinstance(cause, KeyboardInterrupt) else ()
-        return f"{said}: {kept[0]}" if kept else said, 128 + heard[0]
+        return f"{said}: {kept}" if kept else said, 128 + heard[0]
     if isinstance(error, click.NoSuchOption) and error.ctx and error.possibilities is not None:
         known = [name for each in error.ctx.command.params for name in each.opts]
         longer = [name for name in known if name.startswith(error.option_name)]

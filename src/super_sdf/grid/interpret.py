@@ -165,6 +165,9 @@ def interpret(
     ``hint`` is a kind that the file states.
     """
     steps, notes = None if spacing is None else check_spacing(spacing), list[str]()
+    if wanted.level is not None and wanted.inside == "auto" and hint == "distance":
+        said = f"--level {wanted.level:g} is for densities, and the file states distances: give "
+        raise GridError(f"{said}--offset {wanted.level * (wanted.scale or 1):g} instead")
     if wanted.inside == "auto" and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
     if wanted.label is not None:
@@ -328,10 +331,12 @@ def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     case.spacing = spacing = case.spacing or _estimated(case)
     steps = steps_of(spacing)
     slope = 1.0 if case.wanted.scale else _slope_at_surface(case.look, steps)
-    if kind == "density" and is_cubic(spacing) and _levels_off(case.look):
-        case.facts = {"cut": [case.look.low, case.look.high]}
-        case.scaled(slope)
-        return _of_distances(case, spacing, "density")
+    if kind == "density" and is_cubic(spacing):
+        part, low, high = case.look.part, case.look.low, case.look.high
+        if beside_surface(part)[(part > low) & (part < high)].mean() > BESIDE:
+            case.facts = {"cut": [low, high]}
+            case.scaled(slope)
+            return _of_distances(case, spacing, "density")
     case.scaled(slope)
     if "inside" in case.facts:
         from .derived import without_inner_faces
@@ -341,12 +346,6 @@ def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     has_jumps = bool(case.facts.get("cut")) and kind == "smooth"
     own = Field(kind, exact=NONE_EXACT, network=None, has_jumps=has_jumps)
     return case.taken(own, case.choose_side())
-
-
-def _levels_off(look: Look) -> bool:
-    """Return whether most samples between both ends are beside the surface."""
-    between = (look.part > look.low) & (look.part < look.high)
-    return bool(beside_surface(look.part)[between].mean() > BESIDE)
 
 
 def _slope_at_surface(look: Look, steps: ArrayLike) -> float:
@@ -365,10 +364,10 @@ def _of_distances(case: Case, spacing: Triple, kind: str = "distance") -> dict[s
     positive = case.choose_side()
     low = look.low if look.low in cut and look.low < 0 else -np.inf
     high = look.high if look.high in cut and look.high > 0 else np.inf
-    if (at := min(-low, high) / max(steps)) < FILLED:
+    if min(-low, high) < FILLED * max(steps):
         from .derived import filled_planes
 
-        case.notes.append(f"distances that are cut off {at:.3g} voxels from the surface")
+        case.notes.append("values that are cut off near the surface are filled in beyond")
         case.samples = filled_planes(case.samples, steps, (look.low, look.high))
     exact = (-high, -low) if positive else (low, high)
     return case.taken(Field(kind, exact=exact if kind == "distance" else NONE_EXACT), positive)
