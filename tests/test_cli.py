@@ -116,7 +116,7 @@ CASES = {
     "text.npz": "text.npz is not a readable .npz archive: write it by numpy.savez",
     "objects.npy": "objects.npy cannot be read as NumPy: ",
     "other.npz": "other.npz holds no array of three axes",
-    "short.npy": "short.npy cannot be read as NumPy",
+    "short.npy": "short.npy cannot be read as NumPy: it is cut off: it has only 16,000 bytes",
     "short.npz": "short.npz cannot be read as NumPy",
     "in.npy --model huge": "no model 'huge': give an ONNX file or one of: fast, base, best",
 }

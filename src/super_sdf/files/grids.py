@@ -143,6 +143,8 @@ def open_volume(
     except Exception as error:  # the libraries raise all kinds of errors
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         reason = lines[-1][:200] if lines else type(error).__name__
+        if re.match("mmap length|EOF: reading (magic|array header)", reason):  # NumPy's words
+            reason = f"it is cut off: it has only {file.stat().st_size:,} bytes"
         raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
     finally:
         logging.disable(logs)

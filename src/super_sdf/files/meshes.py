@@ -112,10 +112,7 @@ def write_mesh(
 
 
 def write_meshes(
-    files: Mapping[Path, Parts],
-    *,
-    force: bool = False,
-    world: World | None = None,
+    files: Mapping[Path, Parts], *, force: bool = False, world: World | None = None
 ) -> None:
     """Write files of meshes, by path and name: all of them, or none."""
     with ExitStack() as stack:

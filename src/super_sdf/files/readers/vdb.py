@@ -75,7 +75,6 @@ def read_vdb(request: Request) -> Volume:
     margin = 0 if np.isnan(tree.empty) else MARGIN
     low, high = np.min(tree.ends, 0) - margin, np.max(tree.ends, 0) + margin
     size = PICOGK_MM * float(metadata.get("PicoGK.VoxelSize", 1 / PICOGK_MM))
-
     matrix = size * np.column_stack([matrix[:, :3], matrix[:, :3] @ low + matrix[:, 3]])
     return Volume(
         lambda _: tree.voxels(low, high) * tree.dtype.type(size),
