@@ -21,8 +21,7 @@ import numpy as np
 from trimesh.triangles import angles
 
 from super_sdf.arrays import BoolArray, dot, face_normals
-from super_sdf.evaluation import F1_DISTANCE, FIGURES, Comparison as Pair
-from super_sdf.truth import Distances
+from super_sdf.evaluation import F1_DISTANCE, FIGURES, Comparison as Pair, Distances
 
 from .shapes import Shape
 

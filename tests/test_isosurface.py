@@ -89,7 +89,7 @@ fields = hnp.arrays(
 )
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(fields, st.sampled_from([2, 4]), st.sampled_from(["marching", "sharp"]), st.booleans())
 def test_any_field_gives_a_closed_oriented_manifold(values, factor, mesher, leaves):
     """Also if it leaves the grid and is closed there."""

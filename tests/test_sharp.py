@@ -107,7 +107,7 @@ def noise(seed, least):
     return dense_field(lattice)
 
 
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.integers(0, 10**6), st.sampled_from([0.05, 0.3, 1.0]))
 def test_any_lattice_gives_a_closed_manifold_of_features(features_everywhere, seed, least):
     mesh = extract_sharp(*noise(seed, least))

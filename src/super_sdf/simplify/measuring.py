@@ -44,8 +44,8 @@ class Original:
         self.distance = np.full(len(mesh.vertices), np.inf)
         self.near = np.zeros(len(mesh.vertices), np.uint64)  # key of the nearest triangle
         start, end = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
-        self.edges = np.stack([start, end])[:, start < end]
-        self.side = float(length(np.subtract(*self.solid.mesh.vertices[[start, end]])).mean())
+        self.edges = np.stack([start, end]).take(np.flatnonzero(start < end), 1)
+        self.side = float(length(np.subtract(*self.solid.mesh.vertices[self.edges])).mean())
         # of the edges: keys of what their ends and middles are near, if within the limit; distances
         self.seen = np.zeros((3, self.edges.shape[1]), np.uint64)
         self.off = np.zeros(self.edges.shape[1])
