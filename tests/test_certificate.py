@@ -80,7 +80,9 @@ def test_holes_components_and_twists_are_counted():
     assert lidless.open_edges == 3
     assert lidless.report()["manifold"] and lidless.report()["oriented"]
     two = check.examine_surface(joined(coarse, moved(coarse, 1.0)))
-    assert two.components == 2 and two.faults() == []
+    assert (two.components, two.cavities, two.faults()) == (2, 0, [])
+    hollow = check.examine_surface(joined(coarse, inverted(round_mesh(0.5 * RADIUS, 2))))
+    assert hollow.cavities == 1 and " 1 piece (cavities: 1), volume" in hollow.counts()
     half = joined(cube(), moved(cube(), 0.3))
     assert "pairs of triangles that intersect" in check.examine_surface(half).faults()[0]
     faces = cube().faces.copy()
@@ -138,7 +140,7 @@ def test_a_piece_far_from_every_sample_is_noticed():
     assert found.figures()["largest"] < 0.02
     assert found.strays == len(speck.vertices)
     outside = check_mesh(moved(coarse, 2.0), GRID)
-    assert outside.beyond == len(coarse.vertices) and "beyond the grid" in str(outside.faults())
+    assert outside.beyond == len(coarse.vertices) and "within the grid" in str(outside.faults())
 
 
 def test_truncated_and_noisy_samples_promise_nothing():
@@ -194,6 +196,9 @@ def test_each_label_of_a_scene_is_checked(here, command):
     assert code == 0 and [n for _, n in re.findall(row, out)] == [f"{n:.6g}" for n in counts]
     code, _, err = command("check", "both.glb", "labels.npz", "--unit", "mm")
     assert code == 2 and "both.glb has a part 'left': give the --names that it was made with" in err
+    assert command("check", "both.glb")[1].count(" ml), area ") == 2  # it is in metres
+    command("upsample", "labels.npz", "one.glb", "--labels", "right", *how, "-q")
+    assert command("check", "one.glb", "labels.npz", *how)[1].startswith("right: ")
     scene = trimesh.load_scene("both.glb")
     scene.geometry["right"].update_faces(np.arange(len(scene.geometry["right"].faces)) > 0)
     scene.export("open.glb")
@@ -233,6 +238,7 @@ def test_exceeded_limits_are_exit_code_1_and_json_has_all(here, command):
     """Of a mean of 0.05 voxels, a largest residual of 0.1."""
     check_off = ("check", "off.ply", "ball.npz", "--json")
     assert command(*check_off, "--tolerance", 0.2 * H, "--max-mean", 0.1)[::2] == (0, "")
+    assert "--tolerance is nan\n" in command(*check_off, "--tolerance", "nan")[2]
     code, out, err = command(*check_off, "--tolerance", H / 20, "--max-mean", 0.01)
     report = json.loads(out)
     assert code == 1
@@ -251,11 +257,3 @@ def test_the_offset_is_that_of_the_mesh(here, command):
     words = ("check", "grown.ply", "ball.npz", "--tolerance", 0.01 * H, "-q")
     assert command(*words, "--offset", H) == (0, "", "")
     assert command(*words)[0] == 1
-
-
-def test_a_limit_or_an_offset_that_is_no_number_is_one_line(here, command):
-    words = ("check", "ball.ply", "ball.npz", "-q")
-    code, _, err = command(*words, "--tolerance", "nan")
-    assert code == 1 and "in world units, --tolerance is nan\n" in err
-    code, _, err = command(*words, "--offset", "nan")
-    assert code == 2 and err.startswith("Error: --offset is 'nan': give a finite number, in world")

@@ -144,10 +144,11 @@ def test_labels_are_called_what_the_file_says(command):
     nrrd.write("a.seg.nrrd", labels, header)
     assert names_in("a.seg.nrrd") == {1: ("spleen", (0, 255, 0)), 7: ("liver", (255, 0, 128))}
     words = ("upsample", "a.seg.nrrd", "o.glb", "--labels", "liver", "--factor", 2, "--json")
-    code, out, err = command(*words)
-    assert code == 0, err
-    assert [row["name"] for row in json.loads(out)["labels"]] == ["liver"]
+    assert [row["name"] for row in json.loads(command(*words)[1])["labels"]] == ["liver"]
     assert "liver" in trimesh.load("o.glb").geometry
+    assert command("upsample", "a.seg.nrrd", "o.ply", "--label", "liver", "-q")[0] == 0
+    end = "; its labels: 7 (liver), 1 (spleen)"
+    assert refusal(GridError, read_grid, "a.seg.nrrd").endswith(end)
 
 
 # Times, channels, classes

@@ -216,7 +216,9 @@ def test_the_command_writes_a_file_for_each_label(image, command):
         assert row["output"] == path and row["closed"] and mesh.is_watertight
         assert row["triangles"] == len(mesh.faces) and row["vertices"] == len(mesh.vertices)
         assert row["volume"] == pytest.approx(mesh.volume, rel=1e-5) and mesh.volume > 0
-        assert f"{path}: label {row['label']}, {len(mesh.faces):,} triangles, " in err
+        assert f"{path}: label {row['label']}, {len(mesh.faces):,} triangles, pieces: 1, " in err
+        assert f" volume {row['volume'] / 1000:.6g} ml, of its voxels " in err  # NIfTI is in mm
+    assert "off those of the samples: label 3 " in err
     low, high = mesh.bounds  # of label 12, a ball in a turned grid
     np.testing.assert_allclose((low + high) / 2, (3, -9, 23), atol=0.5)
 
@@ -336,9 +338,9 @@ def test_labels_are_chosen_by_name(command, boxes):
     made = Path("one.ply").read_bytes()
     assert command(*run, "--label", "left_kidney", "--names", "names.ctbl")[0] == 0
     assert Path("one.ply").read_bytes() == made
-    known = "of the table (Background, liver&co, left_kidney)"
+    known = "(Background, liver&co, left_kidney)"
     for words, said in (
-        (("--labels", "lung"), f"--labels has 'lung': give numbers, or names {known}"),
+        (("--labels", "lung"), f"--labels has 'lung': give numbers, or names of the table {known}"),
         (("--label", "lung"), f"--label lung names 0 labels: give a number, or a name {known}"),
     ):
         run = "upsample", boxes, "o.ply", "--names", "names.ctbl", *words

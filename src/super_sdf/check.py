@@ -3,9 +3,6 @@
 An exact sample is the radius of an empty ball that touches the surface. Its residual is its
 distance to the mesh minus that radius: positive if the mesh does not reach the ball, negative if it
 pierces it. All lengths are in voxels unless they are named otherwise.
-
->>> from super_sdf.check import check_mesh
->>> check_mesh(mesh, grid).report()                                      # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -49,6 +46,7 @@ class Surface:
     triangles: int
     pinched_vertices: int  # at which several fans of triangles meet: not manifold
     components: int  # that share no vertex
+    cavities: int  # components that bound one
     self_intersections: int  # pairs of triangles that meet off a common vertex or edge
     volume: float  # in cubic world units, negative if the triangles face inward
     volume_ml: float | None  # in millilitres, if the unit is stated
@@ -80,7 +78,8 @@ class Surface:
     def counts(self) -> str:
         """Return counts and volume, as a part of a line."""
         ml = "" if self.volume_ml is None else f" ({self.volume_ml:.6g} ml)"
-        pieces = f"{self.components:,} piece{'s' * (self.components != 1)}"
+        pieces = f"{(solids := self.components - self.cavities):,} piece{'s' * (solids != 1)}"
+        pieces += f" (cavities: {self.cavities:,})" * bool(self.cavities)
         text = f"{self.vertices:,} vertices, {self.triangles:,} triangles, {pieces}, "
         return f"{text}volume {self.volume:.6g}{ml}, area {self.area:.6g}"
 
@@ -143,7 +142,7 @@ class Certificate:
         wrong, strays = int(self.wrong_side.sum()), self.strays or 0
         found = [f"{wrong:,} samples on the wrong side"] * (wrong > 0)
         found += [f"{strays:,} vertices where the grid has no surface"] * (strays > 0)
-        found += ["every vertex lies beyond the grid"] * (0 < self.surface.vertices == self.beyond)
+        found += ["no vertex within the grid"] * (0 < self.surface.vertices == self.beyond)
         return self.surface.faults() + found
 
     def lines(self) -> list[str]:
@@ -161,7 +160,7 @@ class Certificate:
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
             largest = figures["largest"] * self.grid.voxel_size
             lines.append(f"largest residual: {largest:.4g} in world units, at ({at})")
-        lines += [f"{self.beyond:,} vertices lie beyond the grid, unchecked"] * (self.beyond > 0)
+        lines += [f"{self.beyond:,} vertices off the voxels (a cap): unchecked"] * (self.beyond > 0)
         return [*lines, self.summary()]
 
     def summary(self) -> str:
@@ -258,6 +257,7 @@ def examine_surface(mesh: Mesh, unit: str | None = None) -> Surface:
         triangles=len(whole.faces),
         pinched_vertices=int(np.count_nonzero(fans > 1)),
         components=whole.components()[0],
+        cavities=whole.cavities(),
         self_intersections=len(Solid(mesh).intersecting()),
         volume=volume,
         volume_ml=volume * (100 * LENGTHS[unit]) ** 3 if unit else None,

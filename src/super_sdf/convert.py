@@ -1,8 +1,4 @@
-"""Conversion of one grid file to one mesh file: read, refine, extract the surface, write, report.
-
->>> from super_sdf.convert import convert
->>> convert("part.npz", "part.ply", load_network(), Options())           # doctest: +SKIP
-"""
+"""Conversion of one grid file to one mesh file: read, refine, mesh, write, report."""
 
 from __future__ import annotations
 
@@ -58,7 +54,7 @@ def convert(
     SuperSdfError as in ``read_grid``, ``reconstruct``, ``simplify_mesh`` and ``write_mesh``.
     """
     steps, files, saved = Steps(progress, STEPS), files_of(source), dict[str, Any]()
-    check_free(check_mesh_suffix(Path(target), options.unit), force=force)
+    check_free(check_mesh_suffix(Path(target)), force=force)
     check_apart(target, files)
     with ExitStack() as saving:
         if save_field is not None:

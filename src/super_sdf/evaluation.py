@@ -3,9 +3,6 @@
 Lengths are in units of the diagonal of the reference's bounding box. P are 1e5 points drawn from
 the reference, uniformly by area, Q those from the mesh. Needs the extra ``eval``.
 
->>> from super_sdf import evaluate
->>> evaluate([mesh], ["true.ply"])["f1"].mean()                          # doctest: +SKIP
-
 References
 ----------
 Chen and Zhang, Neural Marching Cubes (2021): F1 at 0.003; edge points, ECD and EF1 at 0.005.

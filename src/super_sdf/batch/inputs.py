@@ -79,7 +79,7 @@ def find_jobs(
             if not (same and other.options == job.options):
                 both = f"{other.source} and {job.source} would both become {job.target}"
                 raise OptionError(f"{both}: rename one, or give 'out' in a .jsonl list")
-            check_mesh_suffix(Path(job.mesh), job.options.unit)
+            check_mesh_suffix(Path(job.mesh))
     return list(by_target.values())
 
 

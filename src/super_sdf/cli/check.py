@@ -51,7 +51,7 @@ def command(mesh: Path, grid: str | None, **given: Any) -> None:
     limits = given.pop("tolerance"), given.pop("max_mean")
     if grid is None and limits != (None, None):
         raise OptionError("--tolerance and --max-mean are limits of residuals: give a GRID, too")
-    found = certificates(mesh, grid, main.chosen_options(given), given["names"])
+    found = certificates(mesh, grid, main.chosen_options(given, grid or "-"), given["names"])
     alone = found.get("")  # a mesh beside its grid
     failed = [said for each in found.values() if grid for said in each.exceeded(*limits)]
     if given["no_faults"] or not alone:
@@ -81,12 +81,14 @@ def certificates(mesh: Path, grid: str | None, options: Options, names: Any) -> 
 
     parts, found = read_parts(mesh, options.unit), dict[str, Any]()
     if grid is None:
-        return {name: examine_surface(part, options.unit) for name, part in parts.items()}
-    if len(parts) == 1:
-        samples = read_grid(grid, **options.reading())
-        return {"": check_mesh(parts.popitem()[1], samples, options)}
+        unit = options.unit or ("m" if mesh.suffix.lower() == ".glb" else None)  # by its standard
+        return {name: examine_surface(part, unit) for name, part in parts.items()}
     known = names or names_in(grid)
     numbers = {name: str(number) for number, (name, _) in names_of(known, known).items()}
+    is_label = options.label is None and not parts.keys() - numbers.keys()
+    if len(parts) == 1 and not is_label:
+        samples = read_grid(grid, **options.reading())
+        return {"": check_mesh(parts.popitem()[1], samples, options)}
     for name, part in parts.items():
         label = numbers.get(name, name.removeprefix("label "))
         if not label.lstrip("-").isdigit():

@@ -127,16 +127,17 @@ SHARED: dict[Any, click.Option] = {  # options of several commands, by their nam
 SHARED |= {name: table_option(name) for name in OPTIONS}
 
 
-def chosen_options(given: dict[str, Any]) -> Options:
-    """Return the options of a conversion, of all options of a command; read a table of names."""
-    if given.get("names"):
-        from ..labels.files import read_names
+def chosen_options(given: dict[str, Any], source: str = "-") -> Options:
+    """Return the options of a conversion, of all of a command; names are of a table or a source."""
+    is_name = not (label := str(given.get("label") or 0)).lstrip("+-").isdigit()
+    if given.get("names") or (is_name and source != "-"):
+        from ..labels.files import names_in, read_names
 
-        given["names"] = read_names(given["names"])
-        label, known = str(given["label"] or 0), [name for name, _ in given["names"].values()]
-        alike = [n for n, (name, _) in given["names"].items() if name == label]
-        if len(alike) != 1 and not label.lstrip("+-").isdigit():
-            some = f", or a name of the table ({', '.join(known[:10])})" * (not alike)
+        names = given["names"] = read_names(given["names"]) if given["names"] else names_in(source)
+        known = ", ".join(name for name, _ in [*names.values()][:10]) or "none without --names"
+        alike = [n for n, (name, _) in names.items() if name == label]
+        if len(alike) != 1 and is_name:
+            some = f", or a name ({known})" * (not alike)
             raise OptionError(f"--label {label} names {len(alike)} labels: give a number{some}")
         given["label"] = alike[0] if alike else given["label"]
     chosen = Options(**{name: value for name, value in given.items() if name in OPTIONS})

@@ -28,7 +28,7 @@ from click import Argument, Choice, Option
 from .. import __version__
 from ..errors import OptionError, SuperSdfError
 from ..files.meshes import has_parts
-from ..options import MESH_FORMATS, OPTIONS, Options
+from ..options import LENGTHS, MESH_FORMATS, OPTIONS, Options
 from . import main
 
 MANY = 50_000  # triangles of which simplifying is worth a hint
@@ -51,7 +51,7 @@ TAKES = (
 
 def command(source: str, target: str, **given: Any) -> None:
     """Convert one grid to a mesh, or the labels of an image to meshes."""
-    start, options, page = time.perf_counter(), main.chosen_options(given), given["report"]
+    start, options, page = time.perf_counter(), main.chosen_options(given, source), given["report"]
     if target == "-" and given["as_json"]:
         raise OptionError("--json is for standard output, too: give a file for OUT")
     if target == "-" and options.labels is not None and not has_parts(f"-.{given['kind']}"):
@@ -146,13 +146,20 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     """Return lines on a result: notes and warnings, and what was written."""
     lines = [f"Note: {note}" for note in (*report["inferred"], *report["device_notes"])]
     lines += [f"Warning: {warning}" for warning in report.get("warnings", ())]
+    is_mm = report["space"] and "the unit that it states" not in " ".join(report["inferred"])
+    unit = report["asked"]["unit"] or ("mm" if is_mm else None)
+    scale, ml = ((100 * LENGTHS[unit]) ** 3, " ml") if unit else (1, "")
+    if report["asked"]["unit"] and report["output"] != "-" and not has_parts(report["output"]):
+        lines.append(f"Note: {report['output']} states no unit, only a .glb or .3mf does")
     seconds = f"{sum(report['seconds'].values()):.1f} s"
     for row in report.get("labels", ()):
         name = report["output"] if report["output"] == "-" else row["output"]
-        line = f"{name}: {row['name']}, {row['triangles']:,} triangles, volume "
-        lines.append(f"{line}{row['volume']:.6g}, of its voxels {row['sample_volume']:.6g}")
+        line = f"{name}: {row['name']}, {row['triangles']:,} triangles, "
+        line += f"pieces: {row['components'] - row['cavities']}, cavities: {row['cavities']}, "
+        volumes = [f"{scale * row[name]:.6g}{ml}" for name in ("volume", "sample_volume")]
+        lines.append(f"{line}volume {volumes[0]}, of its voxels {volumes[1]}")
     if "labels" in report:
-        return [*lines, f"{len(report['labels'])} labels, {seconds}"]
+        return [*lines, f"labels: {len(report['labels'])}, {seconds}"]
     few, field, triangles = report.get("simplified"), report.get("saved_field"), report["triangles"]
     low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in report["bounds"])
     line = f"{report['output']}: {report['vertices']:,} vertices, {triangles:,} triangles, "

@@ -79,7 +79,7 @@ def find_format(path: str | Path) -> GridFormat:
         other = PLUGIN._replace(name=ending, suffixes=(ending,))
         format_ = next((format_ for format_ in FORMATS if ending in format_.suffixes), other)
         if member and member[0] != "[" and not format_.has_members:
-            raise OptionError(f"{format_.name} files hold one array: leave out :{member}")
+            raise OptionError(f"{format_.name} files hold one array: give --label, not :{member}")
         return format_
     if file.is_dir():
         return DICOM

@@ -24,7 +24,7 @@ from ..grid.sdf_grid import SdfGrid, make_grid, with_fields
 from ..options import OPTIONS, PATH, AxisOrder, FieldKind, Inside, Options, Space, Values
 from .formats import DICOM, check_regular_file, find_format, is_store, split_member
 from .output import check_free, replacing
-from .readers import Names, Request, Volume, axes_direction, find_placement
+from .readers import MOST_NAMED, Names, Request, Volume, axes_direction, find_placement
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
@@ -79,8 +79,12 @@ def read_grid(
     Options(space=space, **values)  # checks them
     given = {"spacing": spacing, "origin": origin, "direction": direction}
     arrays = read_array(path, given, axes, space, max_memory)
-    notes, space = arrays.pop("notes"), arrays.pop("space")
-    grid = make_grid(**arrays, **values)
+    notes, space, names = (arrays.pop(key) for key in ("notes", "space", "names"))
+    try:
+        grid = make_grid(**arrays, **values)
+    except SuperSdfError as error:
+        listed = ", ".join(f"{n} ({name})" for n, (name, _) in [*names.items()][:MOST_NAMED])
+        raise type(error)(error.flagged + f"; its labels: {listed}" * bool(names)) from None
     return with_fields(grid, flagged=(*notes, *grid.flagged), space=space)
 
 
@@ -98,7 +102,7 @@ def read_array(
         if direction is not None:  # of x, y and z
             volume = replace(volume, direction=axes_direction(volume.axes or request.axes))
         arrays = _taken(volume, request, given)
-    return arrays | {"notes": volume.notes, "space": volume.space}
+    return arrays | {"notes": volume.notes, "space": volume.space, "names": volume.names}
 
 
 def names_in(path: str | Path) -> Names:
@@ -217,6 +221,7 @@ def describe_grid_file(path: str | Path) -> dict[str, Any]:
         "axes in the file": "".join("xyz"[order.index(axis)] for axis in range(3)),
         **facts,
         **({"space": volume.space} if volume.space else {}),
+        "labels": [f"{n} {name}" for n, (name, _) in volume.names.items()],
         "notes": list(volume.notes),
     }
 

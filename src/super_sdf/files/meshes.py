@@ -61,13 +61,10 @@ def has_parts(path: str | Path) -> bool:
     return Path(path).suffix.lower() in SCENES
 
 
-def check_mesh_suffix(path: Path, unit: str | None = None) -> Path:
-    """Return the path of a mesh file; OptionError for another suffix, or if it states no unit."""
+def check_mesh_suffix(path: Path) -> Path:
+    """Return the path of a mesh file; OptionError for another suffix."""
     if path.suffix.lower() not in MESH_SUFFIXES and not plugin("writers", path.suffix):
         raise OptionError(f"{path} is not a mesh file: give one of {', '.join(MESH_SUFFIXES)}")
-    if unit and not has_parts(path):
-        stating = " or ".join(SCENES)
-        raise OptionError(f"--unit {unit}: {path} can state none, give {stating}, or no unit")
     return path
 
 
@@ -93,8 +90,8 @@ def write_mesh(
     force : bool
         Replace an existing file.
     unit : str, optional
-        Unit of the world, which .3mf and .glb state: um, mm, cm, m, in or ft. Default: a .3mf says
-        mm, a .glb m.
+        Unit of the world: um, mm, cm, m, in or ft. Only .3mf and .glb state it; by default a .3mf
+        says mm, a .glb m.
     space : str, optional
         The anatomical space of the coordinates, "RAS" or "LPS", such as that of the grid. A .ply,
         .stl or .obj names it in its header, where 3D Slicer looks for it.
@@ -102,12 +99,12 @@ def write_mesh(
     Raises
     ------
     OptionError, MeshError, FileError
-        If the suffix is unknown, or that of a format that states no unit; if the arrays are no
-        mesh, or a coordinate is not finite; if the file cannot be written, or its format cannot
-        hold the mesh: corners of a triangle would coincide.
+        If the suffix is unknown; if the arrays are no mesh, or a coordinate is not finite; if the
+        file cannot be written, or its format cannot hold the mesh: corners of a triangle would
+        coincide.
     """
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
-    path = check_free(check_mesh_suffix(PATH.check(path, "path"), world.unit), force=force)
+    path = check_free(check_mesh_suffix(PATH.check(path, "path")), force=force)
     write_meshes({path: {"": mesh}}, force=force, world=world)
 
 

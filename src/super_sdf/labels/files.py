@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from ..errors import FileError, MeshError, OptionError, flag
 from ..files.formats import check_regular_file, files_of
-from ..files.grids import names_in
+from ..files.grids import names_in as names_in
 from ..files.meshes import World, check_mesh_suffix, has_parts, write_meshes
 from ..files.output import check_apart, check_free
 from ..files.readers import PLACE, Names as Names
@@ -30,7 +30,7 @@ from ..options import LABELS, OPTIONS, Options
 from ..surface.mesh import Mesh
 from ..threads import Progress, Steps
 from .reconstruct import find_image, in_order, label_meshes
-from .volumes import volume_notes
+from .volumes import FAR, NOTED, volume_notes
 
 LONGEST = 80  # characters of a name
 ITK_SNAP = re.compile(r'^\s*(\d+)\s+(\d+)\s+(\d+)\s+(\d+)\s.*"(.*)"', re.MULTILINE)
@@ -66,7 +66,7 @@ def convert_labels(
     """
     watch, options, known = Steps(), options or Options(), names or names_in(source)
     options = with_numbers(replace(options, labels=options.labels or "all"), known)
-    check_mesh_suffix(Path(target), options.unit)
+    check_mesh_suffix(Path(target))
     image = find_image(source, options, [getattr(options, name) for name in PLACE], partly=True)
     called, lacking = names_of(image.volumes, known), names_of(image.missing, known)
     paths = paths_of(Path(target), called, known)
@@ -82,15 +82,15 @@ def convert_labels(
         files[path][name] = mesh
         if mesh.open_edges():
             raise MeshError(f"the mesh of label {n} is torn: run it again, and report it")
-        counts = {"vertices": len(mesh.vertices), "triangles": len(mesh.faces)}
-        volumes = {"volume": mesh.volume(), "sample_volume": image.volumes[n]}
-        row = {"label": n, "name": name, "output": str(path), **counts, **volumes}
-        rows.append({**row, "components": mesh.components()[0], "closed": True})
+        row = {"label": n, "name": name, "output": str(path), "vertices": len(mesh.vertices)}
+        row |= {"triangles": len(mesh.faces), "components": mesh.components()[0]}
+        row |= {"cavities": mesh.cavities(), "closed": True, "volume": mesh.volume()}
+        rows.append({**row, "sample_volume": image.volumes[n]})
     colours = {name: colour for name, colour in called.values() if colour}
     write_meshes(files, force=force, world=World(options.unit, image.grid.space, colours))
     watch.lap("write")
-    if options.keep_volume:
-        notes += volume_notes({row["name"]: (row["volume"], row["sample_volume"]) for row in rows})
+    pairs = {row["name"]: (row["volume"], row["sample_volume"]) for row in rows}
+    notes += volume_notes(pairs, NOTED if options.keep_volume else FAR)
     missing = [{"label": n, "name": name} for n, (name, _) in lacking.items()]
     listed = ", ".join(name for name, _ in lacking.values())
     notes += [f"no sample has a label that was asked for: {listed}"] * bool(missing)

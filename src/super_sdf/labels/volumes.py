@@ -24,7 +24,7 @@ from ..surface.mesh import Mesh, row_keys
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
 ROUNDS, TURNS = 30, 6
-GOOD, NOTED = 1e-6, 1e-3  # of a volume
+GOOD, NOTED, FAR = 1e-6, 1e-3, 0.1  # of a volume; the last if it need not be kept
 
 
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
@@ -36,11 +36,12 @@ def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
         )
 
 
-def volume_notes(volumes: Mapping[str, tuple[float, float]]) -> list[str]:
+def volume_notes(volumes: Mapping[str, tuple[float, float]], least: float = NOTED) -> list[str]:
     """Return a note on meshes whose volume is not that of their samples, both by a name."""
     off = {name: mesh / samples - 1 for name, (mesh, samples) in volumes.items()}
-    far = [f"{name} {share:+.1%}" for name, share in off.items() if abs(share) > NOTED]
-    return [f"volumes that are off those of the samples: {', '.join(far)}"] * bool(far)
+    far = [f"{name} {share:+.1%}" for name, share in off.items() if abs(share) > least]
+    way_out = " (see --keep-volume)" * (least == FAR)
+    return [f"volumes that are off those of the samples: {', '.join(far)}{way_out}"] * bool(far)
 
 
 def keep_volume(mesh: Mesh, volume: float, spacing: float) -> Mesh:

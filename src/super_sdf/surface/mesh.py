@@ -112,6 +112,12 @@ class Mesh:
         piece = _connected(start, end, len(self.vertices))
         return len(np.unique(piece[self.faces[:, 0]])), piece
 
+    def cavities(self) -> int:
+        """Count the components that bound a cavity: of negative volume, in a mesh of positive."""
+        piece, middle = self.components()[1][self.faces[:, 0]], self.vertices.mean(0, np.float64)
+        volumes = np.bincount(piece, np.linalg.det(self.vertices[self.faces] - middle))
+        return int(np.count_nonzero(volumes < 0)) * bool(volumes.sum() > 0)
+
     def pair_edges(self) -> tuple[IntArray, NDArray[np.intp], int]:
         """Find the neighbour of each triangle across each of its edges, by sorting all edges.
 
