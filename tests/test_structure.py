@@ -46,10 +46,10 @@ BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a r
     "files": 2697,  # 2,700; and readers and writers of other packages
     "functions": 684,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached
     "labels": 900,
-    "simplify check truth evaluation": 1434,  # 1,100; and the evaluation, which lab imports
+    "simplify check truth evaluation": 1441,  # 1,100; and the evaluation, which lab imports
     "batch": 887,  # and what a page lacks is made again
     "pages": 385,
-    "cli": 873,  # 800; and standard input and output, a row for each label of a mesh
+    "cli": 876,  # 800; and standard input and output, a row for each label of a mesh
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 90, 45, 114  # 90, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 15_750, 36_000
