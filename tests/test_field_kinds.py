@@ -323,6 +323,19 @@ def test_densities_have_the_surface_of_their_spline():
     np.testing.assert_array_equal(two.values, make_grid(MASK, **PLACE).values)
 
 
+@pytest.mark.parametrize("padding", [-10.0, -1e6])
+@pytest.mark.parametrize("told", [{"level": 0.5}, {"field": "smooth"}], ids=["level", "smooth"])
+def test_padding_far_from_all_values_moves_no_surface(padding, told):
+    """As round the occupancies of networks: the spline would swing beside it."""
+    occupancy = 1 / (1 + np.exp(2 * torus(32))) - (0 if "level" in told else 0.5)
+    grid = make_grid(np.pad(occupancy, 2, constant_values=padding), **PLACE, **told)
+    assert "values far from all others are taken as padding" in grid.notes
+    wanted = make_grid(np.pad(occupancy, 2, "edge"), **PLACE, **told)
+    inner = (slice(2, -2),) * 3
+    np.testing.assert_allclose(grid.values[inner], wanted.values[inner], rtol=1e-6)
+    assert grid.high < 9 and grid.field.kind == wanted.field.kind
+
+
 def test_shares_of_voxels_are_no_steps():
     """Of a block with faces .4 voxels from the samples, each share beside a face is .9 or 0."""
     share = np.clip(15.6 - np.arange(24) + 0.5, 0, 1) - np.clip(6.4 - np.arange(24) + 0.5, 0, 1)

@@ -82,6 +82,24 @@ def test_meshes_are_closed_and_share_their_walls(name, factor, more):
         assert seen[a, b, c] == 1
 
 
+@pytest.mark.parametrize("thickness, most", [(1, 0.35), (4, 2)])
+def test_the_line_on_which_labels_meet_has_no_teeth(thickness, most):
+    """A ball cut by a plane: a circle, of its own length."""
+    middle, normal, radius = np.array([15.3, 14.8, 15.1]), np.array([2, 1, 2]) / 3, 11
+    whole, spacing = ball(middle - 2 * normal, np.hypot(radius, 2)), (1, 1, thickness)
+    solids = [lambda p: np.maximum(whole(p), (p - middle) @ normal), whole]
+    labels = painted((30, 30, 32 // thickness), spacing, solids)
+    one, other = map(corners_of, reconstruct_labels(labels, spacing=spacing, origin=0).values())
+    wall = [corners for corners in one if (corners[0], corners[2], corners[1]) in other]
+    edges = {(corners[n - 1], corners[n]) for corners in wall for n in range(3)}
+    ends = [end for edge in edges if edge[::-1] not in edges for end in edge]
+    ends = np.frombuffer(b"".join(ends), np.float32).reshape(-1, 2, 3) - middle
+    away = np.hypot(ends @ normal, np.linalg.norm(np.cross(ends, normal), axis=-1) - radius)
+    assert away.max() < most
+    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).sum()
+    assert length == pytest.approx(2 * np.pi * radius, rel=0.03)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, fast):
     noise = np.random.default_rng(seed).standard_normal((4, 8, 8, 8))

@@ -60,6 +60,16 @@ def test_coarse_samples_are_kept(network):
     assert (kept[samples == 0] == 0).all() and (samples == 0).any()
 
 
+@pytest.mark.parametrize("factor", [2, 4])
+@pytest.mark.parametrize("half", [(7.5, 5, 6.5), (4, 6.5, 5), (6, 6.5, 7)])
+def test_a_box_with_faces_on_samples_is_one_piece(network, half, factor):
+    """Samples of 0 on its edges, where the network errs outwards, are no pieces of their own."""
+    middle = 10 + np.array(half) % 1
+    values = box_distance(np.moveaxis(np.indices((20,) * 3), 0, -1) - middle, np.array(half))
+    mesh = reconstruct(SdfGrid.trusted(values, 1.0), network, factor)
+    assert mesh.is_closed() and mesh.components()[0] == 1
+
+
 def test_noisy_samples_are_corrected(network):
     clean = ball(24, 8.0)
     noise = np.random.default_rng(0).uniform(-0.4, 0.4, clean.shape)

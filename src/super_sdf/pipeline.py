@@ -66,6 +66,7 @@ def refine_band(
     if grid.field.sides_only:
         nodes.hold_sides(decoded, factor, patches[voxels, CENTRE])
     nodes.pin_to_skipped(decoded, parts, factor, own_ijk, patches[voxels], grid.shape)
+    nodes.take_lone_points_out(decoded, factor)
     steps.finish("nodes")
     unseen, leaves, exact = grid.field.unseen, band.whole.leaves, band.exact
     number = np.ravel_multi_index(tuple(band.voxel_ijk[exact].T), grid.shape)

@@ -145,6 +145,19 @@ class Case:
         self.look = replace(self.look, low=self.look.low / slope, high=self.look.high / slope)
         self.facts = self.facts | {"cut": [x / slope for x in self.facts.get("cut", ())]}
 
+    def clip_padding(self) -> None:
+        """Clip an end of the values that is farther from all others than these are apart.
+
+        A spline would swing beside it.
+        """
+        for end in (self.look.low, self.look.high):
+            others = self.look.part[np.isfinite(self.look.part) & (self.look.part != end)]
+            low, high = float(others.min(initial=0)), float(others.max(initial=0))
+            if low < 0 < high and max(low - end, end - high) > high - low:
+                self.samples = changed(self.samples, partial(np.clip, a_min=low, a_max=high))
+                self.look = look_at(self.samples)
+                self.notes.append("values far from all others are taken as padding")
+
     def fill_in(self, values: Sequence[float] = ()) -> None:
         """Fill in unknown samples, for which some values stand, too, if there are some."""
         if self.look.is_finite and not values:
@@ -328,6 +341,7 @@ def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     """Return values in steps of their slope beside the surface, to be meshed by their spline."""
     if case.look.is_one_sided:
         raise _refused(case)
+    case.clip_padding()
     case.spacing = spacing = case.spacing or _estimated(case)
     steps = steps_of(spacing)
     slope = 1.0 if case.wanted.scale else _slope_at_surface(case.look, steps)

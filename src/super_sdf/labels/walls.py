@@ -8,9 +8,9 @@ get the very same vertex. So each surface is closed, and there is neither gap no
 
 A point is named by its place in the lattice of half the fine spacing; further points in a cell have
 that of its middle, and a number above all places. How walls run in a cell follows from the labels
-at its corners. On a face with two labels the wall runs as in ``surface.cell_cases``. Where three or
-four meet, a point on the face is joined to all crossed edges, unless opposite corners have the same
-label: they are joined, and each of the others is cut off. Both cells beside the face agree on it.
+at its corners. On a face with two labels it runs as in ``surface.cell_cases``. Where three or four
+meet, the point where their fields are equal is joined to all crossed edges, unless opposite corners
+have the same label: they are joined, and each of the others is cut off. Both cells beside it agree.
 
 These segments part the surface of the cell into regions, each of one label. A loop between two
 labels is cut into triangles as in ``cell_cases``. Segments that hang together by points on faces
@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,7 @@ ON_FACES = [CORNERS[list(face)].sum(0) // 2 for face in FACES]
 IN_CELL = np.ones((MOST_POINTS - CELL_POINTS, 3), int)
 # Where the points are in a cell of two steps along each axis, (26, 3).
 PLACES = np.concatenate([CORNERS[EDGE_ENDS].sum(0), ON_FACES, IN_CELL])
+BESIDE = 0.1  # fine spacings from the edges of a face to a point on it, at least
 
 Labels = NDArray[np.int16]
 FieldOfLabel = tuple[Index, FloatArray, BoolArray]
@@ -64,26 +66,23 @@ class Labelled:
     # of label 0 values are NaN, or missing, where they are minus those of any other
     fields: dict[int, FieldOfLabel]
 
-    def apart(self, low: Index, corner: NDArray[np.intp], holder: Labels) -> Vectors:
+    def apart(self, low: Index, corner: NDArray[np.intp], holder: Labels, other: Labels) -> Vectors:
         """Return by how much the field of a node's holder is lower than that of another, (k, n).
 
-        The nodes are some corners, (k, n), of cells with low nodes (n, 3), held by two labels.
+        The nodes are some corners, (k, n), of cells with low nodes (n, 3).
         """
         voxel = np.clip(low // self.factor, 0, np.array(self.shape) - 1)
-        row, between = self.index.find(voxel + 1), np.sort(holder[:2], axis=0)
-        place = (low - self.factor * voxel + CORNERS[corner]) @ strides(self.factor)
-        values = np.full((2, *place.shape), np.nan)
+        node_ijk = np.clip(low - self.factor * voxel + CORNERS[corner], 0, self.factor)
+        place = node_ijk @ strides(self.factor)
+        row, values = self.index.find(voxel + 1), np.full((2, *holder.shape), np.nan)
         for label, (rows, blocks, _) in self.fields.items():
-            for value, own in zip(values, between):
-                some = np.flatnonzero(own == label)
-                at = np.searchsorted(rows, row[some])
-                is_known = np.append(rows, -1)[at] == row[some]
-                some = some[is_known]
-                value[:, some] = blocks[place[:, some], at[is_known]]
-        lower = np.where(np.isnan(values[0]), -values[1], values[0])
-        apart = np.where(holder == between[0], values[1] - lower, lower - values[1])
-        # the other may be lower where it cannot hold the node
-        return np.asarray(np.maximum(apart, 0))
+            for value, own in zip(values, (holder, other)):
+                node, cell = np.nonzero(own == label)
+                at = np.minimum(np.searchsorted(rows, row[cell]), len(rows) - 1)
+                found = blocks[place[node, cell], at]
+                value[node, cell] = np.where(rows[at] == row[cell], found, np.nan)
+        held, others = np.where(np.isnan(values), -values[::-1], values)
+        return np.asarray(np.fmax(others - held, 0))  # what cannot hold a node may be lower
 
 
 def extract_walls(field: Labelled) -> Walls:
@@ -109,29 +108,36 @@ def extract_walls(field: Labelled) -> Walls:
     tables = [_walls_of_cell(int(number) & (1 << 24) - 1, int(number) >> 24) for number in case]
     cell = np.repeat(np.arange(len(base)), [len(tables[nth]) for nth in of_cell])
     table = np.concatenate([np.empty((0, 5), np.int32), *(tables[nth] for nth in of_cell)])
-    faces, sides = base[cell, None] + steps[table[:, :3]], label[cell[:, None], table[:, 3:]]
+    names, sides = base[cell, None] + steps[table[:, :3]], label[cell[:, None], table[:, 3:]]
+    first, faces = np.unique(names, return_index=True, return_inverse=True)[1:]
+    kind, cell, faces = table[:, :3].ravel()[first], cell[first // 3], faces.reshape(-1, 3)
+    return Walls(_places(field, low[cell], label[cell], kind, faces), faces.astype(np.int32), sides)
 
-    # a point on each crossed edge
-    edge, cell = np.nonzero((label[:, EDGE_ENDS[0]] != label[:, EDGE_ENDS[1]]).T)
-    keys, one = np.unique(base[cell] + steps[edge], return_index=True)
-    places = _on_edges(field, low[cell[one]], EDGE_ENDS[:, edge[one]], label[cell[one]])
 
-    # on a face the mean of the points that it is joined to on edges; then so in a cell, which is
-    # the last of its triangle
-    kind = table[:, :3]
-    on_face = (kind >= FACE_POINTS) & (kind < CELL_POINTS)
-    in_cell = (kind >= CELL_POINTS) & [False, False, True]
-    for least, which in ((FACE_POINTS, on_face), (CELL_POINTS, in_cell)):
-        row, corner = np.nonzero(which)
-        named, of = np.unique(faces[row, corner], return_inverse=True)
-        others = np.add([[1], [2]], corner) % 3
-        is_known = kind[row, others] < least
-        of = np.broadcast_to(of, others.shape)[is_known]
-        at = np.searchsorted(keys, faces[row, others][is_known])
-        means = sums_at(of, places[at], len(named)) / np.bincount(of)[:, None]
-        order = np.argsort(np.append(keys, named))
-        keys, places = np.append(keys, named)[order], np.concatenate([places, means])[order]
-    return Walls(places, np.searchsorted(keys, faces).astype(np.int32), sides)
+def _places(field: Labelled, low: Index, label: Labels, kind: IntArray, faces: Index) -> Vectors:
+    """Return the points of faces, in fine spacings, (n, 3), by their cells and numbers there.
+
+    A point in a cell is the mean of those on its faces. These move once to the mean of the points
+    in cells beside them: the line on which labels meet has teeth otherwise, near lattice edges.
+    """
+    middle = low + PLACES[kind] / 2
+    rank = np.digitize(kind, (FACE_POINTS, CELL_POINTS))  # 0 on edges, 1 on faces, 2 in cells
+    within = ((middle >= 0) & (middle <= field.factor * np.array(field.shape))).all(1)
+    places, edge, face = np.zeros(low.shape), rank == 0, (rank == 1) & within
+    places[edge] = _on_edges(field, low[edge], EDGE_ENDS[:, kind[edge]], label[edge])
+    corner = np.array(FACES)[kind[face] - FACE_POINTS].T
+    places[face] = _on_faces(field, low[face], corner, label[face])
+
+    joined = faces[rank[faces].any(1)]
+    pairs = np.concatenate([joined[:, ends] for ends in permutations(range(3), 2)])
+    alone, reach = rank == 2, (0.5 - BESIDE) * (PLACES[kind] == 1)
+    alone[pairs[(rank[pairs] == 2).all(1)]] = False  # joined to others in their cell
+    for some, by in ((rank > 0) & ~face, 0), (alone, 1), (face, 2), (alone, 1):
+        point, other = pairs[some[pairs[:, 0]] & (rank[pairs[:, 1]] == by)].T
+        times = np.maximum(np.bincount(point, minlength=len(low)), 1)
+        places[some] = (sums_at(point, places[other], len(low)) / times[:, None])[some]
+        places[face] = np.clip(places, middle - reach, middle + reach)[face]
+    return places
 
 
 def _cases(field: Labelled, low: Index, label: Labels) -> Index:
@@ -146,7 +152,8 @@ def _cases(field: Labelled, low: Index, label: Labels) -> Index:
     for n, face in enumerate(FACES):
         a, b, c, d = label[:, face].T
         unsure = np.flatnonzero((a == c) & (b == d) & (a != b))
-        apart = field.apart(low[unsure], np.array(face)[:, None], label[unsure][:, face].T)
+        holder = label[unsure][:, face].T
+        apart = field.apart(low[unsure], np.array(face)[:, None], holder, np.roll(holder, 1, 0))
         one, other = apart[::2].prod(0), apart[1::2].prod(0)
         joined = np.where(a[unsure] > b[unsure], one > other, other > one)
         case[unsure] |= joined.astype(np.int64) << (24 + n)
@@ -154,16 +161,27 @@ def _cases(field: Labelled, low: Index, label: Labels) -> Index:
 
 
 def _on_edges(field: Labelled, low: Index, corner: NDArray[np.intp], label: Labels) -> Vectors:
-    """Return the points on edges between two corners, (2, n), of cells, in fine spacings."""
+    """Return the points on edges between two corners, (2, n), half-way beyond the border."""
     holder = np.take_along_axis(label, corner.T, 1).T
     ends, last = low + CORNERS[corner], field.factor * np.array(field.shape)
-    within = np.flatnonzero(((ends >= 0) & (ends <= last)).all((0, 2)))
-    one, other = field.apart(low[within], corner[:, within], holder[:, within])
-    total, share = one + other, np.full(len(low), 0.5)  # half-way, if an end is beyond the border
-    share[within] = np.where(total, one / np.where(total, total, 1), 0.5)
+    within = ((ends >= 0) & (ends <= last)).all((0, 2))
+    one, total = np.cumsum(field.apart(low, corner, holder, holder[::-1]), 0)
+    share = np.where(within & (total > 0), one / np.where(total > 0, total, 1), 0.5)
     share = np.clip(share, CLEARANCE, 1 - CLEARANCE)
     begin, stop = np.clip(ends.astype(float), -CAP_HEIGHT, last + CAP_HEIGHT)
     return np.asarray(begin + share[:, None] * (stop - begin))
+
+
+def _on_faces(field: Labelled, low: Index, corner: NDArray[np.intp], label: Labels) -> Vectors:
+    """Return where the labels at all corners of faces, (4, n), are equal, by planes as fields."""
+    holder = np.take_along_axis(label, corner.T, 1).T
+    others = (np.broadcast_to(other, holder.shape) for other in holder)
+    apart = np.stack([field.apart(low, corner, holder, other) for other in others], 1).T
+    apart = apart - apart.mean(1, keepdims=True)  # (n, labels, corners)
+    ends = CORNERS[corner.T]
+    middle = ends.mean(1, keepdims=True)
+    step = np.linalg.pinv(apart @ (ends - middle), 1e-3) @ apart.mean(2, keepdims=True)
+    return np.asarray(low + middle[:, 0] - step[..., 0])
 
 
 @lru_cache(maxsize=1 << 14)

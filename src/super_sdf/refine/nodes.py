@@ -191,3 +191,15 @@ def pin_to_skipped(
         for node in nodes:
             values = blocks[node].take(known)
             blocks[node, known] = np.where((values > 0) == outside, values, barely)
+
+
+def take_lone_points_out(blocks: FloatArray, factor: int) -> None:
+    """Put samples of 0 outside whose six nodes beside are outside, in ``blocks`` (Q, D).
+
+    On an edge of the solid, say: 0 counts as inside, so each would be a piece of no size.
+    """
+    middle = len(blocks) // 2
+    around = np.flatnonzero(np.abs(block_ijk(factor) - factor // 2).sum(1) == 1)
+    points = np.flatnonzero(blocks[middle] == 0)
+    lone = (blocks[around[:, None], points] > 0).all(0)
+    blocks[middle, points[lone]] = BARELY_OUTSIDE
