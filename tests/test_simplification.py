@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from conftest import ball, farthest, is_manifold, refusal, trilinear, walled
 from hypothesis import example, given, settings, strategies as st
-from solids import cube, joined, sphere, square, torus
+from solids import box_distance, cube, joined, sphere, square, torus
 from trimesh.triangles import angles
 
 from super_sdf import Mesh, SdfGrid, make_grid, read_grid, reconstruct, simplify_mesh
@@ -48,6 +48,18 @@ def three_holes() -> Mesh:
     for k in range(3):
         plate = np.maximum(plate, 2.4 - np.hypot(x - 3.2 - 8.3 * k, y))
     return reconstruct(SdfGrid.trusted(plate.astype(np.float32), 1.0), trilinear, factor=2)
+
+
+@pytest.mark.parametrize("half", [(7.5, 5, 6.5), (6, 6.25, 7)])
+def test_a_box_along_the_lattice_has_few_triangles_and_slivers(half):
+    """Its many tiny edges, beside nodes of the lattice, do not stay."""
+    middle = 10 + np.array(half) % 1
+    values = box_distance(np.moveaxis(np.indices((20,) * 3), 0, -1) - middle, np.array(half))
+    fine = reconstruct(SdfGrid.trusted(values, 1.0), load_network())
+    found = simplify_mesh(fine, error=0.05)
+    smallest = angles(found.vertices.astype(float)[found.faces]).min(1)
+    assert is_closed_manifold(found) and not len(Solid(found).intersecting())
+    assert len(found.faces) < 400 and np.count_nonzero(smallest < np.radians(0.5)) < 12
 
 
 @pytest.mark.parametrize("turn, most", [(np.eye(3), 12), (TURN, 24)], ids=["straight", "turned"])

@@ -149,9 +149,9 @@ EXTRAS = {
     "dicom": ("pydicom",),
     "3mf": ("lxml", "networkx"),
     "pyvista": ("pyvista",),
-    "simplify": ("igl", "pyfqmr"),
+    "simplify": ("igl", "manifold3d", "pyfqmr"),
     "eval": ("igl",),
-    "report": ("igl", "pyfqmr"),
+    "report": ("igl", "manifold3d", "pyfqmr"),
     "cluster": ("distributed",),
 }
 """The modules that each extra installs."""
