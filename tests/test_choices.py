@@ -185,9 +185,6 @@ def test_a_number_chooses_a_time_a_channel_or_a_class():
     assert "time has 2 entries, from 0 on: choose one" in refusal(GridError, read_grid, "sim.nc[2]")
     said = "b.npz has 0 axes to choose from by [0], [1], ..."
     assert refusal(SuperSdfError, read_grid, "b.npz:one[1]") == said
-    assert "holds several arrays, one, two: give b.npz:one" in refusal(
-        SuperSdfError, read_grid, "b.npz"
-    )
     assert "NIfTI files hold one array" in refusal(SuperSdfError, read_grid, "a.nii.gz:phi")
 
 
