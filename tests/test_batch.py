@@ -194,6 +194,7 @@ def test_a_name_chooses_among_the_arrays_of_each_file(batch):
     Path("frames/list.txt").write_text("2.npz\n1.npz:speed")
     facts = batch("frames/1.npz", "frames/list.txt", "--grid", "density", "--level", 0)[1]
     assert facts["done"] == 3 and contents().keys() == {"1.ply", "2.ply", "1-speed.ply"}
+    assert batch("frames/1.npz", "--grid", "speed", "--level", 0)[1]["done"] == 1  # in its place
     err = batch("frames/1.npz", out="other")[2]
     say = "holds several arrays, density, speed: give --grid density, say"
     assert f"Failed: frames/1.npz: {say}\n" in err and rows("other")[0]["reason"] == say

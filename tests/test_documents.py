@@ -34,7 +34,7 @@ RE = re.MULTILINE | re.DOTALL
 LEFT_OUT = {
     r"-m venv|pip |pytest|ruff": "in .ci/run, which installs and tests",
     r"python -m (lab|export)|neural_field": "in .ci/nightly, in small: PyTorch, hours",
-    r"gmsh|plate\.": "in .ci/nightly: examples/tools/tetrahedra.sh is docs/jobs/cad.md",
+    r"gmsh|plate\.|pytetwild": "in .ci/nightly: examples/tools/tetrahedra.sh is docs/jobs/cad.md",
     r"dask |--cluster": "needs other machines: tests/test_cluster.py starts workers",
     r"--device cuda": "needs a GPU",
     r"paraview|bpy\.|/path/to|getargspec": "needs ParaView or Blender: tests/test_plugins.py",

@@ -46,25 +46,18 @@ main()
 """
 
 
-def ended(script, number, *more):
-    """Run a script until its first line, send it a signal; return its exit code and streams."""
-    words = [sys.executable, "-c", script, *QUICK, *more]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen(words, preexec_fn=hear_signals, **pipes) as process:
-        assert process.stdout.readline()
-        process.send_signal(number)
-        out, err = process.communicate(timeout=PATIENCE)
-    return process.returncode, out, err.strip()
-
-
 SIGNALS = {"interrupted": signal.SIGINT, "ended by SIGHUP": signal.SIGHUP, "ended by SIGTERM": 15}
 
 
 @pytest.mark.parametrize("line", SIGNALS)
 def test_a_signal_leaves_a_line_its_exit_code_and_no_file(line):
-    number = SIGNALS[line]
-    code, out, err = ended(STAGE, number, "--json")
-    assert (code, err.splitlines()[-1]) == (128 + number, f"Error: {line}")
+    number, words = SIGNALS[line], [sys.executable, "-c", STAGE, *QUICK, "--json"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, preexec_fn=hear_signals, **pipes) as process:
+        assert process.stdout.readline()
+        process.send_signal(number)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, err.splitlines()[-1]) == (128 + number, f"Error: {line}")
     assert json.loads(out) == {"error": line} and os.listdir() == ["in.npy"]
 
 

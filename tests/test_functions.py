@@ -156,7 +156,9 @@ ASKED = {"function": torus, "bounds": BOX, "spacing": H}
     ({"function": 3}, OptionTypeError, "function is 3: give a function of points (n, 3)"),
     ({}, OptionTypeError, "grid is None: make one with make_grid(values, spacing=...) or "),
     ({"function": torus}, OptionError, "a function needs bounds and spacing, or a grid of its "),
-    ({**ASKED, "level": 0.1}, OptionError, "level is of arrays: leave it out, a grid or function "),
+    ({"grid": DistanceFunction(torus).sample(BOX, H), "function": block}, OptionError,
+     "function has another side than the grid at "),
+    ({**ASKED, "level": 0.1}, OptionError, "level is for arrays: a grid or function has its own"),
     ({**ASKED, "bounds": (1, -1)}, OptionError, "bounds are (1, -1): give (lowest, highest), "),
     ({**ASKED, "function": lambda p: p}, OptionTypeError,
      "the function returns an array of shape (8, 3) for 8 points: return a real number for each"),
@@ -170,13 +172,6 @@ ASKED = {"function": torus, "bounds": BOX, "spacing": H}
 def test_errors(arguments, kind, message):
     said = refusal(kind, reconstruct, network=trilinear, **arguments)
     assert said.startswith(message), said
-
-
-def test_a_function_of_another_grid_is_refused():
-    grid = DistanceFunction(torus).sample(BOX, H)
-    said = refusal(OptionError, reconstruct, grid, trilinear, function=block)
-    assert said.startswith("function has another side than the grid at ")
-    assert said.endswith("give the function that the grid has samples of")
 
 
 # Marching cubes beside scikit-image's: scripts in which only the import is changed

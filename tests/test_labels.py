@@ -223,9 +223,7 @@ def test_the_command_writes_a_file_for_each_label(image, command):
     np.testing.assert_allclose((low + high) / 2, (3, -9, 23), atol=0.5)
 
 
-@pytest.mark.parametrize(
-    "words", ["--triangles 99", "--mesher sharp", "--open", "--save-field f.npz"]
-)
+@pytest.mark.parametrize("words", ["--triangles 9", "--mesher sharp", "--open", "--save-field f"])
 def test_options_that_would_tear_the_walls_are_refused(words, image, command):
     code, _, err = command("upsample", image, "a.ply", "--labels", "all", *words.split(), *PLAIN)
     said = f"Error: {words.split()[0]} does not go with labels, which share their walls: "
@@ -301,12 +299,11 @@ def convert(command, image, out, labels="all", *more):
 
 
 def test_files_and_parts_have_the_names(command, boxes):
-    rows, err = convert(command, boxes, "o.stl", "all", "--names", "names.ctbl")
+    rows, _ = convert(command, boxes, "o.stl", "all", "--names", "names.ctbl")
     assert [row["output"] for row in rows] == ["o-liver_co.stl", "o-left_kidney.stl"]
     assert [row["name"] for row in rows] == ["liver&co", "left_kidney"]
     assert [row["sample_volume"] for row in rows] == [180.0, 181.0]
     assert [row["components"] for row in rows] == [1, 2]
-    assert "o-left_kidney.stl: left_kidney, " in err and " of its voxels 181" in err
     convert(command, boxes, "o.glb", "all", "--names", "names.ctbl")
     parts = trimesh.load("o.glb").geometry
     assert sorted(parts) == ["left_kidney", "liver&co"]

@@ -130,11 +130,6 @@ def test_an_array_of_any_library_goes_in_with_its_place(folder, kind):
     np.testing.assert_array_equal(mesh.faces, want.faces)
 
 
-def test_a_grid_has_its_own_place():
-    said = refusal(OptionError, reconstruct, GRID, trilinear, level=0.5)
-    assert said == "level is of arrays: leave it out, a grid or function has its own"
-
-
 def test_notes_are_logged_and_warnings_issued_in_the_words_of_python(caplog, command, folder):
     caplog.set_level("INFO", "super_sdf")
     with pytest.warns(SuperSdfWarning) as caught:

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import trimesh
 from conftest import refusal
 from solids import (
     CUBE_FACES,
@@ -141,7 +142,8 @@ def test_a_shift_in_units_of_the_diagonal_whatever_the_unit(folder, size):
     shift = np.array([0, 0, 0.005 * 2**0.5 * size])
     flat = square().transformed(size * np.eye(3), np.array([3.0, 0, 5]))
     write_mesh(Mesh(flat.vertices + shift, flat.faces), "off.ply")
-    found = evaluate(["off.ply", flat, NOTHING], [flat] * 3)
+    library = trimesh.Trimesh(flat.vertices, flat.faces, process=False)
+    found = evaluate(["off.ply", library, NOTHING], [flat] * 3)
     assert all(figures.shape == (3,) for figures in found.values())
     assert found["p2s"][:2] == pytest.approx([0.005, 0], abs=1e-6)
     assert found["cd"][0] == pytest.approx(2 * 0.005**2 + 1 / (np.pi * 1e5), rel=0.02)
@@ -158,9 +160,10 @@ def test_edges_are_within_a_tenth_of_the_spacing():
 
 
 @pytest.mark.parametrize(("given", "kind", "said"), [
-    (([cube()], [cube()] * 2), OptionError, "there are 1 meshes and 2 references: give as many"),
+    (([cube()], [cube()] * 2), OptionError, "there are 1 meshes and 2 references: "
+     "give as many of Mesh(vertices, faces) or paths"),
     (([cube()], [NOTHING]), MeshError, "a reference has no area: give a surface"),
-    ((None, cube()), OptionTypeError, "mesh is None: give one from reconstruct(grid)"),
+    ((None, cube()), OptionTypeError, "mesh is None: give Mesh(vertices, faces) or a path"),
     (([Mesh(cube().vertices * np.inf, CUBE_FACES)], [cube()]), MeshError,
      "a vertex of the mesh is not finite: repair it"),
 ])  # fmt: skip

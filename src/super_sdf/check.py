@@ -154,8 +154,8 @@ class Certificate:
             f"{of.needles:,} needles (vertices at the tip of a spike)",
         ]
         if any(samples.values()):
-            text = "samples: {exact:,} exact near the surface, {cut_off:,} cut off and {noisy:,} "
-            lines.append(text.format(**samples) + "noisy left out")
+            text = "samples: {exact:,} exact near the surface; left out: {cut_off:,} that may be "
+            lines.append((text + "cut off, {noisy:,} noisy").format(**samples))
         if figures := self.figures():
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
             largest = figures["largest"] * self.grid.voxel_size

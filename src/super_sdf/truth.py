@@ -124,7 +124,7 @@ class Solid:
     """
 
     def __init__(self, mesh: Mesh) -> None:
-        self.mesh = Mesh(mesh.vertices.astype(np.float64), mesh.faces.astype(np.int32))
+        self.mesh = Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int32))
 
     def _tree(self, kind: str) -> Any:
         """Return a search tree of igl for the triangles."""

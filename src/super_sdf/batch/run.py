@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..files.formats import split_member
 from ..files.output import naming
 from ..network.network import find_model
 from ..network.onnx import available_devices
@@ -167,6 +168,7 @@ class Batch:
             if (
                 not (settings.force or row["retry"] or again)
                 and all(row.get(key) == value for key, value in how.items() if key != "model")
+                and split_member(row["in"])[1] == split_member(job.source)[1]
                 and is_unchanged(job.source, row["content"], same_path=same_path)
                 and all(is_unchanged(settings.folder / n, k) for n, k in outputs_of(row).items())
             ):
@@ -203,9 +205,7 @@ class Batch:
             if is_gone or row.get("asked", {}).get("labels") is not None:
                 del rows[name]
 
-        left = len(self.of("to_do"))
-        alert = f"Incomplete: {left} not finished; run it again to go on" if left else ""
-        facts = {"title": f"Batch: {folder}", "lead": lead, "alert": alert}
+        facts = {"title": f"Batch: {folder}", "lead": lead}
         write_batch_page(path, facts, rows, force=self.settings.force)
 
 

@@ -132,7 +132,7 @@ def sentence(facts: dict[str, Any]) -> str:
     words = {state: state.replace("_", " ") for state in STATES}
     words |= {"failed_before": "failed before (--retry tries again)", "warned": "with warnings"}
     counts = [f"{facts[key]} {said}" for key, said in words.items() if facts[key]]
-    meshes = f"{facts['closed']} meshes closed, {facts['open']} open"
+    meshes = f"meshes: {facts['closed']} closed, {facts['open']} open"
     return f"{', '.join(counts)}; {meshes}; {facts['seconds']:.1f} s"
 
 

@@ -129,7 +129,7 @@ SHARED |= {name: table_option(name) for name in OPTIONS}
 
 def chosen_options(given: dict[str, Any], source: str = "-") -> Options:
     """Return the options of a conversion, of all of a command; names are of a table or a source."""
-    is_name = not (label := str(given.get("label") or 0)).lstrip("+-").isdigit()
+    is_name = not (label := str(given.get("label") or 0)).lstrip("+-").replace(".", "").isdigit()
     if given.get("names") or (is_name and source != "-"):
         from ..labels.files import names_in, read_names
 

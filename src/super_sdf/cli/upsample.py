@@ -173,5 +173,8 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     if few:
         off = max(few["deviation"][way] for way in ("largest", "largest_back"))
         said = f"Simplified: from {few['triangles_before']:,} to {triangles:,} triangles; largest "
-        lines.append(f"{said}distance {off:.4f} voxels")
+        said += f"distance {off:.4f} voxels, {off * few['voxel_size']:.4g} in world units"
+        lines.append(said)
+        if off > 0.5:
+            lines.append("Note: over half a voxel thin parts may be lost: --simplify 0.1 is closer")
     return lines

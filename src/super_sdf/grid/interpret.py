@@ -346,9 +346,9 @@ def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     steps = steps_of(spacing)
     slope = 1.0 if case.wanted.scale else _slope_at_surface(case.look, steps)
     if kind == "density" and is_cubic(spacing):
-        part, low, high = case.look.part, case.look.low, case.look.high
-        if beside_surface(part)[(part > low) & (part < high)].mean() > BESIDE:
-            case.facts = {"cut": [low, high]}
+        between = (case.look.part > case.look.low) & (case.look.part < case.look.high)
+        if (beside_surface(case.look.part) & between).sum() > BESIDE * between.sum():
+            case.facts = {"cut": [case.look.low, case.look.high]}
             case.scaled(slope)
             return _of_distances(case, spacing, "density")
     case.scaled(slope)

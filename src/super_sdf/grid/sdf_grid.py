@@ -264,7 +264,7 @@ def as_grid(grid: Any, **told: Any) -> SdfGrid:
         return make_grid(grid, **told)
     for name, value in told.items():
         if not (value is None or (isinstance(value, str) and value == "auto")):
-            raise OptionError(f"{name} is of arrays: leave it out, a grid or function has its own")
+            raise OptionError(f"{name} is for arrays: a grid or function has its own, leave it out")
     return grid
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 HOME = Path(__file__).parent
 SCRIPTS = ("three.min.js", "viewer.js", "page.js")
 GENERATOR = "super-sdf"
-EMPTY = {"lead": "", "alert": "", "summary": [], "notes": []}
+EMPTY = {"lead": "", "summary": [], "notes": []}
 MARKUP = {ord(c): f"\\u{ord(c):04x}" for c in "<>&"}  # of JSON in which a tag could be read
 
 

@@ -44,11 +44,9 @@ function sentences(className, label, texts) {
 
 function head() {
   document.title = facts.title;
-  const more = facts.alert ? [make("p", { className: "alert", role: "status" }, facts.alert)] : [];
   document.getElementById("head").append(
     make("h1", {}, facts.title),
     facts.lead ? make("p", { className: "lead" }, facts.lead) : "",
-    ...more,
     rows(facts.summary, "tiles"),
     ...sentences("note", "Note:", facts.notes),
     make("p", { className: "made" }, `super-sdf ${facts.version}, ${facts.made}`),

@@ -14,9 +14,9 @@ neighbours stay neighbours; a mesh is the wall round one label.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
-from itertools import product
+from itertools import chain, product
 from threading import Lock
 from typing import Any
 
@@ -33,9 +33,10 @@ ONE_AT_A_TIME = Lock()  # pyfqmr has one mesh, in global variables
 # of the sum of squares), step by step. Those of the first pass hardly ever leave a triangle beyond
 # the error, those of the second do at some places, and leave a fifth fewer triangles.
 PLANE_DISTANCES = (0.6,), (1.4, 1.4, 1.4), (1.7, 1.7)
-# Manifold collapses edges within these errors, of meshes with such a share of tiny edges, over the
-# mean: turned solids to .0008, others from .0064.
-WELDED, TINY, TINY_SHARE = 0.15, 0.003, 0.003
+# Manifold collapses edges within these errors, one tried after the other, of meshes with such a
+# share of tiny edges, over the mean: turned solids to .0008, others from .0064.
+WELDED = 0.15, 0.08, 0.25, 0.04
+TINY, TINY_SHARE = 0.003, 0.003
 ROUNDS, RISE = 15, 4.0  # of the threshold; fewer leave exact planes in pieces
 MOST_REPEATS, HALVINGS = 16, 3  # of passes, before smaller distances are tried
 # A number of triangles is sought by the error that leaves as many.
@@ -59,8 +60,8 @@ class Unsimplified:
 
 def within(of: Unsimplified, error: float) -> Walls | None:
     """Return walls within a distance of the originals; None if no triangle can be spared."""
-    starts = [*weld(of, WELDED * error), of.walls]
-    ways = product(starts, range(HALVINGS), (PLANE_DISTANCES, PLANE_DISTANCES[:1]))
+    alone = product([of.walls], range(HALVINGS), (PLANE_DISTANCES, PLANE_DISTANCES[:1]))
+    ways = chain(((start, 0, PLANE_DISTANCES) for start in welded(of, error)), alone)
     for start, halving, passes in ways:
         result = collapsed(of, start, passes, error / 2**halving, error)
         if result and len(result.faces) < len(of.walls.faces):
@@ -94,20 +95,19 @@ def down_to(of: Unsimplified, triangles: int) -> Walls:
     return min(reversed(found), key=lambda walls: max(len(walls.faces) - triangles, 0))
 
 
-def weld(of: Unsimplified, distance: float) -> list[Walls]:
-    """Return the closed mesh of one label without edges within a distance, if it has many tiny."""
+def welded(of: Unsimplified, error: float) -> Iterator[Walls]:
+    """Yield the closed mesh of one label without most of its tiny edges, if it has many."""
     from manifold3d import Error, Manifold, Mesh64
 
     one, walls = of.originals[0], of.walls
     tiny = length(np.subtract(*walls.vertices[one.edges])) < TINY * one.side
     if len(of.originals) > 1 or tiny.mean() < TINY_SHARE:
-        return []
+        return
     whole = Manifold(Mesh64(walls.vertices.astype(np.float64), walls.faces.astype(np.uint64)))
-    if whole.status() != Error.NoError:  # open, say
-        return []
-    welded = whole.simplify(distance).to_mesh64()
-    vertices = welded.vert_properties.astype(walls.vertices.dtype)
-    return [Walls.of(Mesh(vertices, welded.tri_verts.astype(np.int32)))]
+    for distance in WELDED if whole.status() == Error.NoError else ():  # else open, say
+        left = whole.simplify(distance * error).to_mesh64()
+        vertices = left.vert_properties.astype(walls.vertices.dtype)
+        yield Walls.of(Mesh(vertices, left.tri_verts.astype(np.int32)))
 
 
 def collapsed(
