@@ -175,9 +175,12 @@ class Solid:
         """
         import igl.predicates
 
-        faces = self.mesh.faces.astype(np.int64)
+        vertices, faces = self.mesh.vertices, self.mesh.faces.astype(np.int64)
         whole = np.flatnonzero((faces != np.roll(faces, 1, axis=1)).all(1))
-        return whole[igl.predicates.find_self_intersections(self.mesh.vertices, faces[whole])[1]]
+        # not too small for igl, which has absolute tolerances; powers of two round nothing
+        _, power = np.frexp(np.ptp(vertices, axis=0).max(initial=1e-300))
+        vertices = np.ldexp(vertices, 10 - power)
+        return whole[igl.predicates.find_self_intersections(vertices, faces[whole])[1]]
 
 
 def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, list[str]]:
