@@ -24,8 +24,8 @@ import pytetwild
 import pyvista
 
 solid = pytetwild.tetrahedralize_pv(pyvista.read("part.stl"), epsilon=5e-4)
-smallest = solid.cell_quality("min_angle")["min_angle"].min()
+least = solid.cell_quality("scaled_jacobian")["scaled_jacobian"].min()
 pyvista.save_meshio("part.msh", solid)
-print(f"fTetWild: {solid.n_cells:,} tetrahedra, smallest angle {smallest:.1f} degrees")
-assert smallest > 5
+print(f"fTetWild: {solid.n_cells:,} tetrahedra, least scaled Jacobian {least:.2f} (flat: 0, regular: 1)")
+assert least > 0.05
 END
