@@ -196,7 +196,7 @@ def pin_to_skipped(
 def take_lone_points_out(blocks: FloatArray, factor: int) -> None:
     """Put samples of 0 outside whose six nodes beside are outside, in ``blocks`` (Q, D).
 
-    On an edge of the solid, say: 0 counts as inside, so each would be a piece of no size.
+    0 counts as inside, so such a sample, as on an edge, would be a piece of no size.
     """
     middle = len(blocks) // 2
     around = np.flatnonzero(np.abs(block_ijk(factor) - factor // 2).sum(1) == 1)

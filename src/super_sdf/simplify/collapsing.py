@@ -97,12 +97,12 @@ def down_to(of: Unsimplified, triangles: int) -> Walls:
 
 def welded(of: Unsimplified, error: float) -> Iterator[Walls]:
     """Yield the closed mesh of one label without most of its tiny edges, if it has many."""
-    from manifold3d import Error, Manifold, Mesh64
-
     one, walls = of.originals[0], of.walls
     tiny = length(np.subtract(*walls.vertices[one.edges])) < TINY * one.side
     if len(of.originals) > 1 or tiny.mean() < TINY_SHARE:
         return
+    from manifold3d import Error, Manifold, Mesh64
+
     whole = Manifold(Mesh64(walls.vertices.astype(np.float64), walls.faces.astype(np.uint64)))
     for distance in WELDED if whole.status() == Error.NoError else ():  # else open, say
         left = whole.simplify(distance * error).to_mesh64()
