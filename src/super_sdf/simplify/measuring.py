@@ -19,7 +19,7 @@ from ..truth import Points, Solid
 
 Keys = NDArray[np.uint64]
 BETWEEN = 0.97  # of the error, which no measured point exceeds: others may be a little farther away
-NEAR = 0.6  # of the limit, from which on more is measured round a point on an edge:
+NEAR = 0.6  # of the limit, from which on more is measured round a point or an end of an edge:
 THIRDS = np.array([[-2], [-1], [1], [2]]) / 3  # of the way to the next point
 
 
@@ -90,7 +90,8 @@ class Original:
         some, low, high = some[bent], low[bent], high[bent]
         middles = (low + high) / 2
         off, nearest, _ = other.nearest(middles)
-        more = (off > NEAR * limit) & (off <= limit)
+        around = np.maximum(off, self.distance[self.edges[:, some]].max(0))
+        more = (around > NEAR * limit) & (off <= limit)
         points = middles[more] + THIRDS[..., None] * (middles[more] - low[more])  # (4, n, 3)
         beside_middle = other.distance(points.reshape(-1, 3)).reshape(len(THIRDS), -1)
         wrong = middles[off > limit], points[beside_middle > limit]
