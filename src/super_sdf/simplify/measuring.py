@@ -19,7 +19,7 @@ from ..truth import Points, Solid
 
 Keys = NDArray[np.uint64]
 BETWEEN = 0.97  # of the error, which no measured point exceeds: others may be a little farther away
-NEAR = 0.6  # of the limit, from which on more is measured round a point on an edge:
+NEAR = 0.6  # of the limit, from which on more is measured round a point or an end of an edge:
 THIRDS = np.array([[-2], [-1], [1], [2]]) / 3  # of the way to the next point
 
 
