@@ -48,7 +48,7 @@ def read_grid(
 ) -> SdfGrid:
     """Read a grid from a file of any format in docs/guides/formats.md.
 
-    An ``.npy`` file is mapped into memory, other files are loaded.
+    An ``.npy`` file is memory-mapped, other files are loaded.
 
     Parameters
     ----------
@@ -56,23 +56,23 @@ def read_grid(
         The file; ``FILE:NAME`` names one of several arrays in a file, and ``FILE:NAME[3]`` or
         ``FILE[3]`` the fourth of several times, channels or classes in an array.
     spacing, origin, direction : numbers, optional
-        Used instead of those in the file; see ``make_grid``. A direction goes with files that
-        state no axes.
+        Replace the values of the file; see ``make_grid``. ``direction`` is for files that state no
+        axes.
     axes : {"xyz", "zyx"}, optional
         The axis order of an array whose file does not state one. Default: x, y, z in ``.npy``,
         ``.npz`` and MATLAB, else z, y, x.
     space : {"RAS", "LPS"}, optional
-        The anatomical space of the grid's world; for files that state theirs. Default: that one.
+        Anatomical space of the grid, for files that state a space. Default: the file's space.
     inside, field, label, level, scale, unknown
-        What the values are; see ``make_grid``.
+        The kind of the values; see ``make_grid``.
     max_memory : int, optional
-        Bytes that this process may hold in all. Default: a share of the free memory.
+        Memory limit of this process in bytes. Default: a share of the free memory.
 
     Raises
     ------
     FileError, OutOfMemoryError, GridError, OptionError
-        If the file cannot be read, as its library is missing, say; if there is no room for it; if
-        its values are no usable grid; if an option is wrong, or the file states what is given.
+        If the file cannot be read, for example without its library; if the grid does not fit in
+        memory; if the values are no usable grid; if an option is wrong, or stated by the file.
     """
     values: Values = {"inside": inside, "field": field, "label": label, "level": level}
     values |= {"scale": scale, "unknown": unknown}
@@ -171,23 +171,23 @@ def grid_from_image(
     max_memory: int | None = None,
     **values: Unpack[Values],
 ) -> SdfGrid:
-    """Make a grid of VTK image data: the one that ``read_grid`` makes of it as a ``.vti`` file.
+    """Make a grid from VTK image data, equal to ``read_grid`` of the saved ``.vti`` file.
 
     Parameters
     ----------
     image : vtkImageData
-        Or a subclass, such as ``pyvista.ImageData``, with its spacing, origin, extent, direction.
+        Or a subclass, such as ``pyvista.ImageData``, with spacing, origin, extent and direction.
     scalars : str, optional
-        The name of an array of numbers at its points or, if no array there has that name, in its
-        cells; samples in cells are at their centres. Default: the active scalars of the points,
-        else of the cells, else the only array.
+        The name of a point array, or, if there is none, of a cell array, with samples at the
+        centres of the cells. Default: the active scalars of the points, else of the cells, else the
+        only array.
     max_memory, inside, field, label, level, scale, unknown
         As in ``read_grid``.
 
     Raises
     ------
     FileError, GridError, OptionError
-        If there is no such array, or no usable grid; if ``image`` is no image data.
+        If there is no such array, or no usable grid; if ``image`` is not image data.
     """
     Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image
