@@ -147,7 +147,7 @@ def test_another_unit_than_that_of_the_spacing_is_an_error(unit):
     assert scale * unit == pytest.approx(1, rel=0.005)
     told = make_grid(values, **PLACE, scale=scale)
     assert told.notes == () and np.allclose(told.values, box(), rtol=5e-3)
-    shown = float(re.search(r"they show (\S+)\)", said).group(1))
+    shown = float(re.search(r"the values show (\S+)\)", said).group(1))
     assert shown == pytest.approx(unit, rel=0.005)
     if unit < 0.1:
         return
@@ -198,7 +198,7 @@ LABELS = {
 @pytest.mark.parametrize("name", LABELS)
 def test_labels_without_a_choice_are_refused(name, spacing):
     said = refusal(GridError, make_grid, LABELS[name], spacing=spacing, origin=0)
-    assert said.startswith("no solid is chosen: they look like labels (0, ")
+    assert said.startswith("the values look like labels (0, ")
     assert re.search(
         r"choose one with label=\d+, or mesh all with reconstruct_labels\(values\)$", said
     )
@@ -209,7 +209,7 @@ def test_whole_numbers_in_another_unit_are_scaled(times, values):
     """They are neither labels, of which 4 of 6 neighbours are equal, too, nor densities."""
     stored = np.rint(times * values).astype(np.int16)
     said = refusal(GridError, make_grid, stored, **PLACE)
-    assert said.startswith("they are distances in another unit than the spacing: ")
+    assert said.startswith("the distances have another unit than the spacing: ")
     scale = float(re.search(r"scale=([.\d]+)", said)[1])
     assert scale == pytest.approx(1 / times, rel=0.1)
     found, exact = make_grid(stored, **PLACE, scale=scale), make_grid(values, **PLACE)
@@ -379,7 +379,7 @@ def test_probabilities_in_whole_numbers_are_densities(most, width):
     values = np.rint(most / (1 + np.exp(box() / width))).astype(np.uint8)
     said = refusal(GridError, make_grid, values, **PLACE)
     level = float(re.search(r"level=(\S+),", said).group(1))
-    assert "they look like densities" in said and 0.3 * most < level < 0.7 * most
+    assert "the values look like densities" in said and 0.3 * most < level < 0.7 * most
 
 
 def test_the_level_is_between_the_plateaus_of_an_image_with_noise():
