@@ -122,7 +122,6 @@ WRONG = {
     "in.raw": f"in.raw is not a grid file: give one of {', '.join(GRID_SUFFIXES)}",
     "in.npy --label 1.5": "--label is '1.5': give a whole number, -2^63 to 2^64 - 1",
     "in.npy --label 1 --field noisy": "--label 1 and --field noisy: the samples of a label are a",
-    "in.npy --field wrong": "--field is 'wrong': give one of auto, distance, noisy, mask, smooth",
     "in.npy --scale 0": "--scale is '0': give a number greater than 0",
     "in.npy --simplify -1": "--simplify is '-1': give a number greater than 0",
     "in.npy --mesher dual": "--mesher is 'dual': give one of auto, marching, sharp",

@@ -333,10 +333,9 @@ def mesh_grid(
         # popped, so that nothing here keeps the band in memory
         parts = [make_tile(task, decoder, bands.pop(), steps, save_field)]
     elif save_field:
-        raise OutOfMemoryError(
-            f"the refined field does not fit in the {in_words(room.bound)} that may be used: use a "
-            "smaller factor, allow more (--max-memory), or leave --save-field out"
-        )
+        said = f"the refined field does not fit in the {in_words(room.bound)} that may be used"
+        way_out = "use a smaller factor, allow more (--max-memory), or leave --save-field out"
+        raise OutOfMemoryError(f"{said}: {way_out}")
     else:
         margin = margin_of(lattice, decoder.receptive_field, chosen.mesher, factor)
         tiles, parts = plan(shape, whole, margin, room, least_tiles), list[Part]()

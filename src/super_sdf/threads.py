@@ -110,9 +110,8 @@ def check_fits(need: int, what: str, way_out: str, most: int | None = None) -> N
     free = free_memory() if most is None else max(most - held_memory(), 0)
     if need > free:
         allow = "" if most is None else f" of the {in_words(most)} that may be taken in all"
-        raise OutOfMemoryError(
-            f"{what} needs {in_words(need)} of memory, {in_words(free)}{allow} are free; {way_out}"
-        )
+        left = f"{in_words(free)}{allow} are free"
+        raise OutOfMemoryError(f"{what} needs {in_words(need)} of memory, {left}; {way_out}")
 
 
 def in_words(size: float) -> str:

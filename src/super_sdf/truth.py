@@ -193,10 +193,8 @@ def load_solid(path: str | Path, *, allow_open: bool = False) -> tuple[Solid, li
     solid, notes = Solid(read_mesh(path)), []
     mesh, open_edges, volume = solid.mesh, solid.unbalanced_edges, solid.mesh.volume()
     if open_edges and not allow_open:
-        raise MeshError(
-            f"{path} is open: {open_edges:,} edges have no partner, so it has no inside; "
-            "close it, or use --allow-open to guess its inside"
-        )
+        said = f"{path} is open: {open_edges:,} edges have no partner, so it has no inside"
+        raise MeshError(f"{said}; close it, or use --allow-open to guess its inside")
     if not np.ptp(mesh.vertices, axis=0).all() or volume == 0:
         raise MeshError(f"{path} is flat: it encloses no volume")
     if open_edges:

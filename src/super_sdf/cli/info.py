@@ -36,20 +36,16 @@ TAKES = (
 
 
 def command(source: str | None, check: bool, device: Device, as_json: bool) -> None:
-    """Print findings as they come; the exit code is 1 if something failed."""
+    """Print findings; the exit code is 1 if something failed."""
     OPTIONS["device"].check(device)
     if source is not None:
         facts = describe_grid_file(source)
         main.print_stdout(*([facts] if as_json else in_words(facts)))
         return
-    findings = []
-    for state, what, says in run_checks(device, check):
-        findings.append({"state": state, "what": what, "says": says})
-        if not as_json:
-            main.print_stdout(f"{state:<8} {what}: {says}")
-    works = all(finding["state"] != FAILED for finding in findings)
-    if as_json:
-        main.print_stdout({"works": works, "findings": findings})
+    found = [dict(zip(("state", "what", "says"), each)) for each in run_checks(device, check)]
+    works = all(each["state"] != FAILED for each in found)
+    rows = ("{state:<8} {what}: {says}".format(**each) for each in found)
+    main.print_stdout(*([{"works": works, "findings": found}] if as_json else rows))
     if not works:
         sys.exit(1)
 

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from string import Template
+from threading import Timer
 from types import FrameType
 from typing import Any
 
@@ -189,15 +190,12 @@ def print_stdout(*lines: str | dict[str, Any], err: bool = False) -> None:
         click.echo(json.dumps(line, indent=2) if isinstance(line, dict) else "".join(text), err=err)
 
 
-def main() -> None:
-    """Run the command line and exit with its exit code, 128 + n after signal n.
+def hear_signals() -> list[int]:
+    """Have a signal raise KeyboardInterrupt, so that files that were begun are removed; list it.
 
-    A signal raises KeyboardInterrupt, so that files that were begun are removed; one that the
-    parent process ignores, as ``nohup`` does, stays ignored. Every error is one line on stderr.
+    A signal that the parent process ignores, as ``nohup`` does, stays ignored. If a callback is
+    interrupted, such as that of a lock, Python drops the exception: the signal is sent again.
     """
-    while (number := os.open(os.devnull, os.O_RDWR)) < 3:
-        pass  # a standard stream was closed, and the next file would get its text
-    os.close(number)
     # not KeyboardInterrupt itself: after one within exec() Python ends itself by SIGINT
     heard, ended = list[int](), type("Ended", (KeyboardInterrupt,), {})
 
@@ -205,9 +203,28 @@ def main() -> None:
         heard.append(number)
         raise ended
 
+    def hear_again(dropped: Any) -> None:
+        if dropped.exc_type is ended:
+            Timer(0.01, os.kill, (os.getpid(), heard[0])).start()  # once the callback has ended
+        else:
+            sys.__unraisablehook__(dropped)
+
+    sys.unraisablehook = hear_again
     for number in SIGNALS:
         if signal.getsignal(number) not in (signal.SIG_IGN, None):
             signal.signal(number, hear)
+    return heard
+
+
+def main() -> None:
+    """Run the command line and exit with its exit code, 128 + n after signal n.
+
+    Every error is one line on stderr.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) < 3:
+        pass  # a standard stream was closed, and the next file would get its text
+    os.close(number)
+    heard = hear_signals()
     try:
         code = cli.main(standalone_mode=False)  # a number if a command ended early
     except (Exception, KeyboardInterrupt) as error:

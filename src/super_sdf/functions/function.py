@@ -132,10 +132,9 @@ class DistanceFunction:
         least, most = known.min() * scale, known.max() * scale
         if not least < 0 < most:
             goes = f"goes from {least:.6g} to {most:.6g}" if least < most else f"is {least:.6g}"
-            raise GridError(
-                f"the function {goes} at all {len(known):,} samples, and its surface is where it "
-                "is 0: subtract a level, or give a finer spacing or other bounds"
-            )
+            where = f"at all {len(known):,} samples, and its surface is where it is 0"
+            way_out = "subtract a level, or give a finer spacing or other bounds"
+            raise GridError(f"the function {goes} {where}: {way_out}")
         np.clip(samples, -cut, cut, out=samples)
         try:
             return make_grid(samples, spacing=spacing, origin=low)

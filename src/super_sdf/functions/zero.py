@@ -94,10 +94,9 @@ def unit_of(function: DistanceFunction, grid: SdfGrid) -> float:
     ratio = float(np.median(ratios)) if len(ratios) else 1.0
     other = np.count_nonzero(ratios * np.sign(ratio) < 0) / max(len(ratios), 1)
     if other > MOST_OTHER or ratio == 0:
-        raise OptionError(
-            f"function has another side than the grid at {other:.0%} of the samples near the "
-            "surface: give the function that the grid has samples of"
-        )
+        where = f"at {other:.0%} of the samples near the surface"
+        way_out = "give the function that the grid has samples of"
+        raise OptionError(f"function has another side than the grid {where}: {way_out}")
     return ratio
 
 

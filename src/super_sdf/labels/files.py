@@ -114,10 +114,9 @@ def check_options(options: Options, more: Sequence[str] = ()) -> None:
     usual = {name: (OPTIONS[name].default, "marching") for name in OPTIONS if name not in LABELS}
     given = [name for name, values in usual.items() if getattr(options, name) not in values]
     for name in (*given, *more):
-        raise OptionError(
-            f"{flag('open' if name == 'cap' else name)} does not go with labels, which share their "
-            "walls: leave it out, or mesh one label (--label)"
-        )
+        option = flag("open" if name == "cap" else name)
+        said = f"{option} does not go with labels, which share their walls"
+        raise OptionError(f"{said}: leave it out, or mesh one label (--label)")
 
 
 def with_numbers(options: Options, names: Names | None) -> Options:

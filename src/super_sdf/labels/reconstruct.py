@@ -149,10 +149,8 @@ def find_labels(
         values, times = np.unique(plane, return_counts=True)
         odd = values[~np.isfinite(values) | (np.rint(values) != values)]
         if len(odd):
-            raise GridError(
-                f"a value is {odd[0]:g}: labels are whole numbers; choose what is above a value "
-                "with --level if they are densities"
-            )
+            way_out = "choose what is above a value with --level if they are densities"
+            raise GridError(f"a value is {odd[0]:g}: labels are whole numbers; {way_out}")
         counts.update(dict(zip(values.tolist(), times.tolist())))
         if wanted is None and len(counts) > MOST_LABELS + 1:
             raise GridError(

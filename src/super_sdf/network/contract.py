@@ -119,7 +119,5 @@ def decode(
         return bool(some.min() >= -MAX_VALUE and some.max() <= MAX_VALUE)  # False for NaN
 
     if not all(map_chunks(transpose_and_check, count, 4 * width, threads)):
-        raise ModelError(
-            "the network gave values that are NaN, infinite or beyond 1e15: it cannot be used for "
-            "this grid; use another --model"
-        )
+        said = "the network gave values that are NaN, infinite or beyond 1e15"
+        raise ModelError(f"{said}: it cannot be used for this grid; use another --model")
