@@ -90,8 +90,7 @@ class Original:
         some, low, high = some[bent], low[bent], high[bent]
         middles = (low + high) / 2
         off, nearest, _ = other.nearest(middles)
-        around = np.maximum(off, self.distance[self.edges[:, some]].max(0))
-        more = (around > NEAR * limit) & (off <= limit)
+        more = np.maximum(off, self.distance[self.edges[:, some]].max(0)) > NEAR * limit
         points = middles[more] + THIRDS[..., None] * (middles[more] - low[more])  # (4, n, 3)
         beside_middle = other.distance(points.reshape(-1, 3)).reshape(len(THIRDS), -1)
         wrong = middles[off > limit], points[beside_middle > limit]
