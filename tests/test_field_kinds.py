@@ -12,7 +12,7 @@ from scipy import ndimage
 from solids import box_distance
 
 from super_sdf import make_grid, reconstruct
-from super_sdf.errors import GridError, OptionError
+from super_sdf.errors import GridError
 from super_sdf.grid import look, samples
 from super_sdf.grid.sdf_grid import crop
 from super_sdf.options import OPTIONS
@@ -342,20 +342,6 @@ def test_shares_of_voxels_are_no_steps():
     values = share[:, None, None] * share[:, None] * share
     mesh = reconstruct(make_grid(values, **PLACE, level=0.5), trilinear)
     assert np.ptp(mesh.vertices, axis=0) == pytest.approx(9.2, abs=0.1)
-
-
-BAD = {
-    "inside is 'out': give one of auto, negative, positive": {"inside": "out"},
-    "field is 'wrong': give one of auto, distance, noisy, mask, smooth": {"field": "wrong"},
-    f"label is {2**64}: give a whole number, -2^63 to 2^64 - 1": {"label": 2**64},
-    "level is nan: give a finite number": {"level": float("nan")},
-    "label=1 and field='noisy': the samples of a label are a mask": {"label": 1, "field": "noisy"},
-}
-
-
-@pytest.mark.parametrize("message", BAD)
-def test_wrong_options_are_refused(message):
-    assert refusal(OptionError, make_grid, torus(), **PLACE, **BAD[message]) == message
 
 
 def test_a_mask_shows_no_spacing():

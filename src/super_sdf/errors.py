@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 
 FLAG = re.compile(r"(?<!install )--([a-z-]+)(?: ('[^']*'|[\w.,+-]*\w))?( (?=--))?")
@@ -26,6 +26,8 @@ class SuperSdfError(Exception):
     ``str`` of an error names options as keywords, ``max_memory=4G``; ``flagged``, for the command
     line, as flags, ``--max-memory 4G``.
     """
+
+    names: Sequence[str] = ()  # of the arrays in a file, where one has to be chosen
 
     @property
     def flagged(self) -> str:

@@ -130,16 +130,16 @@ def open_volume(
         what = f"--axes {axes}" if axes else "--direction is given"
         raise OptionError(f"{what}, but {format_.name} files state their axes: leave it out")
     order = axes or format_.axes or "xyz"
-    logs = logging.root.manager.disable
     try:
         with warnings.catch_warnings(), ExitStack() as files:
             warnings.simplefilter("ignore")
+            files.callback(logging.disable, logging.root.manager.disable)
             logging.disable(logging.CRITICAL)  # what matters is raised
             readers = import_module(f".readers.{format_.module}", __package__)
             request = Request(file, member or None, numbers, order, files, max_memory)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
-        if str(file) in error.flagged:
+        if error.flagged.startswith(str(file)):
             raise
         raise type(error)(f"{path}: {error.flagged}") from None
     except MemoryError:
@@ -150,8 +150,6 @@ def open_volume(
         if re.match("mmap length|EOF: reading (magic|array header)", reason):  # NumPy's words
             reason = f"it is cut off: it has only {file.stat().st_size:,} bytes"
         raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
-    finally:
-        logging.disable(logs)
 
 
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
@@ -199,22 +197,30 @@ def grid_from_image(
     return make_grid(**_taken(volume, request, {}), **values)
 
 
-def describe_grid_file(path: str | Path) -> dict[str, Any]:
+def describe_grid_file(path: str | Path, *, is_each: bool = False) -> dict[str, Any]:
     """Return format, shape (x, y, z), type and place of the array in a grid file.
 
-    No sample is read where the format allows it. What the file does not state is None or missing.
+    Of several arrays, ``grids`` are these facts of each, or an ``error`` (so with ``is_each``). No
+    sample is read where the format allows it. What the file does not state is None or missing.
     Raises as ``read_grid``.
     """
-    path = Path(PATH.check(path, "path"))
-    with open_volume(path) as (volume, _):
-        order, _, place = find_placement(volume, {})
+    about = {"file": str(PATH.check(path, "path")), "format": find_format(path).name}
+    try:
+        with open_volume(Path(path)) as (volume, _):
+            order, _, place = find_placement(volume, {})
+    except SuperSdfError as error:
+        if not (is_each or error.names):
+            raise
+        if is_each:
+            return about | {"error": error.flagged}
+        paths = [f"{split_member(path)[0]}:{name}" for name in error.names]
+        return about | {"grids": [describe_grid_file(each, is_each=True) for each in paths]}
     shape = [volume.shape[axis] for axis in order]
     facts = {k: None if at is None else np.ravel(at).tolist() for k, at in place.items()}
     if facts["direction"] in (None, np.eye(3).ravel().tolist()):
         del facts["direction"]
     return {
-        "file": str(path),
-        "format": find_format(path).name,
+        **about,
         "shape": shape,
         "dtype": str(volume.dtype),
         "bytes": prod(shape) * volume.dtype.itemsize,
