@@ -324,12 +324,12 @@ def test_densities_have_the_surface_of_their_spline():
 
 
 @pytest.mark.parametrize("padding", [-10.0, -1e6])
-@pytest.mark.parametrize("told", [{"level": 0.5}, {"field": "smooth"}], ids=["level", "smooth"])
+@pytest.mark.parametrize("told", [{"level": 0.5, "scale": 2}, {"field": "smooth"}], ids=str)
 def test_padding_far_from_all_values_moves_no_surface(padding, told):
     """As round the occupancies of networks: the spline would swing beside it."""
     occupancy = 1 / (1 + np.exp(2 * torus(32))) - (0 if "level" in told else 0.5)
     grid = make_grid(np.pad(occupancy, 2, constant_values=padding), **PLACE, **told)
-    assert "values far from all others are taken as padding" in grid.notes
+    assert f"values of {padding:.6g}, far from all others, taken as padding" in grid.notes
     wanted = make_grid(np.pad(occupancy, 2, "edge"), **PLACE, **told)
     inner = (slice(2, -2),) * 3
     np.testing.assert_allclose(grid.values[inner], wanted.values[inner], rtol=1e-6)

@@ -156,7 +156,8 @@ class Case:
             if low < 0 < high and max(low - end, end - high) > high - low:
                 self.samples = changed(self.samples, partial(np.clip, a_min=low, a_max=high))
                 self.look = look_at(self.samples)
-                self.notes.append("values far from all others are taken as padding")
+                seen = end / (self.wanted.scale or 1) + (self.wanted.level or 0)  # in the array
+                self.notes.append(f"values of {seen:.6g}, far from all others, taken as padding")
 
     def fill_in(self, values: Sequence[float] = ()) -> None:
         """Fill in unknown samples, for which some values stand, too, if there are some."""
