@@ -1,4 +1,4 @@
-"""From an array to a mesh in a line, with the array of a real part.
+"""From an array to a mesh in one line: the distances of a real part.
 
 python examples/array_to_mesh.py [OUT.ply]
 """

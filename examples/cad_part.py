@@ -1,8 +1,8 @@
-"""A part for CAD and printing: within a hundredth of a millimetre, few triangles, in millimetres.
+"""A part for CAD and printing: in millimetres, simplified within 0.01 mm.
 
     python examples/cad_part.py [OUT.3mf]
 
-The grid is made up: a plate of 40 x 25 x 8 mm with two holes, turned, sampled every millimetre.
+The grid is synthetic: a rotated plate of 40 x 25 x 8 mm with two holes, with a spacing of 1 mm.
 """
 
 from argparse import ArgumentParser, RawDescriptionHelpFormatter

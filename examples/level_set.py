@@ -1,4 +1,4 @@
-"""Densities to a level set of OpenVDB and a mesh: for Houdini, Blender and other tools of volumes.
+"""Densities to a level set of OpenVDB and a mesh: for Houdini, Blender and other programs.
 
     python examples/level_set.py [OUT.vdb [OUT.glb]]
 

@@ -1,8 +1,8 @@
-"""Library use: one network for many grids, the steps by name, progress, and errors.
+"""One network for many grids, each step of ``reconstruct``, progress, and errors.
 
     python examples/many_grids.py [FOLDER]
 
-Writes the part and its surface moved outwards by 1, 2 and 3 mm, at factor 2.
+Writes the part and its offset surfaces at 1, 2 and 3 mm, at factor 2.
 """
 
 import sys

@@ -2,7 +2,7 @@
 
     python examples/organs.py [OUT.glb]
 
-The segmentation is made up: two balls that touch, and a tube through one of them, in a NIfTI file
+The segmentation is synthetic: two balls that touch, and a tube through one ball, in a NIfTI file
 with thick slices. Neighbours share their walls, vertex for vertex.
 """
 

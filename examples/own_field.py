@@ -2,7 +2,7 @@
 
     python examples/own_field.py [OUT.stl]
 
-A bowl: the upper half cut off a sphere, hollowed by an offset of the field.
+A bowl: a hollow sphere, by an offset of the field, without its upper part.
 """
 
 from argparse import ArgumentParser, RawDescriptionHelpFormatter

@@ -104,7 +104,7 @@ def test_segments_are_placed_by_height_and_frames_left_out_are_empty():
     assert said == "in has no series of DICOM images 'no': it holds 1.2.3, gap, other"
     with open_volume(Path("in")) as (volume, _):
         assert volume.hint == "labels"
-    assert "they look like labels (0, 1, 2)" in refusal(GridError, read_grid, "in")
+    assert "the values look like labels (0, 1, 2)" in refusal(GridError, read_grid, "in")
 
 
 def test_a_segment_alone_is_a_mask_as_are_fractions_over_a_half():

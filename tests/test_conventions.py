@@ -32,10 +32,10 @@ FAR = np.abs(torus(8))
 AXES = "give three axes (x, y, z), with at least 2 samples on each"
 REFUSED = {
     "every value is 3: a constant field has no surface": np.full((4, 4, 4), 3.0),
-    "no value is below 0 (the smallest is 0.5): they look like densities: give the level of their "
-    "surface, such as level=0.8, inside='positive'": FAR + 0.5 - FAR.min(),
-    "no value is above 0 (the largest is -1): they look like densities: give the level of their "
-    "surface, such as level=-3.5, inside='positive'": (-1 - np.indices((3, 3, 3)).sum(0)),
+    "no value is below 0 (the smallest is 0.5): the values look like densities: give the "
+    "surface's level, such as level=0.8, inside='positive'": FAR + 0.5 - FAR.min(),
+    "no value is above 0 (the largest is -1): the values look like densities: give the "
+    "surface's level, such as level=-3.5, inside='positive'": (-1 - np.indices((3, 3, 3)).sum(0)),
     "every value is False: a constant field has no surface": np.zeros((5, 5, 5), bool),
     "no value is finite: there is no surface": np.full((3, 3, 3), np.nan),
     f"values have shape (4, 4): {AXES}": np.zeros((4, 4)),
@@ -43,8 +43,8 @@ REFUSED = {
     f"values have shape (nan, 4, 4): {AXES}": SimpleNamespace(
         shape=(np.nan, 4, 4), dtype=np.dtype(float), chunks=((np.nan,), (4,), (4,))
     ),
-    "the largest value is 1e+200: if it stands for unknown ones, unknown=9.9999999999999997e+199, "
-    "else multiply them, scale=": np.where(FAR > 0.1, 1e200, -1.0),
+    "the largest value is 1e+200: if it marks unknown samples, unknown=9.9999999999999997e+199, "
+    "else scale the values, scale=": np.where(FAR > 0.1, 1e200, -1.0),
 }
 
 
@@ -133,7 +133,7 @@ NO_SURFACE = {
     "steps": np.maximum(R - 9, 0) + 0.5,
     "slow": 0.1 * R + 0.05,
 }
-DENSITY = "they look like densities: give the level of their surface, such as level="
+DENSITY = "the values look like densities: give the surface's level, such as level="
 FIELDS = {f"unsigned {name}": values for name, values in UNSIGNED.items()} | NO_SURFACE
 
 

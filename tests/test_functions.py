@@ -281,7 +281,7 @@ def test_what_is_not_taken_is_said(wrong, said):
 ROOT = Path(__file__).parent.parent
 SIZES = 20, 22, 24
 RADIUS = 4.2
-UNIT = "they are distances in another unit than the spacing: multiply the values, scale=0.4 (or "
+UNIT = "the distances have another unit than the spacing: multiply the values, scale=0.4 (or "
 ABOUT_Z = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
 DIRECTIONS = {
     "straight": np.eye(3),

@@ -65,6 +65,7 @@ REFUSED = [  # report, values, spacing, words of the advice
     ("sxyu/svox2 11: raw density", 30 * SOFT - 0.5, None, "level="),
     ("CT of 16 bits", CT, 1, "level="),
     ("resampled labels", 0.9999999998 * MASK + 2 * (ball(5, -10) < 0), None, "label=1"),
+    ("labels, few of them 0", np.where(box(18, 18, 18) < 0, 7 - 4 * MASK, 0), None, "label=7"),
     ("unsigned distances", np.abs(ball(13)), 1, "offset=1"),
     ("another unit", 0.87 * ball(13), 1, "scale=1.149"),
 ]

@@ -321,6 +321,13 @@ def test_info_of_a_file(command):
     found = json.loads(command("info", "i.zarr", "--json")[1])
     assert found["spacing"] == [1, 1, 1] and found["origin"] == [1, 2, 3]
     assert found["notes"] == ["lengths are in the unit that it states, micrometer"]
+    for name, shape in {"a/t": (3, *SHAPE), "a/v": SHAPE, "b": SHAPE}.items():
+        store("g.zarr", np.zeros(shape), name=name)
+    times, last = json.loads(command("info", "g.zarr:a", "--json")[1])["grids"]
+    assert (last["file"], last["shape"]) == ("g.zarr:/a/v", [22, 26, 30])
+    said = "g.zarr:/a/t: its axis 0 has 3 entries, from 0 on: choose one, g.zarr:/a/t[0], say"
+    assert times == {"file": "g.zarr:/a/t", "format": "Zarr", "error": said}
+    assert said in command("info", "g.zarr")[1].splitlines()
 
 
 # Stores from elsewhere

@@ -169,5 +169,8 @@ def test_one_of_several_grids_is_named(command):
     path = DATA / "three-grids.vdb"
     said = refusal(FileError, read_grid, path)
     assert said.endswith(f"holds several arrays, density, surface: give {path}:density, say")
-    code, out, _ = command("info", f"{path}:surface")
-    assert code == 0 and "shape: 15, 15, 15" in out
+    code, out, _ = command("info", path)
+    same = "dtype: float32; spacing: 1, 1, 1; origin"
+    first = f"{path}:density: shape: 8, 8, 8; {same}: -1, -1, -1"
+    assert out.splitlines()[2:] == [first, f"{path}:surface: shape: 15, 15, 15; {same}: -4, -4, -4"]
+    assert code == 0

@@ -2,8 +2,8 @@
 
     pip install torch && python examples/tools/neural_field.py [OUT.ply]
 
-A small network learns the distances of a ring for half a minute. ``reconstruct`` then asks it at
-coarse samples and at the vertices, instead of at every node of a fine lattice.
+A small network learns the distances of a ring for half a minute. ``reconstruct`` then evaluates the
+network at coarse samples and at vertices, instead of at every node of a fine lattice.
 """
 
 from argparse import ArgumentParser, RawDescriptionHelpFormatter

@@ -45,18 +45,18 @@ class ImportGrid(bpy.types.Operator, ImportHelper):
         default="*.npy;*.npz;*.vdb;*.nii;*.nii.gz;*.nrrd;*.mha;*.mhd;*.vti;*.tif;*.h5;*.mrc;*.sdf",
         options={"HIDDEN"},
     )
-    member: StringProperty(name="Grid", description="Its name, if the file has several")
-    factor: EnumProperty(name="Factor", items=FACTORS, description="Times finer than the grid")
-    field: EnumProperty(name="Values", items=FIELDS, description="What the values are")
-    level: FloatProperty(name="Level", description="The density at the surface", precision=4)
+    member: StringProperty(name="Grid", description="Name of the grid, if there are several")
+    factor: EnumProperty(name="Factor", items=FACTORS, description="Fine voxels per voxel")
+    field: EnumProperty(name="Values", items=FIELDS, description="Kind of the values")
+    level: FloatProperty(name="Level", description="Density at the surface", precision=4)
     simplify: FloatProperty(
         name="Simplify",
-        description="Spare triangles within this many voxels (0.02); 0 keeps all",
+        description="Largest error of simplifying, in voxels (0.02); 0 keeps all",
         min=0,
         precision=3,
     )
     scale: FloatProperty(
-        name="Scale", description="Of the object: 0.001 if the grid is in mm", default=1, min=1e-9
+        name="Scale", description="Scale of the object: 0.001 for mm", default=1, min=1e-9
     )
     shading: EnumProperty(name="Shading", items=SHADINGS)
 

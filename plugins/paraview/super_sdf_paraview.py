@@ -33,7 +33,7 @@ PROPERTIES = """
     <Entry value="8" text="8"/>
     <Entry value="16" text="16"/>
   </EnumerationDomain>
-  <Documentation>Times finer than the image; automatic is 2 for masks, else 4.</Documentation>
+  <Documentation>Fine voxels per voxel; automatic is 2 for masks, else 4.</Documentation>
 </IntVectorProperty>
 <StringVectorProperty name="Field" command="SetField" number_of_elements="1" default_values="auto">
   <StringListDomain name="list">
@@ -44,10 +44,10 @@ PROPERTIES = """
     <String value="smooth"/>
     <String value="density"/>
   </StringListDomain>
-  <Documentation>What the values are: auto goes by the samples, density has a level.</Documentation>
+  <Documentation>Kind of the values: auto recognises it, density needs a level.</Documentation>
 </StringVectorProperty>
 <DoubleVectorProperty name="Level" command="SetLevel" number_of_elements="1" default_values="0">
-  <Documentation>The density at the surface; what is above is inside.</Documentation>
+  <Documentation>Density at the surface; larger values are inside.</Documentation>
   <Hints>
     <PropertyWidgetDecorator type="GenericDecorator" mode="visibility" property="Field"
         value="density"/>
@@ -56,7 +56,7 @@ PROPERTIES = """
 <DoubleVectorProperty name="Simplify" command="SetSimplify" number_of_elements="1"
     default_values="0">
   <DoubleRangeDomain name="range" min="0"/>
-  <Documentation>Spare triangles within this many voxels (0.02); 0 keeps all.</Documentation>
+  <Documentation>Largest error of simplifying, in voxels (0.02); 0 keeps all.</Documentation>
 </DoubleVectorProperty>"""
 
 

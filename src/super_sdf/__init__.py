@@ -3,7 +3,7 @@
 >>> from super_sdf import reconstruct
 >>> mesh = reconstruct(values, spacing=0.1)                       # doctest: +SKIP
 
-Names are imported on first use, so that a conversion does not load what it does without.
+Names are imported on first use, so that a conversion loads only the modules that it needs.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ if TYPE_CHECKING:
 PUBLIC = {
     "reconstruct": ("pipeline", "an array, a grid or a function in, a fine mesh out"),
     "reconstruct_labels": ("labels.reconstruct", "a label image in, a mesh of each label out"),
-    "marching_cubes": ("functions.scikit_image", "in place of that of scikit-image"),
-    "make_grid": ("grid.sdf_grid", "an array as a grid; what is not given is inferred"),
+    "marching_cubes": ("functions.scikit_image", "the refined surface, called as scikit-image's"),
+    "make_grid": ("grid.sdf_grid", "a grid from an array; spacing, sign and kind are inferred"),
     "read_grid": ("files.grids", "a grid from a file of any format"),
-    "grid_from_image": ("files.grids", "a grid of VTK image data, such as PyVista's"),
-    "SdfGrid": ("grid.sdf_grid", "samples and where they lie"),
-    "DistanceFunction": ("functions.function", "a function or a module of PyTorch, to sample"),
-    "load_network": ("network.network", "a network, to load it once for many grids"),
+    "grid_from_image": ("files.grids", "a grid from VTK image data, such as PyVista's"),
+    "SdfGrid": ("grid.sdf_grid", "samples with spacing, origin and direction"),
+    "DistanceFunction": ("functions.function", "a function or PyTorch module of points, to sample"),
+    "load_network": ("network.network", "a network from its file, once for many grids"),
     "upsample": ("pipeline", "a grid in, the fine field near its surface out"),
     "extract_mesh": ("pipeline", "a fine field in, its mesh out"),
     "FineField": ("refine.field", "refined values near a surface"),
-    "fine_grid": ("refine.field", "the fine lattice of a field as a grid, to refine again"),
+    "fine_grid": ("refine.field", "a grid of the fine lattice of a field, to refine again"),
     "read_field": ("files.fields", "a fine field from a file"),
     "write_field": ("files.fields", "a fine field to a file"),
-    "Mesh": ("surface.mesh", "vertices, faces, and what was noted of them"),
+    "Mesh": ("surface.mesh", "vertices, faces, notes and warnings"),
     "write_mesh": ("files.meshes", "a mesh to a file: .ply, .stl, .obj, .off, .glb, .3mf"),
     "simplify_mesh": ("simplify.simplify", "a mesh of fewer triangles within a measured distance"),
-    "evaluate": ("evaluation", "Chamfer distance, F1, normals, edges of meshes beside references"),
+    "evaluate": ("evaluation", "Chamfer distance, F1, normals, edges of meshes and references"),
     "SuperSdfError": ("errors", "every error of this package"),
     "SuperSdfWarning": ("errors", "every warning of this package"),
 }

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 
 FLAG = re.compile(r"(?<!install )--([a-z-]+)(?: ('[^']*'|[\w.,+-]*\w))?( (?=--))?")
@@ -23,9 +23,11 @@ SWITCHES |= {"labels all": "reconstruct_labels(values)"}
 class SuperSdfError(Exception):
     """Base class of all errors of this package.
 
-    A message names options as flags, ``--max-memory 4G``: ``flagged``, for the command line. In
-    Python, ``str`` of an error names keywords: ``max_memory=4G``.
+    ``str`` of an error names options as keywords, ``max_memory=4G``; ``flagged``, for the command
+    line, as flags, ``--max-memory 4G``.
     """
+
+    names: Sequence[str] = ()  # of the arrays in a file, where one has to be chosen
 
     @property
     def flagged(self) -> str:
@@ -37,7 +39,7 @@ class SuperSdfError(Exception):
 
 
 class SuperSdfWarning(UserWarning):
-    """What may be wrong with a mesh; it is also in the ``warnings`` of the mesh."""
+    """What may be wrong with a mesh; ``Mesh.warnings`` has the same sentences."""
 
 
 def flag(name: str) -> str:
@@ -93,7 +95,7 @@ class NoSurfaceError(GridError):
 
 
 class MeshError(SuperSdfError, ValueError):
-    """A reference mesh does not bound a solid, or a mesh or the tiles of one are torn."""
+    """A mesh does not bound a solid, has invalid arrays, or has holes between its tiles."""
 
 
 class OptionError(SuperSdfError, ValueError):

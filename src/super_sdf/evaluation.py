@@ -47,25 +47,25 @@ def evaluate(
     *,
     spacing: ArrayLike | None = None,
 ) -> dict[str, Distances]:
-    """Measure meshes beside their references, which lie in the same world coordinates.
+    """Measure meshes against their references, in the same world coordinates.
 
-    Lengths are in units of the diagonal of the reference's bounding box. P are 1e5 points drawn
-    from the reference, uniformly by area, Q those from the mesh. So even a mesh beside itself has
-    an F1 of only 1 - exp(-2.83 / A), A its area in these units: 0.79 for a box of 1.2 x 1 x 0.6.
+    Lengths are in diagonals of the reference's bounding box. P and Q are 1e5 points each, drawn
+    uniformly by area from reference and mesh. So even a mesh compared with itself has an F1 of only
+    1 - exp(-2.83 / A), A the area in these units: 0.79 for a box of 1.2 x 1 x 0.6.
 
     Parameters
     ----------
     meshes, references : Mesh, mesh of trimesh, or path, or a sequence of these
-        As many of either. A mesh without triangles counts as a point at the middle of the
-        reference's box, as a method that fails does in papers.
+        As many meshes as references. A mesh without triangles counts as a point at the middle of
+        the reference's box, as failures do in papers.
     spacing : number or one for each mesh, optional
         World distance between the samples of the coarse grid, for "efv".
 
     Returns
     -------
     dict of (n,) float64
-        A figure of each mesh, NaN where there is none, as for edges of a reference without any.
-        Papers quote the mean over meshes.
+        One value per mesh, NaN if undefined, such as edges of a smooth reference. Papers quote the
+        mean over meshes.
 
         - "cd": Chamfer distance, mean_P d^2 + mean_Q d^2, by the nearest point of the other set
         - "f1": harmonic mean of the shares of points of P and of Q with d < 0.003
@@ -77,8 +77,8 @@ def evaluate(
     Raises
     ------
     SuperSdfError
-        If there are not as many of either, or the arrays of a mesh are no mesh; if a reference has
-        no area; if a file cannot be read, or the extra ``eval`` is not installed.
+        If the numbers of meshes and references differ; if the arrays of a mesh are invalid; if a
+        reference has no area; if a file cannot be read, or the extra ``eval`` is not installed.
     """
     check_modules("evaluating", "eval")
     some, true = (np.array(each, object, ndmin=1) for each in (meshes, references))

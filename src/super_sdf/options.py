@@ -179,7 +179,7 @@ class Options:
     direction: tuple[float, ...] | None = _option(None, GRID, "read list labels",
         Kind("nine numbers, row by row", partial(numbers, (9,))),
         "World directions of the array's axes: a matrix with a unit vector in each column, as nine "
-        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other formats state it.", "MATRIX")
+        "numbers row by row. For NumPy, TIFF, HDF5 and Zarr; other formats state axes.", "MATRIX")
     axes: AxisOrder | None = _option(None, GRID, "read list labels", one_of(AxisOrder),
         "Axis order of an array in NumPy, TIFF, HDF5 or Zarr. Default: by the names of the axes, "
         "else xyz for NumPy, zyx for the others.")
@@ -209,8 +209,8 @@ class Options:
         "Close the surface along the border of the grid (default), or leave the surface open. A "
         "surface that ends at unknown samples needs --open.", off="open")
     mesher: MesherName = _option("auto", MESH, "list", one_of(MesherName),
-        "marching is marching cubes, which cuts off edges and corners; sharp puts vertices on "
-        "them; auto is sharp for distances, marching for masks and noise.")
+        "marching is marching cubes, which cuts off edges; sharp puts vertices on edges and "
+        "corners; auto is sharp for distances, marching for masks and noise.")
     simplify: float | None = _option(None, MESH, "list labels",
         number("a number greater than 0, in voxels (--tolerance takes world units)", above=0),
         "Simplify the mesh to within ERROR voxels, such as 0.02, of the unsimplified mesh. Needs "

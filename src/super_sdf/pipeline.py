@@ -90,7 +90,7 @@ def upsample(
     ----------
     grid : SdfGrid
         Coarse signed distances in world units, negative inside. If the spacing differs between
-        axes, they are resampled to the finest first; the field has that spacing.
+        axes, distances are first resampled to the finest spacing, which the field then has.
     network : Network
         From ``load_network``.
     factor, offset, progress
@@ -122,17 +122,17 @@ def extract_mesh(
     mesher: options.MesherName = "auto",
     cap: bool = True,
 ) -> Mesh:
-    """Return the zero level of a field as triangles in world coordinates; a node of 0 is inside.
+    """Return the zero level of a field as a mesh in world coordinates; nodes of 0 are inside.
 
     Parameters
     ----------
     field : FineField
         From ``upsample`` or ``read_field``.
     grid : SdfGrid, optional
-        A coarse grid for spacing, origin and direction. Default: the one that the field was made
-        from.
+        A coarse grid for spacing, origin and direction. Default: the grid from which the field was
+        made.
     mesher, cap
-        As in ``reconstruct``; "auto" is "sharp" if the field has samples that were taken as exact.
+        As in ``reconstruct``; "auto" is "sharp" if samples of the field were taken as exact.
     """
     if not isinstance(field, FineField):
         raise OptionTypeError(f"field is {seen(field)}: give one from upsample(grid, network)")
@@ -173,43 +173,43 @@ def reconstruct(
     Parameters
     ----------
     grid : SdfGrid or (nx, ny, nz) array_like, optional
-        Coarse signed distances, or other values: see ``make_grid``. An array may be of NumPy, of
-        PyTorch on any device, a memory map, of h5py, Zarr, Dask or xarray; it may have further
-        axes of length 1 in front. Without a grid the function is sampled.
+        Coarse signed distances, or other values: see ``make_grid``. An array may be of NumPy
+        (memory maps, too), PyTorch on any device, h5py, Zarr, Dask or xarray, with further leading
+        axes of length 1. Without a grid the function is sampled.
     network : Network, optional
-        From ``load_network``, to load it once for many grids.
+        From ``load_network``, to load the network once for many grids.
     factor : int, optional
-        How many times finer per axis, K: an even number from 2 to 16; by default 2 for masks,
-        else 4.
+        Fine voxels per voxel of the grid along each axis, K: an even number from 2 to 16; by
+        default 2 for masks, else 4.
     function : callable, torch.nn.Module or DistanceFunction, optional
-        What the grid has samples of; vertices are then put where it is 0.
+        The function of which the grid has samples; vertices are moved to its zeros.
     bounds, spacing : optional
-        The box and the distance of the samples, without a grid; see ``DistanceFunction.sample``.
+        The box and the spacing of the samples of a function; see ``DistanceFunction.sample``.
     spacing, origin, direction, inside, field, label, level, scale, unknown : optional
-        Where the values of an array lie and what they are; see ``make_grid``.
+        Position and kind of the values of an array; see ``make_grid``.
     quality, device, precision, threads : optional
-        Which network to load, and where it runs, if none is given: see ``load_network``.
+        The network to load if none is given, and where it runs: see ``load_network``.
     offset : float
-        Mesh the surface at this distance from the solid (world units, Sec. 5.3); positive is
-        outwards. The distances must reach 1.5 spacings beyond the offset.
+        Mesh the surface at this world distance from the solid, positive outwards (Sec. 5.3). The
+        distances must reach 1.5 spacings beyond the offset.
     cap, mesher, max_memory
         As the options of ``super-sdf upsample``. With ``cap=False`` meshes of neighbouring grids
         can be joined.
     progress : callable, optional
-        Called with (done, total), see ``threads.Progress``; an exception in it ends the work.
+        Called with (done, total), see ``threads.Progress``; an exception there ends the work.
 
     Returns
     -------
     Mesh
-        In world units; closed, unless the surface leaves the grid and ``cap`` is False. Its
-        ``notes`` say what was inferred; they are logged, level INFO, to "super_sdf". Its
-        ``warnings`` say what may be wrong; each is also a ``SuperSdfWarning``.
+        In world units; closed, unless the surface leaves the grid and ``cap`` is False.
+        ``Mesh.notes`` say what was inferred, and are logged, level INFO, to "super_sdf".
+        ``Mesh.warnings`` say what may be wrong; each is also issued as a ``SuperSdfWarning``.
 
     Raises
     ------
     OptionError, GridError, ModelError, OutOfMemoryError
         If an argument is invalid; if there is no surface at the offset; if the network returns
-        values that are not finite; if not even small tiles of the grid fit in the memory.
+        values that are not finite; if not even small tiles of the grid fit in memory.
     """
     chosen = Options(factor, offset=offset, cap=cap, mesher=mesher, max_memory=max_memory)
     told = {"spacing": spacing, "origin": origin, "direction": direction, "inside": inside}

@@ -34,10 +34,8 @@ SHARE = 0.6  # of the memory that is free, the share that is taken unless a boun
 def check_count(count: int, what: str) -> int:
     """Return ``count``, the number of ``what``; OptionError if 32-bit numbers are too few."""
     if count > MAX_INDEX:
-        raise OptionError(
-            f"there are {count:,} {what}, but 32-bit indices allow only {MAX_INDEX:,}: use a "
-            "smaller factor, or fewer samples"
-        )
+        said = f"there are {count:,} {what}, but 32-bit indices allow only {MAX_INDEX:,}"
+        raise OptionError(f"{said}: use a smaller factor, or fewer samples")
     return count
 
 

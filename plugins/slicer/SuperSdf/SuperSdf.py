@@ -31,7 +31,7 @@ class SuperSdf(ScriptedLoadableModule):
         parent.contributors = ["the authors of super-sdf"]
         parent.helpText = (
             "Makes a segmentation of smooth, closed surfaces. Neighbouring segments share their "
-            "walls. Where segments overlap, the last of them is taken."
+            "walls. Where segments overlap, the last segment is taken."
         )
 
 

@@ -2,10 +2,10 @@
 
 Each IN is a grid file as for upsample, a folder (searched with its subfolders), a pattern such as
 '**/*.npy', or a list of inputs: .txt with one path per line, or .jsonl with one object per line
-such as {"in": "a.npy", "out": "a.ply", "spacing": 0.5}. Paths are relative to the list.
+such as {"in": "a.npy", "out": "a.ply", "spacing": 0.5}. Inputs are relative to the list.
 
 A file that fails is reported and does not stop the batch. Run the command again to resume after an
-interruption, or with more inputs or other options: only missing meshes are made.
+interruption, or with more inputs or other options: only missing and outdated meshes are made.
 
   super-sdf batch grids/ --out meshes/
   super-sdf batch 'scans/**/*.npz' more.txt --out meshes/ --format stl --factor 2

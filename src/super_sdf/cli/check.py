@@ -1,13 +1,13 @@
-"""Check the mesh file MESH, also against the signed distance grid GRID that it was made from.
+"""Check the mesh file MESH, with GRID also against the signed distance grid that it was made from.
 
 The true surface is not needed. Every exact sample is the radius of an empty ball that touches the
-surface. The residual of a sample is its distance to the mesh minus that radius, in voxels: positive
+surface. The residual of a sample is its distance to the mesh minus the radius, in voxels: positive
 if the mesh does not reach the ball, negative if the mesh pierces the ball. Without GRID only faults
 are counted.
 
 MESH is any mesh file that trimesh reads; vertices at the same position are merged. GRID is a grid
-file as for upsample. Each part of a MESH of several labels is checked beside its label in GRID. The
-exit code is 1 if a limit is exceeded; without GRID, or with several parts, also if one has faults.
+file as for upsample. Each part of a MESH of several labels is checked against its label in GRID.
+The exit code is 1 if a limit is exceeded; without GRID, or with several parts, also for faults.
 
   super-sdf check part.ply part.npz
   super-sdf check part.ply part.npz --max-mean 0.01 --no-faults

@@ -18,10 +18,12 @@ import numpy as np
 from click import Argument, Option
 
 from .. import __version__, errors
+from ..files.grids import describe_grid_file
 from ..options import OPTIONS, Device
 from . import main
 
 OK, MISSING, FAILED = "ok", "missing", "failed"
+SHORT = ("shape", "dtype", "spacing", "origin")  # of each of several grids
 SAID = {float: "{:.10g}", int: "{:,}", type(None): "not stated"}  # how facts are shown
 CENTRE, RADIUS = 15.63, 12.0  # of a ball, in voxels; the centre is on no sample
 MOST_OFF, MOST_OFF_OF_MASK = 0.05, 0.6  # voxels; a mask shows the surface to half a voxel
@@ -37,8 +39,6 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
     """Print findings as they come; the exit code is 1 if something failed."""
     OPTIONS["device"].check(device)
     if source is not None:
-        from ..files.grids import describe_grid_file
-
         facts = describe_grid_file(source)
         main.print_stdout(*([facts] if as_json else in_words(facts)))
         return
@@ -55,12 +55,16 @@ def command(source: str | None, check: bool, device: Device, as_json: bool) -> N
 
 
 def in_words(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield facts as lines: a line each, and one for each note."""
+    """Yield facts as lines: a line each, and one for each note, or for each of several grids."""
     for key, value in facts.items():
         values = value if isinstance(value, list) else [value]
         words = [SAID.get(type(each), "{}").format(each) for each in values]
         if key == "notes":
             yield from (f"note: {note}" for note in words)
+        elif key == "grids":
+            for each in value:
+                shown = in_words({name: each[name] for name in SHORT if name in each})
+                yield each.get("error") or f"{each['file']}: {'; '.join(shown)}"
         elif words:
             yield f"{key.replace('_', ' ')}: {', '.join(words)}"
 

@@ -25,6 +25,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read when NumPy is importe
 from .. import __version__
 from ..errors import OptionError, SuperSdfError, check_modules, flag, in_a_line
 from ..files.formats import LISTED, NAMED, files_of
+from ..files.output import check_apart, check_free
 from ..options import GRID, MESH, MESH_FORMATS, OPTIONS, VALUES, WORK, Options
 
 COMMANDS = {
@@ -154,8 +155,6 @@ def chosen_options(given: dict[str, Any], source: str = "-") -> Options:
 
 def check_page(word: str, page: Path, sources: Paths, others: Paths, *, force: bool) -> None:
     """Raise if a page cannot be written, is a file that a source is read from, or an output."""
-    from ..files.output import check_apart, check_free
-
     if page.suffix.lower() not in (".html", ".htm"):
         raise OptionError(f"{page} is not a page: give {word} a file .html or .htm")
     check_free(page, force=force)

@@ -25,7 +25,7 @@ TAKES = (
     Option(["--spacing"], type=FloatRange(0, min_open=True), metavar="H",
         help="World distance between samples, instead of -n."),
     Option(["--padding"], type=FloatRange(0), metavar="VOXELS",
-        help="Voxels between the bounding box of the mesh and the last samples. Default: 2.37."),
+        help="Voxels between the bounding box of the mesh and the grid's border. Default: 2.37."),
     Option(["--band"], type=FloatRange(1.5), metavar="VOXELS",
         help="Exact distances up to this many voxels from the surface, clamped beyond. Default: "
         "exact everywhere up to 256^3 samples, within 4 voxels in larger grids."),

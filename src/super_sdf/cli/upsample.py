@@ -20,7 +20,9 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from hashlib import sha256
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from click import Argument, Choice, Option
@@ -70,10 +72,7 @@ def command(source: str, target: str, **given: Any) -> None:
         report |= {"precision": network.precision, "device": network.device}
         report |= {"device_notes": list(network.notes), **done.facts}
         seconds, start = seconds | done.seconds, time.perf_counter()
-        if given["as_json"] or page:
-            from hashlib import sha256  # imported here, as it loads OpenSSL
-
-            report["network"] = sha256(network.path.read_bytes()).hexdigest()
+        report["network"] = sha256(network.path.read_bytes()).hexdigest()
         if given["check"]:
             from ..check import check_mesh
             from ..truth import merged
@@ -105,8 +104,6 @@ def standard_streams(source: str, target: str, kind: str | None) -> Iterator[tup
         return
     if (source == "-" and not sys.stdin) or (target == "-" and not sys.stdout):
         raise OptionError("- is a standard stream, which is closed: give a file")
-    from tempfile import TemporaryDirectory  # imported here, as few need it
-
     with TemporaryDirectory() as folder:
         grid, mesh = Path(folder, "stdin.npy"), Path(folder, f"stdout.{kind or MESH_FORMATS[0]}")
         if source == "-":

@@ -1,8 +1,8 @@
 """Look at meshes, and at grids refined as by upsample, in the browser.
 
 MESH is any mesh file that trimesh reads. GRID is a grid file as for upsample. The refined mesh of a
-grid is shown beside coarse marching cubes, with the residuals of the samples as colours (extra
-report). The page is one file, which needs no server. The address of the page is printed.
+grid is shown beside marching cubes of the samples, with residuals as colours (extra report). The
+page is a single file without a server, whose address is printed.
 
   super-sdf view part.npz
   super-sdf view part.ply other.stl --out page.html --no-browser

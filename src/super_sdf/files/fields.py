@@ -139,7 +139,7 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
         From ``upsample``.
     path : path
         The file: .npz for the sparse field, which ``read_field`` reads back; .vdb for a level set
-        of OpenVDB; .npy or .vti for the whole fine lattice. docs/reference/files.md describes them.
+        of OpenVDB; .npy or .vti for the whole fine lattice: see docs/reference/files.md.
     force : bool
         Replace an existing file.
 
@@ -158,8 +158,8 @@ def write_field(field: FineField, path: str | Path, *, force: bool = False) -> N
 def read_field(path: str | Path) -> FineField:
     """Read a refined field from a ``.npz`` file that ``--save-field`` or ``write_field`` wrote.
 
-    ``extract_mesh`` makes the same mesh of it, byte for byte. Its ``grid`` has shape, spacing and
-    origin, but no samples: all are NaN.
+    ``extract_mesh`` of the field gives the same mesh, byte for byte. The ``grid`` of the field has
+    shape, spacing and origin, but its samples are NaN.
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def read_field(path: str | Path) -> FineField:
     Raises
     ------
     FileError
-        If the file is missing, damaged, or holds something else.
+        If the file is missing, damaged, or not a refined field.
     """
     path = check_regular_file(PATH.check(path, "path"))
     try:

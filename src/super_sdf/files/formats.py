@@ -59,9 +59,6 @@ FORMATS = (
 DICOM = FORMATS[-1]._replace(suffixes=("a folder",))
 """A folder that is no Zarr store: the names of slices end in anything."""
 
-PLUGIN = GridFormat("plugin", "", (), "numpy", axes="xyz")
-"""That of another package, but for its ending."""
-
 LISTED = ", ".join(f"{each.name} ({', '.join(each.suffixes)})" for each in (*FORMATS, DICOM))
 NAMED = ", ".join(dict.fromkeys(each.name for each in FORMATS if each.has_members))
 """The formats whose files may hold several arrays, for help texts, as ``LISTED``."""
@@ -76,7 +73,7 @@ def find_format(path: str | Path) -> GridFormat:
     """Return the format of a grid file by its name; raise OptionError if it is none, or a mesh."""
     file, member = split_member(path)
     if ending := _ending(file):
-        other = PLUGIN._replace(name=ending, suffixes=(ending,))
+        other = GridFormat("plugin", ending, (ending,), "numpy", axes="xyz")  # another package's
         format_ = next((format_ for format_ in FORMATS if ending in format_.suffixes), other)
         if member and member[0] != "[" and not format_.has_members:
             raise OptionError(f"{format_.name} files hold one array: give --label, not :{member}")

@@ -48,7 +48,7 @@ def read_grid(
 ) -> SdfGrid:
     """Read a grid from a file of any format in docs/guides/formats.md.
 
-    An ``.npy`` file is mapped into memory, other files are loaded.
+    An ``.npy`` file is memory-mapped, other files are loaded.
 
     Parameters
     ----------
@@ -56,23 +56,23 @@ def read_grid(
         The file; ``FILE:NAME`` names one of several arrays in a file, and ``FILE:NAME[3]`` or
         ``FILE[3]`` the fourth of several times, channels or classes in an array.
     spacing, origin, direction : numbers, optional
-        Used instead of those in the file; see ``make_grid``. A direction goes with files that
-        state no axes.
+        Replace the values of the file; see ``make_grid``. ``direction`` is for files that state no
+        axes.
     axes : {"xyz", "zyx"}, optional
         The axis order of an array whose file does not state one. Default: x, y, z in ``.npy``,
         ``.npz`` and MATLAB, else z, y, x.
     space : {"RAS", "LPS"}, optional
-        The anatomical space of the grid's world; for files that state theirs. Default: that one.
+        Anatomical space of the grid, for files that state a space. Default: the file's space.
     inside, field, label, level, scale, unknown
-        What the values are; see ``make_grid``.
+        The kind of the values; see ``make_grid``.
     max_memory : int, optional
-        Bytes that this process may hold in all. Default: a share of the free memory.
+        Memory limit of this process in bytes. Default: a share of the free memory.
 
     Raises
     ------
     FileError, OutOfMemoryError, GridError, OptionError
-        If the file cannot be read, as its library is missing, say; if there is no room for it; if
-        its values are no usable grid; if an option is wrong, or the file states what is given.
+        If the file cannot be read, for example without its library; if the grid does not fit in
+        memory; if the values are no usable grid; if an option is wrong, or stated by the file.
     """
     values: Values = {"inside": inside, "field": field, "label": label, "level": level}
     values |= {"scale": scale, "unknown": unknown}
@@ -130,16 +130,16 @@ def open_volume(
         what = f"--axes {axes}" if axes else "--direction is given"
         raise OptionError(f"{what}, but {format_.name} files state their axes: leave it out")
     order = axes or format_.axes or "xyz"
-    logs = logging.root.manager.disable
     try:
         with warnings.catch_warnings(), ExitStack() as files:
             warnings.simplefilter("ignore")
+            files.callback(logging.disable, logging.root.manager.disable)
             logging.disable(logging.CRITICAL)  # what matters is raised
             readers = import_module(f".readers.{format_.module}", __package__)
             request = Request(file, member or None, numbers, order, files, max_memory)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
-        if str(file) in error.flagged:
+        if error.flagged.startswith(str(file)):
             raise
         raise type(error)(f"{path}: {error.flagged}") from None
     except MemoryError:
@@ -150,8 +150,6 @@ def open_volume(
         if re.match("mmap length|EOF: reading (magic|array header)", reason):  # NumPy's words
             reason = f"it is cut off: it has only {file.stat().st_size:,} bytes"
         raise FileError(f"{path} cannot be read as {format_.name}: {reason}") from error
-    finally:
-        logging.disable(logs)
 
 
 def _taken(volume: Volume, request: Request, given: dict[str, Any]) -> dict[str, Any]:
@@ -173,23 +171,23 @@ def grid_from_image(
     max_memory: int | None = None,
     **values: Unpack[Values],
 ) -> SdfGrid:
-    """Make a grid of VTK image data: the one that ``read_grid`` makes of it as a ``.vti`` file.
+    """Make a grid from VTK image data, equal to ``read_grid`` of the saved ``.vti`` file.
 
     Parameters
     ----------
     image : vtkImageData
-        Or a subclass, such as ``pyvista.ImageData``, with its spacing, origin, extent, direction.
+        Or a subclass, such as ``pyvista.ImageData``, with spacing, origin, extent and direction.
     scalars : str, optional
-        The name of an array of numbers at its points or, if no array there has that name, in its
-        cells; samples in cells are at their centres. Default: the active scalars of the points,
-        else of the cells, else the only array.
+        The name of a point array, or, if there is none, of a cell array, with samples at the
+        centres of the cells. Default: the active scalars of the points, else of the cells, else the
+        only array.
     max_memory, inside, field, label, level, scale, unknown
         As in ``read_grid``.
 
     Raises
     ------
     FileError, GridError, OptionError
-        If there is no such array, or no usable grid; if ``image`` is no image data.
+        If there is no such array, or no usable grid; if ``image`` is not image data.
     """
     Options(**values)  # checks them
     from .readers.vtk import NAME, volume_of_image
@@ -199,22 +197,30 @@ def grid_from_image(
     return make_grid(**_taken(volume, request, {}), **values)
 
 
-def describe_grid_file(path: str | Path) -> dict[str, Any]:
+def describe_grid_file(path: str | Path, *, is_each: bool = False) -> dict[str, Any]:
     """Return format, shape (x, y, z), type and place of the array in a grid file.
 
-    No sample is read where the format allows it. What the file does not state is None or missing.
+    Of several arrays, ``grids`` are these facts of each, or an ``error`` (so with ``is_each``). No
+    sample is read where the format allows it. What the file does not state is None or missing.
     Raises as ``read_grid``.
     """
-    path = Path(PATH.check(path, "path"))
-    with open_volume(path) as (volume, _):
-        order, _, place = find_placement(volume, {})
+    about = {"file": str(PATH.check(path, "path")), "format": find_format(path).name}
+    try:
+        with open_volume(Path(path)) as (volume, _):
+            order, _, place = find_placement(volume, {})
+    except SuperSdfError as error:
+        if not (is_each or error.names):
+            raise
+        if is_each:
+            return about | {"error": error.flagged}
+        paths = [f"{split_member(path)[0]}:{name}" for name in error.names]
+        return about | {"grids": [describe_grid_file(each, is_each=True) for each in paths]}
     shape = [volume.shape[axis] for axis in order]
     facts = {k: None if at is None else np.ravel(at).tolist() for k, at in place.items()}
     if facts["direction"] in (None, np.eye(3).ravel().tolist()):
         del facts["direction"]
     return {
-        "file": str(path),
-        "format": find_format(path).name,
+        **about,
         "shape": shape,
         "dtype": str(volume.dtype),
         "bytes": prod(shape) * volume.dtype.itemsize,

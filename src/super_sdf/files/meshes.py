@@ -90,18 +90,17 @@ def write_mesh(
     force : bool
         Replace an existing file.
     unit : str, optional
-        Unit of the world: um, mm, cm, m, in or ft. Only .3mf and .glb state it; by default a .3mf
-        says mm, a .glb m.
+        Unit of the world: um, mm, cm, m, in or ft. Only .3mf (default mm) and .glb (default m)
+        state a unit.
     space : str, optional
-        The anatomical space of the coordinates, "RAS" or "LPS", such as that of the grid. A .ply,
-        .stl or .obj names it in its header, where 3D Slicer looks for it.
+        The anatomical space of the coordinates, "RAS" or "LPS", such as ``grid.space``, written
+        into the header of a .ply, .stl or .obj, which 3D Slicer reads.
 
     Raises
     ------
     OptionError, MeshError, FileError
-        If the suffix is unknown; if the arrays are no mesh, or a coordinate is not finite; if the
-        file cannot be written, or its format cannot hold the mesh: corners of a triangle would
-        coincide.
+        If the suffix is unknown; if the arrays are invalid, or a coordinate is not finite; if the
+        file cannot be written, or vertices of a triangle would coincide in the format.
     """
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     path = check_free(check_mesh_suffix(PATH.check(path, "path")), force=force)

@@ -36,18 +36,18 @@ class DistanceFunction:
         Takes world positions, (n, 3) float64, and returns n distances, (n,) or (n, 1): an array, or
         a tensor of PyTorch or JAX on any device, with or without gradients. A module is given a
         tensor of the type and on the device of its parameters, and makes no gradients. Any
-        continuous function that is 0 on the surface will do; it may be positive inside. If it is
+        continuous function that is 0 on the surface is accepted, also positive inside. If it is
         much steeper near a part of the surface than elsewhere, sample with an infinite ``reach``.
 
     Attributes
     ----------
     evaluations : int
-        At how many points it was evaluated so far.
+        Number of points at which the function has been evaluated.
 
     Raises
     ------
     OptionTypeError
-        If it is not callable; in a call, if it does not return one number for each point.
+        If ``function`` is not callable; in a call, if it does not return one number per point.
     """
 
     def __init__(self, function: Callable[[Vectors], Any]) -> None:
@@ -79,25 +79,25 @@ class DistanceFunction:
         return np.concatenate(found)
 
     def sample(self, bounds: ArrayLike, spacing: ArrayLike, reach: float | None = None) -> SdfGrid:
-        """Return the samples on a lattice that covers a box. The surface is where they are 0.
+        """Return samples on a lattice that covers a box, as a grid.
 
-        Coarse cells are asked first, so that far from the surface few points are.
+        Coarse cells are evaluated first, so that few points far from the surface are.
 
         Parameters
         ----------
         bounds : two numbers, or two points
             The lowest and the highest coordinates of the box; the first sample is at the lowest.
-            The solid should end a few spacings inside.
+            The solid should stay a few spacings away from the border of the box.
         spacing : number or three
             World distance between neighbouring samples.
         reach : float, optional
-            World distance from the surface at which samples are cut off, by default 4 spacings;
-            infinite for all as they are.
+            World distance from the surface beyond which samples are truncated, by default 4
+            spacings; infinite for no truncation.
 
         Raises
         ------
         OptionError
-            If the box is empty, or takes more than 2^31 samples.
+            If the box is empty, or has more than 2^31 samples.
         GridError
             If no sample is inside, or none is outside; else as in ``make_grid``.
         """

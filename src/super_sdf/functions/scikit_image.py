@@ -53,9 +53,9 @@ def marching_cubes(
     gradient_direction : {"descent", "ascent"}
         "descent": triangles are counter-clockwise seen from larger values, as in scikit-image.
     step_size, mask
-        Only 1 and None.
+        Must be 1 and None.
     method, allow_degenerate
-        Without effect: no triangle is degenerate.
+        No effect: no triangle is degenerate.
     factor, network
         As in ``reconstruct``.
 

@@ -156,7 +156,8 @@ class Case:
             if low < 0 < high and max(low - end, end - high) > high - low:
                 self.samples = changed(self.samples, partial(np.clip, a_min=low, a_max=high))
                 self.look = look_at(self.samples)
-                self.notes.append("values far from all others are taken as padding")
+                seen = end / (self.wanted.scale or 1) + (self.wanted.level or 0)  # in the array
+                self.notes.append(f"values of {seen:.6g}, far from all others, taken as padding")
 
     def fill_in(self, values: Sequence[float] = ()) -> None:
         """Fill in unknown samples, for which some values stand, too, if there are some."""
@@ -233,7 +234,7 @@ def check_size(look: Look) -> None:
         raise GridError(f"every value is {only}: a constant field has no surface")
     end = max(look.high, look.low, key=abs)
     if not ORDINARY[0] < abs(end) < ORDINARY[1]:
-        said = f"if it stands for unknown ones, --unknown {end:.17g}, else multiply them, --scale"
+        said = f"if it marks unknown samples, --unknown {end:.17g}, else scale the values, --scale"
         raise GridError(f"the largest value is {end:.6g}: {said}")
 
 
@@ -269,7 +270,7 @@ def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
     if slope := facts.get("slope"):
         case.notes.append(
             f"the values change by {slope:.4g} of a spacing from sample to sample, distances by 1: "
-            f"they are divided by that (if the spacing is wrong, give --spacing)"
+            f"the values are divided by that (if the spacing is wrong, give --spacing)"
         )
         case.scaled(slope)
     return _of_distances(case, case.spacing)
@@ -299,7 +300,7 @@ def _of_sides(case: Case) -> dict[str, Any]:
     if look.low > 0 or look.high < 0:
         raise _refused(case)
     if "step" in facts:
-        case.notes.append("they are a distance transform, so only their signs say something")
+        case.notes.append("the values are a distance transform, of which only the signs are used")
         case.set_spacing(facts["step"], "the step of the transform")
     below, zeros = border_share(look, lambda x: x < 0), facts.get("zeros", 0)
     is_positive = below > 0.5 if inside == "auto" else inside == "positive"
@@ -313,7 +314,7 @@ def _of_mask(case: Case, above: Above) -> dict[str, Any]:
 
     positive = case.choose_side(above)
     case.set_spacing(1, "since a mask shows none (give --spacing)")
-    said = "they show the surface to half a voxel only"
+    said = "a mask shows the surface to half a voxel only"
     case.notes.append(f"values taken as a mask (--field mask): {said}")
     h = min(steps_of(case.spacing or (1, 1, 1)))
     case.samples = MadePlanes(

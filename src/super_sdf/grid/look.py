@@ -375,20 +375,19 @@ def which_level(look: Look) -> str:
     outside = border_share(look, lambda x: x > level) > MOST_OUTSIDE
     option = f"--level {level:.6g} --inside {'negative' if outside else 'positive'}"
     other = " (or, if the surface is at 0, --field smooth)" if look.low < 0 < look.high else ""
-    return f"they look like densities: give the level of their surface, such as {option}{other}"
+    return f"the values look like densities: give the surface's level, such as {option}{other}"
 
 
 def which_label(found: tuple[NDArray[Any], NDArray[np.int64]] | None) -> str:
-    """Return the advice to choose a label: the most frequent after that of the background."""
+    """Return the advice to choose a label: the most frequent besides the background."""
     if found is None:
-        return "no solid is chosen: they are labels: choose one with --label, or some with --labels"
+        return "the values are labels: choose one with --label, or several with --labels"
     distinct, counts = found
     ordered = distinct[np.argsort(counts, kind="stable")[::-1]]
-    best = next((x for x in ordered[1:] if x), ordered[0])
-    return (
-        f"no solid is chosen: they look like labels ({named(distinct.tolist())}): choose one with "
-        f"--label {round(best.item())}, or mesh all with --labels all"
-    )
+    first = 0 if 0 in distinct else 1  # without a 0 the background is the most frequent
+    best = next((x for x in ordered[first:] if x), ordered[0]).item()
+    said = f"the values look like labels ({named(distinct.tolist())})"
+    return f"{said}: choose one with --label {round(best)}, or mesh all with --labels all"
 
 
 def named(labels: Any) -> str:

@@ -332,8 +332,8 @@ def _in_unit(look: Look, unit: Any, given: Floats | None, facts: dict[str, Any])
     if off > ANOTHER_UNIT:
         shown = ",".join(f"{x:.4g}" for x in np.unique(steps) * unit)
         said = (
-            "they are distances in another unit than the spacing: multiply the values, --scale "
-            f"{1 / unit:.4g} (or the spacing is wrong: they show {shown})"
+            "the distances have another unit than the spacing: multiply the values, --scale "
+            f"{1 / unit:.4g} (or the spacing is wrong: the values show {shown})"
         )
         return Answer("distance", "", facts, said)
     if off > facts["error"]:

@@ -39,17 +39,17 @@ from .samples import (
 class SdfGrid:
     """Signed distances at the points ``world = origin + direction @ (spacing * (i, j, k))``.
 
-    ``SdfGrid(values, spacing, origin, direction)`` is ``make_grid`` with these, all else inferred.
+    ``SdfGrid(values, spacing, origin, direction)`` calls ``make_grid``; all else is inferred.
 
     Attributes
     ----------
     values : (nx, ny, nz) array
-        All samples, negative inside. Those of a file, or made of others, are loaded on first use
-        and stay in memory; ``planes`` reads some of them without that.
+        All samples, negative inside. Samples in a file, or computed from others, are loaded on
+        first use and stay in memory; ``planes`` reads some planes without loading all.
     low, high : float
         The smallest and the largest sample, negative inside.
     field : Field
-        What the values are, and which of them can be exact.
+        The kind of the values, and which values can be exact.
     space : str or None
         The anatomical space of the world, "RAS" or "LPS", if a file states one.
     """
@@ -89,8 +89,8 @@ class SdfGrid:
     ) -> SdfGrid:
         """Return a grid whose sign and spacing are known and not checked against the values.
 
-        With ``extremes``, the smallest and the largest sample, they are not searched for. Values
-        are taken as exact distances unless ``field`` says what they are.
+        ``extremes``, the smallest and the largest sample, saves the search for them. Values are
+        taken as exact distances unless ``field`` states another kind.
         """
         steps, axes, field = check_spacing(spacing), check_direction(direction), field or Field()
         is_sheared = np.abs(np.transpose(axes) @ np.array(axes) - np.eye(3)).max() > 2 * SKEW
@@ -197,40 +197,40 @@ def make_grid(
 ) -> SdfGrid:
     """Make a grid from an array of signed distances, or of other values with a surface.
 
-    What is not given is inferred.
+    Parameters that are not given are inferred.
 
     Parameters
     ----------
     values : (nx, ny, nz) array_like
         Signed distances in world units; i runs along x, j along y, k along z. Or a mask, labels,
         densities, or another field. Samples far from the surface may be NaN or infinite: unknown.
-        A ``DataArray`` of xarray has the dimensions x, y and z, in any order, and evenly spaced
-        coordinates, increasing or decreasing, or none; others of length 1 are left out.
+        A ``DataArray`` of xarray has the dimensions x, y and z, in any order, further dimensions
+        of length 1, and evenly spaced coordinates, increasing or decreasing, or none.
     spacing : number or three, optional
-        World distance between neighbouring samples. Default: that of the coordinates of a
+        World distance between neighbouring samples. Default: from the coordinates of a
         ``DataArray``, else estimated from the gradient.
     origin : number or three, optional
         World position of sample (0, 0, 0). Default: the lowest coordinates of a ``DataArray``, else
         0, 0, 0.
     direction : (3, 3) array_like or nine numbers, optional
-        The columns are the world directions of the array's axes: unit vectors, mirrored or not, of
-        distances at right angles. Default: i runs along x, j along y, k along z.
+        The columns are unit vectors, the world directions of the array's axes; orthogonal for
+        distances, mirrored or not. Default: i runs along x, j along y, k along z.
     inside : {"auto", "negative", "positive"}
         Sign of the values inside the solid; "auto" takes the border of the grid as outside.
     field : {"auto", "distance", "noisy", "mask", "smooth"}
-        What the values are; "auto" goes by what the samples show. Of a mask only the sides of the
-        samples are known; a smooth field has the surface of its cubic spline, without a network.
+        The kind of the values; "auto" recognises the kind. Of a mask only the signs are used; a
+        smooth field has the surface of its cubic spline, without a network.
     label : int, optional
         The samples with this value are the solid; from -2^63 to 2^64 - 1.
     level : number, optional
-        The values are densities, and the surface is where they have this value; what is above is
-        inside, unless ``inside`` is "negative".
+        The values are densities, and this value is on the surface; larger values are inside, unless
+        ``inside`` is "negative".
     scale : number, optional
-        World units per unit of the values, if they have another unit than the spacing.
+        World units per unit of the values, if values and spacing have different units.
     unknown : number, optional
-        Samples with this value are unknown, as those that are NaN.
+        Samples with this value are unknown, like NaN.
     hint : {"", "labels", "density", "distance"}
-        What a file says that the values are; "field", "label" and "level" win over it.
+        The kind of values that a file states; overruled by ``field``, ``label`` and ``level``.
 
     Returns
     -------
@@ -241,9 +241,9 @@ def make_grid(
     ------
     GridError
         If the values have no surface, or contradict the spacing; if the dimensions or coordinates
-        of a ``DataArray`` are not as above.
+        of a ``DataArray`` are not as described.
     OptionError
-        If ``inside`` or ``field`` is not one of these, or another option is no number.
+        If ``inside`` or ``field`` is not one of these values, or another option is not a number.
     """
     told: dict[str, Any] = {"label": label, "level": level, "scale": scale, "unknown": unknown}
     wanted = Options(inside=inside, field=field, **told)

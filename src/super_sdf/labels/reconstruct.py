@@ -53,27 +53,27 @@ def reconstruct_labels(
     max_memory: int | None = None,
     progress: Progress | None = None,
 ) -> dict[int, Mesh]:
-    """Turn a label image into a closed mesh of each label, which share the walls between them.
+    """Turn a label image into a closed mesh of each label, with shared walls.
 
-    Where two labels touch, both have the same vertices and triangles, in opposite directions: there
-    is neither gap nor overlap. Labels that run out of the grid are closed along its border.
+    Where two labels touch, both meshes have the same vertices and triangles, in opposite
+    directions, without gaps or overlaps. Meshes are closed along the border of the grid, too.
 
     Parameters
     ----------
     values : (nx, ny, nz) array_like or path
         Whole numbers, of any integer or floating-point type; or a file, see ``read_grid``.
     labels : "all" or sequence of ints
-        The labels to mesh; all are those of the image but 0. Others count as 0.
+        The labels to mesh; "all" means all but 0. Other labels count as 0.
     network, factor, max_memory, progress
-        As in ``reconstruct``; of shipped networks that for masks is used. The factor is 2 by
-        default.
+        As in ``reconstruct``; by default the factor is 2, and the network the shipped one for
+        masks.
     spacing, origin, direction, axes
-        Where the samples lie in the world, as in ``read_grid``; by default as the file says.
+        Position of the samples, as in ``read_grid``; by default from the file.
     keep_volume : bool
         Give each mesh the volume of its samples, see ``keep_volumes``.
     tolerance : float, optional
         Simplify the walls within this distance, in world units, both ways (extra ``simplify``). By
-        default triangles are spared within about a hundredth of a voxel.
+        default triangles coplanar within about a hundredth of a voxel are merged.
 
     Returns
     -------

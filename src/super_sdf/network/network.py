@@ -129,7 +129,7 @@ def load_network(
     threads: int = 0,
     precision: Precision = "auto",
 ) -> Network:
-    """Load a network.
+    """Load a network, to refine many grids with it.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def load_network(
         CPU threads; 0 for one per core, which is also the maximum.
     precision : str
         "float32"; "int8", the quantised variant, which is faster and runs on the CPU only; or
-        "auto": on the CPU int8, if the network is a shipped one that has it, otherwise float32.
+        "auto": int8 on the CPU for shipped networks that have int8 weights, otherwise float32.
 
     Raises
     ------

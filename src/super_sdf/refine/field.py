@@ -32,7 +32,7 @@ from .nodes import (
 class FineField:
     """Values at the nodes of the decoded voxels' blocks.
 
-    ``positions`` and ``distances`` are the nodes in world units, each once. The arrays below are in
+    ``positions`` and ``distances`` return each node once, in world units. The arrays below are in
     index space.
 
     Attributes
@@ -47,9 +47,9 @@ class FineField:
         Signed distances at the nodes of each voxel's block, in half voxels, negative inside. The
         Q = (K+1)^3 nodes are in C order; blocks that share a node have equal values there.
     grid : SdfGrid
-        The coarse grid, for positions and units. That of a field from a file has no samples.
+        The coarse grid, for positions and units. In a field from a file the grid has no samples.
     offset : float
-        The distance from the solid, in world units, of the surface at which the values are 0.
+        World distance of the zero level from the solid.
     """
 
     shape: tuple[int, int, int]
@@ -157,8 +157,8 @@ class FineLattice(SamplePlanes):
 def fine_grid(field: FineField) -> SdfGrid:
     """Return the fine lattice of a field, from ``upsample``, as a grid of spacing h/K.
 
-    It can be refined again. Its samples, relative to the surface at the field's offset, are not
-    stored: planes of them are made of the field and the coarse grid when they are needed.
+    The grid can be refined again. Samples are relative to the surface at the field's offset, and
+    computed plane by plane, when they are read, from the field and the coarse grid.
     """
     grid, blocks = field.grid, field.blocks
     ends = np.array([blocks.min(initial=np.inf), blocks.max(initial=-np.inf)])

@@ -70,21 +70,21 @@ def simplify_mesh(
         Largest distance, in world units, between the two surfaces, measured both ways at the
         vertices and at points less than an edge of ``mesh`` apart.
     triangles : int, optional
-        Largest number of triangles. If it cannot be reached, a warning says so.
+        Largest number of triangles. If the number cannot be reached, a warning says so.
     max_memory : int, optional
-        Bytes that the process may hold in all; by default a share of the free memory.
+        Memory limit of the process in bytes; by default a share of the free memory.
 
     Returns
     -------
     SimplifiedMesh
-        A ``Mesh`` with vertices of the same type, and how far it is from ``mesh``. Open edges stay
-        exactly where they are. If the goal is not reached, its ``warnings`` say so.
+        A ``Mesh`` with vertices of the same type, and its distance from ``mesh``. Open edges do not
+        move. If the goal is not reached, ``warnings`` of the result say so.
 
     Raises
     ------
     SuperSdfError
-        If not exactly one of ``error`` and ``triangles`` is given, the arrays are no mesh, the
-        extra ``simplify`` is not installed, or it would not fit in memory.
+        If not exactly one of ``error`` and ``triangles`` is given, the arrays are invalid, the
+        extra ``simplify`` is not installed, or simplifying would not fit in memory.
     """
     found = simplified(mesh, error, triangles, max_memory)
     doubts = mesh.warnings + tell((), found.warnings)[1]

@@ -69,12 +69,12 @@ class Mesh:
         return area
 
     def boundary(self) -> IntArray:
-        """Return the open edges, (n, 2): those that an odd number of triangles have.
+        """Return the open edges, which an odd number of triangles share, (n, 2).
 
-        To find them without sorting all edges, every vertex gets a mark of 46 random bits. At a
-        vertex inside the surface, each neighbour follows the vertex in one triangle and precedes it
-        in another, so the marks of those that follow, less those that precede, sum to 0. Only edges
-        between vertices where they do not are sorted. Sums are hardly ever 0 by chance.
+        To avoid sorting all edges, every vertex gets a mark of 46 random bits. At a vertex inside
+        the surface, each neighbour follows the vertex in one triangle and precedes the vertex in
+        another, so marks of followers less marks of predecessors sum to 0. Only edges between
+        vertices with another sum are sorted. Sums are hardly ever 0 by chance.
         """
         count = len(self.vertices)
         bits = np.arange(1, count + 1, dtype=np.uint64) * MIXER
@@ -96,24 +96,24 @@ class Mesh:
         return np.stack([start[odd], end[odd]], 1).astype(np.int32)
 
     def open_edges(self) -> int:
-        """Count the edges that an odd number of triangles have: 0 in a closed mesh."""
+        """Count the edges that an odd number of triangles share: 0 in a closed mesh."""
         return len(self.boundary())
 
     def is_closed(self) -> bool:
-        """Return whether there are faces and no edge is open."""
+        """Return whether the mesh has faces and no open edge."""
         return len(self.faces) > 0 and self.open_edges() == 0
 
     def components(self) -> tuple[int, NDArray[np.int32]]:
-        """Return how many pieces share no vertex, and the number of each vertex's, (n,).
+        """Return the number of connected components, and the component of each vertex, (n,).
 
-        Unused vertices do not count, but have numbers.
+        Unused vertices are not counted, but have component numbers.
         """
         start, end = self.faces[:, :2].ravel(), self.faces[:, 1:].ravel()
         piece = _connected(start, end, len(self.vertices))
         return len(np.unique(piece[self.faces[:, 0]])), piece
 
     def cavities(self) -> int:
-        """Count the components that bound a cavity: of negative volume, in a mesh of positive."""
+        """Count the walls of cavities: components of negative volume, if the mesh's is positive."""
         piece, middle = self.components()[1][self.faces[:, 0]], self.vertices.mean(0, np.float64)
         volumes = np.bincount(piece, np.linalg.det(self.vertices[self.faces] - middle))
         return int(np.count_nonzero(volumes < 0)) * bool(volumes.sum() > 0)
@@ -121,9 +121,9 @@ class Mesh:
     def pair_edges(self) -> tuple[IntArray, NDArray[np.intp], int]:
         """Find the neighbour of each triangle across each of its edges, by sorting all edges.
 
-        Returned are the other half of each half-edge, (3 m,): 3 f + i runs from corner i of face f
-        to the next one, and has -1 if not exactly two triangles pass it, in opposite directions.
-        Then how many triangles each edge has, and how many edges two pass in the same direction.
+        Half-edge 3 f + i runs from corner i of face f to the next corner. Returned are the opposite
+        half-edge of each, (3 m,), -1 unless exactly two triangles share the edge in opposite
+        directions; the triangles of each edge; and how many pairs have the same direction.
         """
         faces = self.faces
         start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
@@ -141,9 +141,9 @@ class Mesh:
         return opposite, uses, int((~against).sum())
 
     def count_fans(self, opposite: IntArray) -> NDArray[np.int64]:
-        """Return for each vertex, (n,), how many fans of triangles meet there: 1 in a manifold.
+        """Return the number of fans of triangles at each vertex, (n,): 1 in a manifold.
 
-        A fan are the half-edges of a vertex that lead to one another, from triangle to triangle.
+        A fan is a set of half-edges at a vertex, connected from triangle to triangle.
         ``opposite`` is from ``pair_edges``.
         """
         half = np.arange(self.faces.size)

@@ -61,7 +61,9 @@ class Request:
         listed = ", ".join(names[:MOST_NAMED]) + ", ..." * (len(names) > MOST_NAMED)
         if self.member is None and len(names) > 1:
             example = f"{self.path}:{names[0]}"
-            raise FileError(f"{self.path} holds several arrays, {listed}: give {example}, say")
+            error = FileError(f"{self.path} holds several arrays, {listed}: give {example}, say")
+            error.names = names
+            raise error
         wanted = (self.member or names[0]).strip("/")
         if same := [name for name in names if name.strip("/") == wanted]:
             return same[0]
@@ -82,20 +84,18 @@ class Request:
         if len(shape) < 3:
             raise GridError(f"{self.path} has shape {tuple(shape)}: give a file of three axes")
         if kept is None:
-            by_length = sorted(range(len(shape)), key=lambda axis: (shape[axis], axis))
-            kept = by_length[-3:]
+            kept = sorted(range(len(shape)), key=lambda axis: shape[axis])[-3:]
         others = [n for n, count in enumerate(shape) if n not in kept and count != 1]
         if len(self.numbers) > len(others):
             raise OptionError(f"{self.path} has {len(others)} axes to choose from by [0], [1], ...")
         chosen = dict(zip(others, self.numbers))
         for axis in others:
             if chosen.get(axis, shape[axis]) >= shape[axis]:
-                said = f"{self.path}: its axis {(names[axis] if names else '') or axis} has"
+                said = f"its axis {(names[axis] if names else '') or axis} has {shape[axis]}"
                 name = f"{self.path}:{self.member}" if self.member else self.path
                 say = f"choose one, {name}{'[0]' * len(others)}, say"
-                raise GridError(f"{said} {shape[axis]} entries, from 0 on: {say}")
-        whole = slice(None)
-        return tuple(whole if n in kept else chosen.get(n, 0) for n in range(len(shape)))
+                raise GridError(f"{said} entries, from 0 on: {say}")
+        return tuple(slice(None) if n in kept else chosen.get(n, 0) for n in range(len(shape)))
 
 
 @dataclass(frozen=True)

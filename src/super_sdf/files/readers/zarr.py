@@ -8,10 +8,8 @@ before anything is unpacked.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 from zipfile import ZipFile
 
@@ -38,10 +36,9 @@ def read_zarr(request: Request) -> Volume:
 
     path = request.path
     store: Any = str(path)
-    for at, folders, files in os.walk(path):  # no link may lead out of a store
-        for each in (Path(at, name) for name in (*folders, *files)):
-            if each.is_symlink() or not (each.is_dir() or each.is_file()):
-                check_beside(path, each.relative_to(path).as_posix())
+    for each in path.rglob("*"):  # no link may lead out of a store
+        if each.is_symlink() or not (each.is_dir() or each.is_file()):
+            check_beside(path, each.relative_to(path).as_posix())
     if not path.is_dir():
         ZipFile(path).close()  # names what is no zip file, as zarr does not
         store = request.files.enter_context(zarr.storage.ZipStore(store, mode="r"))
@@ -95,17 +92,14 @@ def _levels(nodes: dict[str, Any]) -> dict[str, tuple[str, Any, Any]]:
 
 def _choose(nodes: dict[str, Any], levels: dict[str, Any], request: Request) -> str:
     """Return the array to read: of an image the finest level, unless another is named."""
-    group = (request.member or "").strip("/")
-    if group in nodes and not hasattr(nodes[group], "shape"):
-        for name, (of_image, *_) in levels.items():
-            if of_image == group:
-                return name
-        before, request = f"/{group}/".replace("//", "/"), replace(request, member=None)
-    else:
-        before = "/"
+    named = (request.member or "").strip("/")
+    if finest := [name for name, (group, *_) in levels.items() if group == named]:
+        return finest[0]
     shapes = {f"/{name}": getattr(node, "shape", ()) for name, node in sorted(nodes.items())}
-    inner = {name: shape for name, shape in shapes.items() if name.startswith(before)}
-    return request.choose_array(inner).strip("/")
+    if named and not shapes.get(f"/{named}", named):  # a group
+        shapes = {name: shape for name, shape in shapes.items() if name.startswith(f"/{named}/")}
+        request = replace(request, member=None)
+    return request.choose_array(shapes).strip("/")
 
 
 def _named_axes(nodes: dict[str, Any], name: str) -> list[Axis]:
