@@ -125,12 +125,11 @@ class Original:
         within, near = near[owner[near] < ends[0]], near[owner[near] >= ends[1]]
         part = near - len(triangle) - len(vertex)
         turn = (turn[part] + THIRDS).clip(0, parts[row[part]])  # (4, n)
-        finer = low[row[part]] + turn[..., None] * step[row[part]]
-        inner = points[0][within, None] / 2 + vertices[faces[triangle[within]]] / 2  # (n, 3, 3)
-        finer = np.concatenate([finer.reshape(-1, 3), inner.reshape(-1, 3)])
-        more, _, more_feet = self.solid.nearest(finer)
+        along = low[row[part]] + turn[..., None] * step[row[part]]
+        inner = (points[0][within] + vertices[faces[triangle[within]].T]) / 2  # (3, n, 3)
+        more, _, more_feet = self.solid.nearest(np.concatenate([*along, *inner]))
         off, feet = np.append(off, more), np.concatenate([feet, more_feet])
-        owner = np.concatenate([owner, np.tile(owner[near], 4), owner[within].repeat(3)])
+        owner = np.concatenate([owner, np.tile(owner[near], 4), np.tile(owner[within], 3)])
         np.maximum.at(known[0], owner, off)
         self.keys, self.back = places, known
         mean = known[1, : len(faces)] / 2 + known[1, ends[1] + edge.reshape(-1, 3)].mean(1) / 2
