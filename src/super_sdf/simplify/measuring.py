@@ -121,13 +121,16 @@ class Original:
         owner = np.concatenate([triangle, vertex, some[row]])
         off, _, feet = self.solid.nearest(np.concatenate(points))
         known[1, new] = (np.bincount(owner, off) / np.maximum(np.bincount(owner), 1))[new]
-        near = np.flatnonzero((off > NEAR * limit) & (off <= limit) & (owner >= ends[1]))
+        near = np.flatnonzero(off > NEAR * limit)
+        within, near = near[owner[near] < ends[0]], near[owner[near] >= ends[1]]
         part = near - len(triangle) - len(vertex)
         turn = (turn[part] + THIRDS).clip(0, parts[row[part]])  # (4, n)
-        finer = low[row[part]] + turn[..., None] * step[row[part]]
-        more, _, more_feet = self.solid.nearest(finer.reshape(-1, 3))
+        along = low[row[part]] + turn[..., None] * step[row[part]]
+        inner = (points[0][within] + vertices[faces[triangle[within]].T]) / 2  # (3, n, 3)
+        more, _, more_feet = self.solid.nearest(np.concatenate([*along, *inner]))
         off, feet = np.append(off, more), np.concatenate([feet, more_feet])
-        np.maximum.at(known[0], np.append(owner, np.tile(owner[near], 4)), off)
+        owner = np.concatenate([owner, np.tile(owner[near], 4), np.tile(owner[within], 3)])
+        np.maximum.at(known[0], owner, off)
         self.keys, self.back = places, known
         mean = known[1, : len(faces)] / 2 + known[1, ends[1] + edge.reshape(-1, 3)].mean(1) / 2
         mean = float(np.average(mean, weights=length(face_normals(vertices, faces))))
