@@ -123,14 +123,12 @@ WRONG = {
     "in.npy --label 1.5": "--label is '1.5': give a whole number, -2^63 to 2^64 - 1",
     "in.npy --label 1 --field noisy": "--label 1 and --field noisy: the samples of a label are a",
     "in.npy --scale 0": "--scale is '0': give a number greater than 0",
-    "in.npy --simplify -1": "--simplify is '-1': give a number greater than 0",
     "in.npy --mesher dual": "--mesher is 'dual': give one of auto, marching, sharp",
     "in.npy --factor 18": f"--factor is '18': {FACTOR}",
     "in.npy --spacing 1,2": "--spacing is '1,2': give one number, or three",
     "in.npy --spacing 1,nan,1": "--spacing is '1,nan,1': give one number, or three",
     "in.npy --level 1.5 --label 2": "--label 2 and --level 1.5: give only one of them",
     "in.npy --max-memory much": "--max-memory is 'much': give a number of bytes",
-    "in.npy --model x.onnx --quality fast": "--model 'x.onnx' and --quality 'fast': give only one",
     "in.npy --direction 1,0,0": "--direction is '1,0,0': give nine numbers, row by row",
 }
 
