@@ -30,10 +30,9 @@ GOOD, NOTED, FAR = 1e-6, 1e-3, 0.1  # of a volume; the last if it need not be ke
 def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
     """Raise OptionError unless the samples of a grid say what volume its mesh should have."""
     if offset or not cap or not grid.field.sides_only:
-        raise OptionError(
-            f"--keep-volume is for closed meshes of masks and labels, the values are "
-            f"{grid.field.kind}: leave it out, or --offset and --open"
-        )
+        said = "--keep-volume is for closed meshes of masks and labels"
+        way_out = "leave it out, or --offset and --open"
+        raise OptionError(f"{said}, the values are {grid.field.kind}: {way_out}")
 
 
 def volume_notes(volumes: Mapping[str, tuple[float, float]], least: float = NOTED) -> list[str]:
