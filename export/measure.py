@@ -1,11 +1,9 @@
-"""The errors of networks on the windows held out of a store; of those for masks also the bias.
+"""The errors of networks on the windows held out of a store; of those for masks bias and reach.
 
     python -m export.measure --store training/store src/super_sdf/models/mask.onnx training/run
 
 So a shipped network can be compared with one in training, of which the averaged weights are
-measured. Errors are those of the log of a run. Of masks of smooth bodies, at random places on the
-lattice, the second table has the error near the surface and the bias, in thousandths of a voxel:
-over 0 where the surface is made too flat.
+measured. Errors are those of the log of a run. ``lab figures --only masks`` has whole bodies.
 """
 
 from __future__ import annotations
@@ -14,36 +12,52 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from export.arguments import Parser
-from export.augment import CLEAN, DISTANCES, Prepared, change
-from export.dataset import sample_field
+from export.augment import DISTANCES, Prepared, prepare
+from export.dataset import Sample
 from export.losses import measure
-from export.shapes.smooth import Field, ellipsoid, mapped, rounded_box, tilted, torus
+from export.network import SuperSdfNet
 from export.store import HELD_OUT, held_out
 from export.to_onnx import load_run, read_network
+from super_sdf.grid.derived import mask_distances
 from super_sdf.network import contract
 
-SIZE = 68  # samples along each axis round a body
-PLACES = 2  # on the lattice
-BODIES: dict[str, Field] = {
-    **{f"ball {radius}": ellipsoid(np.full(3, radius)) for radius in (8.0, 16.0, 28.0)},
-    "ellipsoid 10, 16, 28": ellipsoid(np.array([10.0, 16.0, 28.0])),
-    "cylinder 12": rounded_box(np.array([0, 0, 500.0]), 12.0),
-    "torus 20, 8": torus(20.0, 8.0),
-    "plane 3 degrees": tilted(np.random.default_rng(0), 3.0),
-}
+STEP, STEPPED = 16, 9  # samples to a step in a plane; those beside it, by which reach is measured
+OF_MASKS = "smooth", "bias", "reach"
 
 
-def masks_of(field: Field, *, turned: bool) -> list[Prepared]:
-    rng, masks = np.random.default_rng(0), []
-    while len(masks) < PLACES:
-        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0] if turned else np.eye(3)
-        low = rng.uniform(-SIZE / 2, 1 - SIZE / 2, 3)
-        sample = sample_field(rng, mapped(field, turn), low, SIZE)
-        if sample:
-            masks.append(change(rng, sample, contract.MASKS, CLEAN))
-    return masks
+def cells_of_masks(net: SuperSdfNet, smooth: Sequence[Prepared]) -> list[str]:
+    """Return the error near the surface and the bias on smooth bodies, and the reach.
+
+    The bias is over 0 where the surface is made too flat. Nothing without smooth bodies, or if the
+    network is for distances.
+    """
+    if net.config.keeps_samples or not smooth:
+        return []
+    found = measure(net, smooth)
+    return [f"{found.near:.5f}", f"{found.bias:.5f}", f"{reach_of(net):.2f}"]
+
+
+@torch.no_grad()
+def reach_of(net: SuperSdfNet) -> float:
+    """Return how far a step of a voxel in a plane of a mask moves the surface, in voxels.
+
+    It is the sum over ``STEPPED`` voxels beside the step: .5 if none but the first moves, which
+    goes half of the way, and half of ``STEPPED`` if all do.
+    """
+    x, _, z = np.indices((2 * STEP, 2 * STEP, 2 * STEP))
+    window = 2 * mask_distances(z < STEP + (x >= STEP))
+    voxel_ijk = np.argwhere(np.abs(window) < 2)  # beside the plane
+    nowhere = np.zeros((1, 3), np.float32), voxel_ijk, np.zeros((len(voxel_ijk), 1), np.float32)
+    device = net.correction.weight.device.type
+    plane = prepare(Sample(window, *nowhere)).on(device)
+    values = np.full(window.shape, np.nan)
+    at_samples = net(plane.patches, plane.table, plane.voxels, plane.offsets)
+    values[tuple(voxel_ijk.T)] = at_samples[:, 0].cpu()
+    inside, outside = values[STEP : STEP + STEPPED, STEP, STEP : STEP + 2].T
+    return float((0.5 - inside / (inside - outside)).sum())
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -53,20 +67,15 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("--store", type=Path, required=True, help="folder of shards")
     options = parser.parse_args(words)
     with parser.one_line_errors():
-        files = options.files
-        nets = {f: load_run(f) if f.is_dir() else read_network(f) for f in files}
+        nets = {f: load_run(f) if f.is_dir() else read_network(f) for f in options.files}
         masks = not all(net.config.keeps_samples for net in nets.values())
-        samples = held_out(options.store, contract.MASKS if masks else DISTANCES, HELD_OUT)
-        print("| network | everywhere | near | normal |\n| --- | ---: | ---: | ---: |")
+        kind = contract.MASKS if masks else DISTANCES
+        samples = held_out(options.store, kind, HELD_OUT)
+        smooth = held_out(options.store, kind, 1, "smooth") if masks else []
+        columns = ["network", "everywhere", "near", "normal", *OF_MASKS[: 3 * bool(smooth)]]
+        print(f"| {' | '.join(columns)} |\n| --- {'| ---: ' * (len(columns) - 1)}|")
         for path, net in nets.items():
-            print(f"| {path.name} | {' | '.join(measure(net, samples).cells())} |", flush=True)
-        if not masks:
-            return
-        bodies = {name: masks_of(f, turned="plane" not in name) for name, f in BODIES.items()}
-        print(f"\n| network | {' | '.join(bodies)} |\n| --- {'| ---: ' * len(bodies)}|")
-        for path, net in nets.items():
-            found = [measure(net, some) for some in bodies.values()]
-            cells = [f"{1000 * each.near:.0f}, {1000 * each.bias:+.1f}" for each in found]
+            cells = measure(net, samples).cells() + cells_of_masks(net, smooth)
             print(f"| {path.name} | {' | '.join(cells)} |", flush=True)
 
 

@@ -28,6 +28,7 @@ from torch import Tensor
 from export.arguments import Parser, at_least, positive, share
 from export.augment import DISTANCES, INPUTS, USUAL
 from export.losses import RECIPE, Batch, Recipe, measure, window_losses
+from export.measure import OF_MASKS, cells_of_masks
 from export.network import PLACES, SIZES, SuperSdfNet
 from export.store import HELD_OUT, Store, check_store
 from export.to_onnx import read_weights
@@ -37,7 +38,7 @@ from super_sdf.errors import OptionError
 SAVE_SECONDS = 300  # between checkpoints, each with a line in the log
 LONGEST_STEP = 30.0  # seconds: the rest of a longer one is taken as a pause (SIGSTOP)
 MEASURED = 3  # every third of the windows held out is measured for the log
-COLUMNS = ("step", "seconds", "samples", "loss", "everywhere", "near", "normal", "smooth", "bias")
+COLUMNS = ("step", "seconds", "samples", "loss", "everywhere", "near", "normal", *OF_MASKS)
 WITH_BFLOAT16 = ("avx512_bf16", "amx_bf16")
 
 
@@ -178,9 +179,7 @@ def log(run: Run, store: Store, loss: float) -> None:
     """Append a line to the log, with the errors on held-out windows, and draw it anew."""
     line = [run.step, round(run.seconds), len(store), f"{loss:.5f}"]
     line += measure(run.average, store.held_out[::MEASURED]).cells()
-    if store.held_out_smooth:
-        smooth = measure(run.average, store.held_out_smooth[::MEASURED])
-        line += [f"{smooth.near:.5f}", f"{smooth.bias:.5f}"]
+    line += cells_of_masks(run.average, store.held_out_smooth[::MEASURED])
     path = run.path.with_name("log.csv")
     with path.open("a", newline="") as file:
         csv.writer(file).writerow(line)
@@ -192,11 +191,11 @@ def plot(log_file: Path, picture: Path) -> None:
     with log_file.open(newline="") as file:
         rows = [row + ["nan"] * (len(COLUMNS) - len(row)) for row in csv.reader(file)]
     columns = dict(zip(COLUMNS, np.array(rows, float).T))
-    figure = Figure(figsize=(12, 4), layout="constrained")
-    for ax, names in zip(figure.subplots(1, 3), (["loss"], COLUMNS[4:7], COLUMNS[7:])):
+    figure = Figure(figsize=(16, 4), layout="constrained")
+    for ax, names in zip(figure.subplots(1, 4), (["loss"], COLUMNS[4:7], COLUMNS[7:9], ["reach"])):
         for name in names:
             ax.plot(columns["seconds"] / 60, columns[name], label=name)
-        ax.set(xlabel="minutes", yscale="linear" if "bias" in names else "log")
+        ax.set(xlabel="minutes", yscale="linear" if names[-1] in OF_MASKS else "log")
         ax.legend()
     figure.savefig(picture, dpi=100)
 

@@ -1,4 +1,4 @@
-"""Families of smooth bodies, most of them level sets: blends, grown limbs, skins, figures.
+"""Families of smooth bodies, all of them level sets: blends, grown limbs, skins, figures.
 
 A figure has a relief, as sculptures, scans and toys have: ridges, scales and spikes down to a
 hundredth of its size. Points are (..., 3), fields of distances (n, n, n), both float32.
@@ -16,19 +16,6 @@ from skimage.measure import marching_cubes
 from export.shapes.draws import log_uniform
 
 FLATNESS = 3e-4  # of the unit; how far fewer faces may depart from a level set
-
-
-def blobs(rng: np.random.Generator) -> Manifold:
-    """Draw blobs, from balls to soft boxes, that blend into one another."""
-    centres = rng.uniform(-0.3, 0.3, (int(rng.integers(2, 8)), 3))
-    widths, power = rng.uniform(0.1, 0.35, centres.shape), int(rng.choice([2, 4, 8]))
-    step = rng.uniform(0.025, 0.045)
-    points = grid(0.8, step)
-    blend = np.full(points.shape[:-1], 1e-30)
-    for centre, width in zip(centres, widths):
-        blend += np.exp(-(((points - centre) / width) ** power).sum(-1))
-    # made to run almost linearly through the surface, which is interpolated linearly
-    return marched(np.maximum(-np.log(blend), 0) ** (1 / power) - 1, -0.8, step)
 
 
 def marched(values: np.ndarray, low: float, step: float) -> Manifold:

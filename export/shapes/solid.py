@@ -18,7 +18,7 @@ from export.shapes.basic import csg, lathe, primitive, prism, rounded
 from export.shapes.draws import joined, log_uniform, swayed, turned, twisted, unit_sized
 from export.shapes.edges import chamfered, filleted
 from export.shapes.mechanical import gear, plate, ribs, text, threads
-from export.shapes.organic import blends, blobs, creature, sculpture
+from export.shapes.organic import blends, creature, sculpture
 from export.shapes.slender import lattice, pipe, section, shell, thin
 from super_sdf import Mesh
 
@@ -35,7 +35,7 @@ MACHINED: tuple[Family, ...] = (
     plate, gear, threads, ribs,
     shell, pipe, thin, section, lattice, text,
 )  # fmt: skip
-GROWN: tuple[Family, ...] = (blobs, blends, creature, sculpture)
+GROWN: tuple[Family, ...] = (blends, creature, sculpture)
 FAMILIES: dict[str, Family] = {family.__name__: family for family in (*MACHINED, *GROWN)}
 
 GROWN_SHARE = 0.4  # few of the meshes at hand have smooth, irregular shapes

@@ -19,7 +19,7 @@ def samples():
     """Three samples of procedural shapes."""
     rng, found = np.random.default_rng(0), []
     while len(found) < 3:
-        sample = make_sample(rng, random_solid(rng, ["csg", "blobs"]))
+        sample = make_sample(rng, random_solid(rng, ["csg", "blends"]))
         found += [sample] if sample else []
     return found
 

@@ -10,7 +10,6 @@ from export import dataset, measure, store, to_onnx, train
 from export.augment import CLEAN, DISTANCES, USUAL, change, masked, turned
 from export.losses import RECIPE, batch_of, errors_of, predict, window_losses
 from export.network import PLACES, SuperSdfNet, interpolation_weights
-from export.shapes.smooth import ellipsoid
 from export.store import Sampler, Store, chances
 from export.tests.conftest import SMALL
 from super_sdf import load_network
@@ -19,9 +18,7 @@ from super_sdf.network import contract
 from super_sdf.refine import nodes
 
 
-def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(measure, "SIZE", 24)
-    monkeypatch.setattr(measure, "BODIES", {"ball 8": ellipsoid(np.full(3, 8.0))})
+def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys):
     folder, run, file = tmp_path / "store", tmp_path / "run", tmp_path / "small.onnx"
     for seed in range(3):
         words = f"--out {folder} --count 1 --seed {seed} --families prism --slices 3 --sizes 9 20"
@@ -35,13 +32,14 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys, mo
     taken = float(log[0].split(",")[1])  # seconds, more than it was given on a slow machine
     train.main([*words.split(), str(taken / 60 + 0.05)])
     lines = [line.split(",") for line in (run / "log.csv").read_text().splitlines()]
-    assert len(lines) == 2 and int(lines[1][0]) > int(lines[0][0]) and len(lines[1]) == 9
+    assert len(lines) == 2 and int(lines[1][0]) > int(lines[0][0])
+    assert len(lines[1]) == len(train.COLUMNS) and np.isfinite(float(lines[1][-1]))
     to_onnx.main(["--run", str(run), "--out", str(file)])
     card = load_network(file).card
     assert card["inputs"] == contract.MASKS and card["receptive_field"] == 10
     measure.main(["--store", str(folder), str(file), str(run)])
     tables = capsys.readouterr().out
-    assert "| small.onnx | 0." in tables and "ball 8" in tables
+    assert "| small.onnx | 0." in tables and "| bias | reach |" in tables
 
 
 @pytest.mark.parametrize(
@@ -166,6 +164,13 @@ def test_blocks_that_see_fewer_places_start_with_the_weights_of_these(tmp_path, 
             block.conv.weight.view(27, -1)[np.setdiff1d(range(27), PLACES[count])] = 0
         values = [predict(each, batch) for each in (whole, run.average)]
     torch.testing.assert_close(*values)
+
+
+def test_the_reach_is_what_a_step_in_a_plane_moves_the_surface_beside_it():
+    net = SuperSdfNet(replace(SMALL, keeps_samples=False))
+    torch.nn.init.zeros_(net.correction.weight)
+    torch.nn.init.constant_(net.correction.bias, 0.4)  # half voxels, so a fifth of a voxel
+    assert measure.reach_of(net) == pytest.approx(0.2 * measure.STEPPED, abs=1e-6)
 
 
 def test_every_new_window_comes_once_then_those_with_much_loss_more_often():
