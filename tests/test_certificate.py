@@ -224,7 +224,7 @@ def test_the_command_prints_figures(here, command):
         "shape: 0 slivers (triangles with an angle under 0.5 degrees), "
         "0 needles (vertices at the tip of a spike)"
     )
-    assert lines[2].endswith(" that may be cut off, 0 noisy")
+    assert lines[2].endswith(" that may be truncated, 0 noisy")
     assert re.match(r"largest residual: 0\.000\d+ in world units, at \(", lines[3]), lines[3]
     assert re.match(r"residual 0\.001\d voxels in the mean, [+-]0\.00\d+ at most, ", lines[4])
     assert re.search(r", 0\.00% of \d,\d+ samples above 0\.1; faults: none$", lines[4]), lines[4]

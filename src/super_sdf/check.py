@@ -92,8 +92,7 @@ class Surface:
 class Certificate:
     """What is certain of a mesh without the true surface: its surface, samples, and strays.
 
-    Samples that promise nothing are counted and left out: cut off at the limit of truncated values
-    or at the band's edge, or noisy, which differ from a neighbour by more than distances can.
+    Samples without a promise are left out: truncated, or noisy: steeper than distances can be.
     """
 
     grid: SdfGrid  # on its cubic lattice
@@ -155,7 +154,7 @@ class Certificate:
         ]
         if any(samples.values()):
             text = "samples: {exact:,} exact near the surface; left out: {cut_off:,} that may be "
-            lines.append((text + "cut off, {noisy:,} noisy").format(**samples))
+            lines.append((text + "truncated, {noisy:,} noisy").format(**samples))
         if figures := self.figures():
             at = ", ".join(f"{x:.6g}" for x in figures["largest_at"])
             largest = figures["largest"] * self.grid.voxel_size

@@ -68,7 +68,7 @@ def with_known(
     count, outer = int((unknown | infinite).sum()), int(size[positive & ~unsure].sum())
     notes.append(
         f"{count:,} samples are unknown, of which {outer:,} without a number lie on the positive "
-        f"side: they are taken as cut off at {low:.6g} and {high:.6g}"
+        f"side: they are taken as truncated at {low:.6g} and {high:.6g}"
     )
     if not is_open.any():
         return whole, None, ""
@@ -85,6 +85,7 @@ def with_known(
     return whole, unseen, why_open
 
 
+@np.errstate(invalid="ignore")  # of infinite samples
 def _continue(values: NDArray[Any]) -> None:
     """Fill in unknown values beside others by straight lines through these."""
     for _ in range(LAYERS if np.isnan(values).any() else 0):
