@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import check_modules, tell
-from ..options import OPTIONS, check_goal
+from ..errors import OptionError, check_modules, tell
+from ..options import ABOVE_0, OPTIONS
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import check_fits, give_back, memory_bound
 from ..truth import Solid
@@ -96,7 +96,10 @@ def simplified(
 ) -> SimplifiedMesh:
     """Return a simplified mesh with warnings of its own only, which are not issued."""
     check_mesh(mesh)
-    error, triangles = check_goal(error, triangles)
+    if (error is None) == (triangles is None):
+        raise OptionError("give error or triangles, and only one of them")
+    error = None if error is None else ABOVE_0.check(error, "error")
+    triangles = OPTIONS["triangles"].check(triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
     count, most = len(mesh.faces), memory_bound(OPTIONS["max_memory"].check(max_memory))
