@@ -116,8 +116,7 @@ def write_meshes(
         for path, parts in files.items():
             for mesh in parts.values():
                 check_mesh(mesh)
-            part = stack.enter_context(replacing(path, force=force))
-            with part.open("wb") as file:
+            with stack.enter_context(replacing(path, force=force)).open("wb") as file:
                 if (ending := path.suffix.lower()) in WRITERS:
                     WRITERS[ending](file, parts, world or World())
                 else:
