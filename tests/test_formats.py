@@ -286,6 +286,9 @@ def test_netcdf_packed_with_units_a_time_and_named_axes():
     array.to_netcdf("b.nc")
     check(read_grid("b.nc"))
     assert read_grid("b.nc").notes[0] == "lengths are in the unit that it states, cm"
+    labels = array.copy(data=np.where(array < 2, np.where(array < 1, -1, 2), 0).astype("i2"))
+    labels.to_netcdf("d.nc", encoding={"distance": {"_FillValue": -1}})
+    assert (read_grid("d.nc", label=2).values < 0).sum() == (array < 2).sum()
     names = {"x": "east", "y": "north", "z": "height"}
     array = array_of("yxz").rename(names)
     for axis, name in names.items():

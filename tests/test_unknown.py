@@ -180,10 +180,22 @@ def test_what_stands_for_nothing_among_distances_is_no_surface(values):
     assert mesh.is_closed() and mesh.volume() == pytest.approx(want.volume(), rel=0.01)
 
 
-@pytest.mark.parametrize("low, high", [(-1, 1), (0, 1), (0.3, 0.7)])
-def test_two_values_beside_unknown_samples_are_a_mask(low, high):
-    values = np.where(np.abs(box()) > 4, np.nan, np.where(box() < 0, high, low))
-    assert make_grid(values, **PLACE, inside="positive").field.kind == "mask"
+NOT_SEEN = {
+    "value": lambda x, unseen: {"values": np.where(unseen, 255, 2 * x), "label": 2, "unknown": 255},
+    "NaN": lambda x, unseen: {"values": np.where(unseen, np.nan, 2 * x), "label": 2},
+    "masked": lambda x, unseen: {"values": np.ma.array(x, mask=unseen)},
+    "two": lambda x, unseen: {"values": np.where(unseen, np.nan, np.where(x, 0.7, 0.3))},
+    "level": lambda x, unseen: {"values": np.where(unseen, np.nan, x), "level": 0.5},
+}
+
+
+@pytest.mark.parametrize("way", NOT_SEEN)
+def test_unknown_samples_of_masks_and_labels_are_on_the_side_round_them(way):
+    solid = box() < 0
+    for unseen in (box() < -2, box() > 2):
+        assert ((make_grid(**NOT_SEEN[way](solid, unseen), **PLACE).values < 0) == solid).all()
+    grid = make_grid(**NOT_SEEN[way](solid, np.isnan(split())), **PLACE)
+    assert "end the surface there" in refusal(GridError, reconstruct, grid, trilinear)
 
 
 @pytest.mark.parametrize("cut", [0.2, 1, 3])

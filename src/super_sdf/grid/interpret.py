@@ -161,10 +161,17 @@ class Case:
 
     def fill_in(self, values: Sequence[float] = ()) -> None:
         """Fill in unknown samples, for which some values stand, too, if there are some."""
+        low, high = self.look.low, self.look.high
+        if self.look.is_two and 0 in (low, high) and self.wanted.inside == "auto":
+            # the other value is inside, wherever it is
+            self.wanted = replace(self.wanted, inside="positive" if high else "negative")
         if self.look.is_finite and not values:
             return
         from .unknown import with_known  # imported where it is needed, as few need it
 
+        if self.look.is_two:  # a mask, whose values need not have two signs
+            two = changed(self.samples, lambda x: np.where(np.isnan(x), x, 2 * (x > low) - 1))
+            self.samples, self.look = two, look_at(two)
         filled = with_known(self.samples, self.look, values, self.notes)
         self.samples, self.unseen, self.why_open = filled
         self.look = look_at(self.samples)
@@ -184,11 +191,11 @@ def interpret(
         raise GridError(f"{said}--offset {wanted.level * (wanted.scale or 1):g} instead")
     if wanted.inside == "auto" and (wanted.label is not None or wanted.level is not None):
         wanted = replace(wanted, inside="positive")
-    if wanted.label is not None:
-        labels, samples = samples, labelled(as_labels(samples), wanted.label)
     if wanted.unknown is not None and samples.dtype.kind != "b":
         value = wanted.unknown
         samples = changed(samples, lambda planes: np.where(planes == value, np.nan, planes))
+    if wanted.label is not None:
+        labels, samples = samples, labelled(as_labels(samples), wanted.label)
     given = samples
     if wanted.level is not None:
         samples = changed(samples, partial(np.add, -float(wanted.level)))
@@ -199,7 +206,7 @@ def interpret(
     look = look_at(samples)
     if wanted.label is not None and look.low == look.high:
         values = {x.item() for plane in as_labels(labels) for x in np.unique(plane)[:MOST_NAMED]}
-        which = f"{'every' if look.high else 'no'} sample has the label {wanted.label}"
+        which = f"{'every' if look.high > 0 else 'no'} sample has the label {wanted.label}"
         raise GridError(f"{which}: the labels are {named(values)}")
     check_size(look)
     case = Case(samples, look, wanted, steps, given, notes)
@@ -207,7 +214,7 @@ def interpret(
         return _of_mask(case, np.asarray)
     if wanted.level is not None:
         return _of_level(case)
-    if wanted.field == "mask":
+    if wanted.field == "mask" or wanted.label is not None:
         case.fill_in()
         return _of_sides(case)
     h = None if steps is None else np.array(steps_of(steps))
@@ -277,12 +284,14 @@ def _as_recognised(case: Case, answer: Answer) -> dict[str, Any]:
 
 
 def labelled(samples: SampleArray, label: int) -> MadePlanes:
-    """Return which samples have a label."""
+    """Return which samples have a label; of floats as 1 and -1, and NaN where they are unknown."""
     value: Any = np.nan  # equals no sample: a label that the type does not hold is not rounded
     with np.errstate(over="ignore"), suppress(OverflowError):
         nearest = np.array(label, object).astype(samples.dtype)
         value = nearest if int(nearest) == label else value
-    return changed(samples, lambda planes: planes == value, np.bool_)
+    if samples.dtype.kind != "f":
+        return changed(samples, lambda planes: planes == value, np.bool_)
+    return changed(samples, lambda x: np.where(np.isnan(x), x, 2 * (x == value) - 1), np.float32)
 
 
 # Masks
@@ -291,10 +300,6 @@ def labelled(samples: SampleArray, label: int) -> MadePlanes:
 def _of_sides(case: Case) -> dict[str, Any]:
     """Return the mask that the sides of values make; 0 is on the side ``zeros``, else inside."""
     look, inside, facts = case.look, case.wanted.inside, case.facts
-    if look.is_two and 0 in (look.low, look.high) and inside == "auto":
-        # the other value is inside, wherever it is
-        case.wanted = replace(case.wanted, inside="positive")
-        return _of_mask(case, partial(np.not_equal, 0))
     if look.is_two:
         return _of_mask(case, partial(np.less, look.low))
     if look.low > 0 or look.high < 0:
@@ -331,9 +336,9 @@ def _of_level(case: Case) -> dict[str, Any]:
     look, wanted = case.look, case.wanted
     if look.is_one_sided:
         raise _refused(case)
+    case.fill_in()
     if look.is_two or wanted.field == "mask":
         return _of_mask(case, partial(np.less, 0))
-    case.fill_in()
     case.set_spacing(1, "since densities show none (give --spacing)")
     return _of_spline(case, "density")
 
@@ -356,8 +361,7 @@ def _of_spline(case: Case, kind: str = "smooth") -> dict[str, Any]:
     if "inside" in case.facts:
         from .derived import without_inner_faces
 
-        deep = INNER * min(steps)
-        case.samples = without_inner_faces(case.samples, case.facts["inside"], deep)
+        case.samples = without_inner_faces(case.samples, case.facts["inside"], INNER * min(steps))
     has_jumps = bool(case.facts.get("cut")) and kind == "smooth"
     own = Field(kind, exact=NONE_EXACT, network=None, has_jumps=has_jumps)
     return case.taken(own, case.choose_side())

@@ -235,8 +235,7 @@ def typical_slope(look: Look, steps: Floats, cut: Sequence[float] = ()) -> float
     known = np.isfinite(mean) & (mean > 0)
     if known.sum() >= max(TELLING, len(lines) / 2) or not len(cut):
         return float(np.median(mean[known])) if known.any() else float("nan")
-    steep = np.fmax(*np.moveaxis(np.abs(np.diff(lines)), 2, 0)) / steps
-    length = np.sqrt((steep**2).sum(1))
+    length = np.linalg.norm(np.fmax(*np.moveaxis(np.abs(np.diff(lines)), 2, 0)) / steps, axis=1)
     return float(np.nanmedian(length)) if np.isfinite(length).any() else float("nan")
 
 
@@ -391,7 +390,7 @@ def which_label(found: tuple[NDArray[Any], NDArray[np.int64]] | None) -> str:
 
 
 def named(labels: Any) -> str:
-    """Return labels in words, the first eight in order."""
-    ordered = sorted(labels)
+    """Return labels in words, the first eight in order, without NaN."""
+    ordered = sorted(x for x in labels if x == x)
     words = ", ".join(f"{x:g}" if x % 1 else str(int(x)) for x in ordered[:MOST_NAMED])
     return words + (", ..." if len(ordered) > MOST_NAMED else "")

@@ -202,10 +202,8 @@ def as_samples(values: Any) -> SampleArray:
             samples = np.asanyarray(without_device(values))
         except (TypeError, ValueError, RuntimeError):  # ragged lists
             raise GridError(f"values are {seen(values)}: give an array of three axes") from None
-    if hasattr(samples, "mask"):  # of a masked array: what is masked is unknown
-        if samples.dtype.kind in "fiu":
-            samples = samples.astype(np.result_type(samples.dtype, np.float32))
-        samples = np.ma.filled(samples, np.nan if samples.dtype.kind == "f" else False)
+    if hasattr(samples, "mask") and samples.dtype.kind in "fiub":  # what is masked is unknown
+        samples = np.ma.filled(samples.astype(np.result_type(samples.dtype, np.float32)), np.nan)
     check_kind(samples.dtype, samples.shape)
     return cast(SampleArray, samples)
 
@@ -274,8 +272,7 @@ def check_direction(direction: ArrayLike | None) -> Direction:
         return STRAIGHT
     what = "nine numbers, row by row, or a 3 x 3 matrix"
     matrix = as_numbers(direction, "direction", what, (9,)).reshape(3, 3)
-    off = np.abs(np.linalg.norm(matrix, axis=0) - 1).max()
-    if off > SKEW or abs(np.linalg.det(matrix)) < FLAT:
+    if np.abs(np.linalg.norm(matrix, axis=0) - 1).max() > SKEW or abs(np.linalg.det(matrix)) < FLAT:
         how = "give a unit vector of each axis, as columns that lie in no plane"
         raise GridError(f"direction is {in_rows(matrix)}: {how}")
     x, y, z = (as_triple(row, "direction") for row in matrix)

@@ -300,8 +300,7 @@ def volume_of_samples(grid: SdfGrid, offset: float = 0.0) -> float:
 
 def mean_spacing(grid: SdfGrid) -> float:
     """Return the edge of a cube with the volume of a box round a sample."""
-    volume = np.prod(grid.spacing) * abs(np.linalg.det(grid.direction))
-    return float(volume ** (1 / 3))
+    return float((np.prod(grid.spacing) * abs(np.linalg.det(grid.direction))) ** (1 / 3))
 
 
 def cubic_grid(grid: SdfGrid, offset: float = 0.0) -> SdfGrid:

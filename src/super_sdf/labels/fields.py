@@ -41,8 +41,7 @@ def label_fields(
     padded, threads = np.pad(numbers, 1), useful_threads(network.threads)
     voxel_ijk = voxels_at_walls(padded)
     own, index = padded[tuple(voxel_ijk.T + 1)], VoxelIndex(voxel_ijk + 1, padded.shape)
-    need = SAMPLE_BYTES * numbers.size
-    need += len(own) * (VOXEL_BYTES + NODE_BYTES * (factor + 1) ** 3)
+    need = SAMPLE_BYTES * numbers.size + len(own) * (VOXEL_BYTES + NODE_BYTES * (factor + 1) ** 3)
     what = f"meshing {count} labels in {numbers.size:,} samples, {len(own):,} of them at walls,"
     way_out = "choose fewer (--labels), a smaller factor, or allow more (--max-memory)"
     check_fits(need, what, way_out, memory_bound(bound))

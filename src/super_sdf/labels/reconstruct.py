@@ -119,6 +119,8 @@ def find_image(
         notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
     if origin is None:
         notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    if unknown := sum(int(np.isnan(plane).sum()) for plane in samples):
+        notes.append(f"{unknown:,} samples are unknown: taken as outside all labels")
     ends = [numbers.take(end, axis).ravel() for axis in range(3) for end in (0, -1)]
     if cut := [[*counts][n - 1] for n in np.unique(np.concatenate(ends)) if n]:
         said = "solids of labels run out of the grid: closed along the border"

@@ -292,11 +292,12 @@ def stored(
     """
     said, shape, dtype = attributes or {}, tuple(values.shape), np.dtype(values.dtype)
     is_packed = "scale_factor" in said or "add_offset" in said
-    if not (is_packed or (dtype.kind == "f" and "_FillValue" in said)):
+    missing = np.ravel(said.get("_FillValue", none))
+    # a 0 of whole numbers is the background of a mask or of labels
+    if not (is_packed or ("_FillValue" in said and (dtype.kind == "f" or missing.any()))):
         return lambda index: values[index], shape, dtype
     factor = float(np.ravel(said.get("scale_factor", 1))[0])
     offset = float(np.ravel(said.get("add_offset", 0))[0])
-    missing = np.ravel(said.get("_FillValue", none))
     kind = np.result_type(dtype, np.float32)
 
     def load(index: Index) -> Any:

@@ -84,8 +84,7 @@ def read_netcdf(request: Request) -> Volume:
 
     if h5py.is_hdf5(request.path):
         return read_hdf5(request)
-    file = request.files.enter_context(netcdf_file(request.path, mmap=False))
-    variables = file.variables
+    variables = request.files.enter_context(netcdf_file(request.path, mmap=False)).variables
     shapes = {f"/{name}": values.shape for name, values in variables.items()}
     values = variables[request.choose_array(shapes)[1:]]
     scales = map(variables.get, values.dimensions)
