@@ -19,7 +19,9 @@ from super_sdf.errors import FileError, GridError, OptionError, OutOfMemoryError
 from super_sdf.grid.sdf_grid import volume_of_samples
 from super_sdf.labels import reconstruct as labelling
 from super_sdf.labels.files import read_names
-from super_sdf.labels.volumes import keep_volume
+from super_sdf.labels.volumes import keep_volumes
+from super_sdf.simplify.walls import Walls
+from super_sdf.surface.mesh import Mesh
 from super_sdf.truth import Solid
 
 
@@ -241,6 +243,9 @@ TABLES = {
     "5   left_kidney   185 102 83 0\n",
     "map.csv": "index,name,r,g,b\n1,liver,221,130,101\n5,left_kidney,185,102,83\n",
     "map.tsv": "1\tliver\t221\t130\t101\n5\tleft_kidney\t185\t102\t83\tmore\n",
+    "last.csv": "ID,r,g,b,Name\n1,221,130,101,liver\n5,185,102,83,left_kidney\n",
+    "parent.tsv": "Label Value\tparent\tname\tColor_R\tColor_G\tColor_B\n"
+    "1\t100\tliver\t221\t130\t101\n5\t100\tleft_kidney\t185\t102\t83\n",
     "quoted.csv": '"label","name"\n1;"liver";221;130;101\n5;left_kidney;185;102;83;of two\n',
 }
 LIVER, KIDNEY = ("liver", (221, 130, 101)), ("left_kidney", (185, 102, 83))
@@ -355,7 +360,7 @@ def test_a_mask_has_the_volume_of_its_samples():
     volume = volume_of_samples(grid)
     assert volume == MASK.sum() / 8
     assert mesh.volume() < 0.995 * volume
-    kept = keep_volume(mesh, volume, 0.5)
+    kept = Mesh(keep_volumes(Walls.of(mesh), [volume], 0.5).vertices, mesh.faces)
     assert kept.volume() == pytest.approx(volume, rel=1e-5)
     assert check_mesh(kept, grid).surface.faults() == []
     away = np.linalg.norm(kept.vertices - mesh.vertices, axis=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -102,9 +102,11 @@ def _finished(mesh: Mesh, grid: SdfGrid, options: Options, facts: dict[str, Any]
     """Return the mesh, with the volume of its samples and simplified, if so asked; add facts."""
     volume = volume_of_samples(grid) if options.keep_volume else None
     if volume is not None:
-        from .labels.volumes import keep_volume, volume_notes
+        from .labels.volumes import keep_volumes, volume_notes
+        from .simplify.walls import Walls
 
-        mesh = keep_volume(mesh, volume, mean_spacing(grid))
+        kept = keep_volumes(Walls.of(mesh), [volume], mean_spacing(grid))
+        mesh = replace(mesh, vertices=kept.vertices)
     if options.goals():
         from .simplify.simplify import simplified
 

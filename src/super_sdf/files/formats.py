@@ -183,8 +183,7 @@ def split_header(path: Path) -> tuple[bytes, str, int]:
         text = re.split(rb"\n\r?\n", text, maxsplit=1)[0]
     if not (found := DATA.search(text)):
         return text, "", 0
-    entry = found[1].decode(errors="surrogateescape").strip()
-    return text[: found.start()], entry, found.end()
+    return text[: found.start()], found[1].decode(errors="surrogateescape").strip(), found.end()
 
 
 def is_store(path: str | Path) -> bool:

@@ -5,7 +5,7 @@ Names and colours come from the tables that programs write:
 3D Slicer, FreeSurfer   1 liver 221 130 101 255
 ITK-SNAP                1 221 130 101 1 1 1 "liver"
 JSON                    {"1": "liver"} or {"liver": 1}; also below "labels", as of nnU-Net
-CSV, TSV                1,liver
+CSV, TSV                1,liver; or a header names the columns: id,r,g,b,name
 """
 
 from __future__ import annotations
@@ -37,6 +37,9 @@ ITK_SNAP = re.compile(r'^\s*(\d+)\s+(\d+)\s+(\d+)\s+(\d+)\s.*"(.*)"', re.MULTILI
 RGB = r"(?:[ \t,;]+(\d{1,3})[ \t,;]+(\d{1,3})[ \t,;]+(\d{1,3})(?:[ \t,;].*)?|[\t,;].*)?"
 LINE = re.compile(rf'^[ \t]*([-+]?\d+)[ \t,;]+"?([^",;\t\n]*?)"?{RGB}[ \t]*$', re.MULTILINE)
 
+LABEL_AND_NAME = ["id", "index", "value", "labelvalue", "labelid", "label", "name"]
+COLOURS = ["r", "g", "b", "red", "green", "blue", "colorr", "colorg", "colorb"]
+
 
 class LabelConversion(NamedTuple):
     """The result of a conversion of a label image, as ``convert.Conversion`` of one mesh."""
@@ -61,8 +64,7 @@ def convert_labels(
     label has its own file, ``part-1.ply``. ``names`` of ``read_names``, by default those that the
     source states, take the place of numbers in ``options.labels``, in files and as parts, and parts
     have their colours. Listed labels that the image lacks are left out. The other parameters and
-    the errors are those of ``convert``; options besides ``options.LABELS`` must have their
-    defaults.
+    the errors are those of ``convert``; of the options only ``options.LABELS`` may be given.
     """
     watch, options, known = Steps(), options or Options(), names or names_in(source)
     options = with_numbers(replace(options, labels=options.labels or "all"), known)
@@ -130,10 +132,11 @@ def with_numbers(options: Options, names: Names | None) -> Options:
     for number, (name, _) in (names or {}).items():
         numbers.setdefault(name, []).append(number)
     chosen = [number for label in options.labels for number in numbers.get(label, [label])]
-    if unknown := [label for label in chosen if isinstance(label, str)]:
+    if other := [label for label in chosen if isinstance(label, str)]:
         some = ", ".join(list(numbers)[:10]) or "none without --names"
-        said = f"--labels has {unknown[0]!r}: give numbers, or names of the table ({some})"
-        raise OptionError(said)
+        raise OptionError(
+            f"--labels has {other[0]!r}: give numbers, or names of the table ({some})"
+        )
     return replace(options, labels=tuple(in_order(chosen) or ()))
 
 
@@ -157,10 +160,16 @@ def read_names(path: str | Path) -> Names:
     try:
         text = path.read_text(encoding="utf-8-sig")
         if path.suffix.lower() == ".json":
-            found = json.loads(text)
-            pairs = found.get("labels", found).items()
+            pairs = (found := json.loads(text)).get("labels", found).items()
             rows = [(x, y, ()) if isinstance(y, str) else (y, x, ()) for x, y in pairs]
         else:
+            head, *table = [re.split("[,;\t]", line) for line in text.strip().splitlines()]
+            at = {re.sub("[^a-z]", "", word.lower()): n for n, word in enumerate(head)}
+            named = [at[word] for word in LABEL_AND_NAME if word in at]
+            if len(named) > 1 and (named[0], named[-1]) != (0, 1):  # else the lines are as others
+                order = [named[0], named[-1], *(at[word] for word in COLOURS if word in at)]
+                whole = [row for row in table if len(row) == len(head)]
+                text = "\n".join("\t".join(row[n] for n in order) for row in whole)
             rows = [(row[0], row[4], row[1:4]) for row in ITK_SNAP.findall(text)]
             rows = rows or [(row[0], row[1], row[2:]) for row in LINE.findall(text)]
         for label, name, rgb in rows:

@@ -117,14 +117,12 @@ def find_image(
     counts, numbers, missing = find_labels(samples, in_order(asked.labels), partly=partly)
     if spacing is None:
         notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
-    if origin is None:
-        notes.append("origin not given: sample (0, 0, 0) is at 0, 0, 0")
+    notes += ["origin not given: sample (0, 0, 0) is at 0, 0, 0"] * (origin is None)
     if unknown := sum(int(np.isnan(plane).sum()) for plane in samples):
         notes.append(f"{unknown:,} samples are unknown: taken as outside all labels")
     ends = [numbers.take(end, axis).ravel() for axis in range(3) for end in (0, -1)]
-    if cut := [[*counts][n - 1] for n in np.unique(np.concatenate(ends)) if n]:
-        said = "solids of labels run out of the grid: closed along the border"
-        notes.append(f"{said} ({named(cut)})")
+    if by := [[*counts][n - 1] for n in np.unique(np.concatenate(ends)) if n]:
+        notes.append(f"solids of labels run out of the grid: closed along the border ({named(by)})")
     steps = check_spacing(1.0 if spacing is None else spacing)
     more = {"direction": place["direction"], "extremes": extremes_of_masks(min(steps))}
     grid = SdfGrid.trusted(samples, steps, origin, tuple(notes), **more, field=MASK)

@@ -19,7 +19,7 @@ from ..arrays import CORNERS, Index, Vectors, face_normals, length, sums_at
 from ..errors import OptionError
 from ..grid.sdf_grid import SdfGrid
 from ..simplify.walls import Walls, faults, labels_apart
-from ..surface.mesh import Mesh, row_keys
+from ..surface.mesh import row_keys
 
 CELL = 0.5  # spacings of the samples between nodes
 MOST = 0.125  # spacings that a surface may move
@@ -41,11 +41,6 @@ def volume_notes(volumes: Mapping[str, tuple[float, float]], least: float = NOTE
     far = [f"{name} {share:+.1%}" for name, share in off.items() if abs(share) > least]
     way_out = " (see --keep-volume)" * (least == FAR)
     return [f"volumes that are off those of the samples: {', '.join(far)}{way_out}"] * bool(far)
-
-
-def keep_volume(mesh: Mesh, volume: float, spacing: float) -> Mesh:
-    """Return a closed mesh moved along its normals until it has the given volume."""
-    return Mesh(keep_volumes(Walls.of(mesh), [volume], spacing).vertices, mesh.faces)
 
 
 def keep_volumes(walls: Walls, volumes: Sequence[float], spacing: float) -> Walls:

@@ -167,9 +167,8 @@ def _on_edges(field: Labelled, low: Index, corner: NDArray[np.intp], label: Labe
     within = ((ends >= 0) & (ends <= last)).all((0, 2))
     one, total = np.cumsum(field.apart(low, corner, holder, holder[::-1]), 0)
     share = np.where(within & (total > 0), one / np.where(total > 0, total, 1), 0.5)
-    share = np.clip(share, CLEARANCE, 1 - CLEARANCE)
     begin, stop = np.clip(ends.astype(float), -CAP_HEIGHT, last + CAP_HEIGHT)
-    return np.asarray(begin + share[:, None] * (stop - begin))
+    return np.asarray(begin + np.clip(share, CLEARANCE, 1 - CLEARANCE)[:, None] * (stop - begin))
 
 
 def _on_faces(field: Labelled, low: Index, corner: NDArray[np.intp], label: Labels) -> Vectors:

@@ -107,8 +107,7 @@ def viewed_page(sources: Sequence[str], options: Options) -> str:
         name = Path(source).name
         if network is not None and is_grid(source):
             with TemporaryDirectory(prefix="super-sdf-") as folder:
-                target = Path(folder, "mesh.ply")
-                done = convert(source, target, network, options)
+                done = convert(source, Path(folder, "mesh.ply"), network, options)
                 item = item_of(done, options)
             report = {**done.facts, "input": source, "asked": options.digest()}
             report["seconds"] = done.seconds

@@ -109,8 +109,7 @@ def extract(
         vertices[count:] = written(features.peak)
         cell = features.cell_ijk - field.factor * border[0]
         keys[count:] = keys_of(cell, whole, field.factor) + FIRST_FEATURE + features.nth
-        plain = marching.connect(field, features.plain, threads)
-        faces = np.concatenate([plain, features.faces])
+        faces = np.concatenate([marching.connect(field, features.plain, threads), features.faces])
     if lattice.is_mirrored:
         faces = np.ascontiguousarray(faces[:, ::-1])
     return Mesh(vertices, faces), keys
