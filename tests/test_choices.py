@@ -161,7 +161,7 @@ def save_several() -> dict[str, np.ndarray]:
     nibabel.save(nibabel.Nifti1Image(TWO.T, np.eye(4)), "a.nii.gz")
     tifffile.imwrite("a.tif", TWO, imagej=True, metadata={"axes": "TZYX"})
     np.savez("a.npz", probabilities=TWO, scale=np.ones(3))
-    np.savez("b.npz", one=ONE, two=ONE)
+    np.savez("b.npz", **{"one": ONE, "two": ONE, "two[1]": TWO[1]})
     nrrd.write("a.nrrd", TWO, {"kinds": ["list", "domain", "domain", "domain"]})
     zarr.create_array("a.zarr", shape=TWO.shape, dtype="f4")[...] = TWO
     with h5py.File("a.h5", "w") as file:
@@ -171,7 +171,7 @@ def save_several() -> dict[str, np.ndarray]:
         **{"sim.nc:phi[1]": TWO[1], "sim.nc[0]": ONE, "a.nii.gz[1]": TWO[1], "a.tif[1]": TWO[1]},
         **{"a.npz:probabilities[1]": TWO[1].T, "a.npz[0]": ONE.T, "b.npz:two": ONE.T},
         **{"a.nrrd[1]": TWO[1].T, "a.zarr[1]": TWO[1], "a.h5:/deep/phi[1]": TWO[1]},
-        "a.npy[1]": TWO[1].T,
+        **{"a.npy[1]": TWO[1].T, "b.npz:two[1]": TWO[1].T},
     }
 
 

@@ -36,7 +36,7 @@ Names: TypeAlias = dict[int, tuple[str, tuple[int, int, int] | None]]
 """Name of each label, and its colour in red, green and blue if the file states one."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class Request:
     """What a reader is asked for."""
 
@@ -64,9 +64,11 @@ class Request:
             error = FileError(f"{self.path} holds several arrays, {listed}: give {example}, say")
             error.names = names
             raise error
-        wanted = (self.member or names[0]).strip("/")
-        if same := [name for name in names if name.strip("/") == wanted]:
-            return same[0]
+        whole = (self.member or "") + "".join(f"[{number}]" for number in self.numbers)
+        for wanted, numbers in ((whole, ()), (self.member or names[0], self.numbers)):
+            if same := [name for name in names if name.strip("/") == wanted.strip("/")]:
+                self.numbers = numbers  # none if brackets are a part of the name
+                return same[0]
         raise FileError(f"{self.path} has no {what} {self.member!r}: it holds {listed}")
 
     def choose_array(self, shapes: Mapping[str, Sequence[int]]) -> str:
