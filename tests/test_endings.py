@@ -67,6 +67,17 @@ def test_a_signal_leaves_a_line_its_exit_code_and_no_file(name, step):
     assert json.loads(out) == {"error": line} and os.listdir() == ["in.npy"]
 
 
+def test_a_signal_does_not_interrupt_the_import_of_a_module_for_a_batch():
+    """As the import of igl does, this import makes another exception of an interrupt."""
+    late = "try: signal.raise_signal(signal.SIGTERM)\nexcept BaseException: raise ImportError"
+    Path("late.py").write_text(f"import signal\n{late}")
+    words = [sys.executable, "-c", STAGE.format("lambda *_, **__: __import__('late') and wait()")]
+    words += ["batch", "in.npy", "--out", "out", "--spacing", "1"]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 143 and "Error: ended by SIGTERM: 1 to do;" in done.stderr
+    assert os.listdir("out") == [".super-sdf-batch.lock"]
+
+
 def test_with_json_an_error_is_json_on_stdout(command):
     for words, code in (
         (["upsample", "none.npy", "out.ply"], 1),

@@ -370,7 +370,7 @@ def test_values_on_one_side_of_0_are_a_mask_only_with_zeros():
     np.testing.assert_array_equal(grid.values < 0, depth < 0)
     for values, side in ((depth - 1, "above"), (1 - depth, "below")):
         said = refusal(GridError, make_grid, values, **PLACE, field="mask")
-        assert said.startswith(f"no value is {side} 0 (") and "the surface's level" in said
+        assert said.startswith(f"no value is {side} 0 (") and "give the surface's level" in said
 
 
 @pytest.mark.parametrize("most", [100, 255])

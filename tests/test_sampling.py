@@ -75,7 +75,9 @@ def test_overlapping_pieces_are_one_solid_and_a_cavity_is_no_overlap():
     both = Solid(joined(cube(), apart))
     points = np.random.default_rng(2).uniform(-1, 1.2, (1000, 3))
     expected = (box_distance(points, 0.5) < 0) | (box_distance(points - [0.4, 0, 0], 0.5) < 0)
-    assert (both.is_inside(points) == expected).all()
+    for far in (0.0, 5.4e6):
+        moved = Solid(Mesh(both.mesh.vertices + far, both.mesh.faces))
+        assert (moved.is_inside(points + far) == expected).all()
     hollow = Solid(joined(cube(), inverted(Mesh(cube().vertices * 0.5, cube().faces))))
     assert hollow.unbalanced_edges == 0
     assert not hollow.is_inside(np.zeros((1, 3)))[0]

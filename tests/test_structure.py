@@ -43,16 +43,16 @@ BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a r
     "refine": 1305,  # 1,300; and samples of 0 that are alone
     "surface": 2229,  # 2,200; and what is noted of a mesh
     "tiles": 300,
-    "files": 2696,  # 2,700; and readers and writers of other packages
+    "files": 2698,  # 2,700; and readers and writers of other packages
     "functions": 684,  # 600; and scikit-image's ``marching_cubes``, modules, what is not reached
     "labels": 901,
-    "simplify check truth evaluation": 1444,  # 1,100; and the evaluation, which lab imports
+    "simplify check truth evaluation": 1443,  # 1,100; and the evaluation, which lab imports
     "batch": 887,  # and what a page lacks is made again
     "pages": 385,
-    "cli": 899,  # 800; and standard streams, a row for each label, signals within a callback
+    "cli": 898,  # 800; and standard streams, a row for each label, signals within a callback
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 90, 45, 114  # 90, 45, 110 in the design
-MOST_LINES, MOST_OF_ALL = 15_750, 36_000
+MOST_LINES, MOST_OF_ALL = 15_755, 36_000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path

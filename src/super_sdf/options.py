@@ -300,11 +300,3 @@ READ, BATCH_LISTS, LABELS = (
     tuple(name for name, row in OPTIONS.items() if where in row.shows)
     for where in ("read", "list", "labels")
 )
-
-
-def check_goal(error: Any, triangles: Any) -> tuple[float | None, int | None]:
-    """Return to what a mesh is simplified, an error or a number; OptionError unless it is one."""
-    if (error is None) == (triangles is None):
-        raise OptionError("give error or triangles, and only one of them")
-    found = None if error is None else ABOVE_0.check(error, "error")
-    return found, OPTIONS["triangles"].check(triangles)

@@ -126,16 +126,17 @@ class Solid:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = Mesh(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int32))
 
-    def _tree(self, kind: str) -> Any:
-        """Return a search tree of igl for the triangles."""
+    def _tree(self, kind: str, middle: Any = 0.0) -> Any:
+        """Return a search tree of igl for the triangles, about a point: one is in float32."""
         import igl
 
         tree = getattr(igl, kind)()
-        tree.init(self.mesh.vertices, self.mesh.faces)
+        tree.init(self.mesh.vertices - middle, self.mesh.faces)
         return tree
 
     _triangles = cached_property(lambda self: self._tree("AABB"))
-    _winding = cached_property(lambda self: self._tree("FastWindingNumberBVH"))
+    _middle = cached_property(lambda self: self.mesh.vertices.mean(0))
+    _winding = cached_property(lambda self: self._tree("FastWindingNumberBVH", self._middle))
 
     @cached_property
     def unbalanced_edges(self) -> int:
@@ -160,8 +161,8 @@ class Solid:
 
     def is_inside(self, points: Points) -> NDArray[np.bool_]:
         """Return a mask, (n,), of the points inside the solid."""
-        inside: NDArray[np.bool_] = np.zeros(len(points), bool)
-        return self._winding.winding_number(points) > 0.5 if len(points) else inside
+        found = self._winding.winding_number(points - self._middle) if len(points) else points[:, 0]
+        return np.asarray(found > 0.5)
 
     def signed_distance(self, points: Points) -> Distances:
         """Return the signed distance, (n,), negative inside."""

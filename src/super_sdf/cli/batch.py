@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 
 from click import Argument, Choice, Option
 
+from ..batch.inputs import Job, find_jobs
 from ..options import MESH_FORMATS, OPTIONS
 from . import main
 
 if TYPE_CHECKING:
-    from ..batch.inputs import Job
     from ..batch.run import Batch
     from ..batch.work import Settings
 
@@ -90,7 +90,6 @@ def command(folder: Path, **given: Any) -> None:
 def planned(folder: Path, given: dict[str, Any]) -> tuple[list[Job], Settings]:
     """Check what is given; return the jobs, and how they are to be run."""
     options, page, drawn = main.chosen_options(given), given["report"], None
-    from ..batch.inputs import find_jobs
     from ..batch.work import Settings
     from ..labels.files import check_options
 

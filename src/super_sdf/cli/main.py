@@ -193,21 +193,25 @@ def print_stdout(*lines: str | dict[str, Any], err: bool = False) -> None:
 def hear_signals() -> list[int]:
     """Have a signal raise KeyboardInterrupt, so that files that were begun are removed; list it.
 
-    A signal that the parent process ignores, as ``nohup`` does, stays ignored. If a callback is
-    interrupted, such as that of a lock, Python drops the exception: the signal is sent again.
+    A signal that the parent process ignores, as ``nohup`` does, stays ignored. A signal is sent
+    again if it comes during an import, or in a callback, where Python drops exceptions.
     """
     # not KeyboardInterrupt itself: after one within exec() Python ends itself by SIGINT
     heard, ended = list[int](), type("Ended", (KeyboardInterrupt,), {})
 
     def hear(number: int, frame: FrameType | None) -> None:
         heard.append(number)
-        raise ended
+        while frame and not frame.f_code.co_filename.startswith("<frozen importlib"):
+            frame = frame.f_back
+        if not frame:
+            raise ended
+        send_again()  # a module in C++ makes ImportError of an exception, or aborts
 
     def hear_again(dropped: Any) -> None:
-        if dropped.exc_type is ended:
-            Timer(0.01, os.kill, (os.getpid(), heard[0])).start()  # once the callback has ended
-        else:
-            sys.__unraisablehook__(dropped)
+        send_again() if dropped.exc_type is ended else sys.__unraisablehook__(dropped)
+
+    def send_again() -> None:
+        Timer(0.01, os.kill, (os.getpid(), heard[0])).start()
 
     sys.unraisablehook = hear_again
     for number in SIGNALS:
@@ -217,10 +221,7 @@ def hear_signals() -> list[int]:
 
 
 def main() -> None:
-    """Run the command line and exit with its exit code, 128 + n after signal n.
-
-    Every error is one line on stderr.
-    """
+    """Run the command line and exit with its exit code, 128 + n after signal n."""
     while (number := os.open(os.devnull, os.O_RDWR)) < 3:
         pass  # a standard stream was closed, and the next file would get its text
     os.close(number)

@@ -128,7 +128,6 @@ def converted(source: str, target: str, network: Any, options: Options, **given:
             return convert_labels(source, target, network, options, names=given["names"], **how)
         from ..convert import convert
 
-        how["save_field"] = given["save_field"]
         if given["cluster"]:
             from ..batch.cluster import connect, tiles_on
 
@@ -136,7 +135,7 @@ def converted(source: str, target: str, network: Any, options: Options, **given:
             client: Any = stack.enter_context(to)
             least = TILES_PER_THREAD * sum(client.nthreads().values())
             how |= {"map_tiles": tiles_on(client), "least_tiles": least}
-        return convert(source, target, network, options, **how)
+        return convert(source, target, network, options, save_field=given["save_field"], **how)
 
 
 def lines_of(report: dict[str, Any]) -> list[str]:

@@ -139,7 +139,7 @@ def open_volume(
             request = Request(file, member or None, numbers, order, files, max_memory)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
-        if error.flagged.startswith(str(file)):
+        if str(file) in error.flagged:
             raise
         raise type(error)(f"{path}: {error.flagged}") from None
     except MemoryError:

@@ -21,7 +21,7 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import FloatArray, unit as of_length_1
+from ..arrays import FloatArray, length, unit as of_length_1
 from ..errors import FileError, OptionError
 from ..options import LENGTHS, MESH_FORMATS, OPTIONS, PATH, Unit
 from ..surface.mesh import Mesh, check_mesh
@@ -30,6 +30,7 @@ from .output import check_free, replacing
 
 MESH_SUFFIXES = tuple(f".{name}" for name in MESH_FORMATS)
 SCENES = (".glb", ".3mf")  # have parts with names and colours, and a unit
+MOST_ROUNDED = 0.01  # sides of the triangles by which rounding may move a vertex
 STL_CHUNK = 1 << 18  # triangles at a time
 STL_ROW = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 PLY_TYPES = {"<f4": "float", "<f8": "double"}
@@ -100,7 +101,7 @@ def write_mesh(
     ------
     OptionError, MeshError, FileError
         If the suffix is unknown; if the arrays are invalid, or a coordinate is not finite; if the
-        file cannot be written, or vertices of a triangle would coincide in the format.
+        file cannot be written, or its single precision would move vertices too far.
     """
     world = World(OPTIONS["unit"].check(unit), OPTIONS["space"].check(space))
     path = check_free(check_mesh_suffix(PATH.check(path, "path")), force=force)
@@ -128,12 +129,14 @@ def _as_single(mesh: Mesh, origin: Any = 0.0) -> FloatArray:
     """Return vertices, relative to an origin, as float32; FileError if it cannot hold the mesh."""
     if mesh.vertices.dtype == np.float32 and not np.any(origin):
         return np.asarray(mesh.vertices)
+    exact = mesh.vertices.astype(np.float64) - origin
     with np.errstate(over="ignore"):
-        rounded = (mesh.vertices - origin).astype(np.float32)
-    corners = (points[mesh.faces] for points in (rounded, mesh.vertices))
-    is_flat, was_flat = ((at == np.roll(at, 1, axis=1)).all(2).any(1) for at in corners)
-    if not np.isfinite(rounded).all() or (is_flat & ~was_flat).any():  # two corners at one place
-        said = "the format has single precision, in which vertices of the mesh coincide"
+        rounded = exact.astype(np.float32)
+    off = float(np.abs(rounded - exact).max(initial=0))
+    corners = (points[mesh.faces] for points in (rounded, exact))
+    now, then = (length(at - np.roll(at, 1, axis=1)) for at in corners)
+    if off > MOST_ROUNDED * then.mean() or ((now == 0) & (then > 0)).any():
+        said = f"the format has single precision, which moves vertices by up to {off:.3g}"
         raise FileError(f"{said}: write .ply or .obj")
     return np.asarray(rounded)
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import check_modules, tell
-from ..options import OPTIONS, check_goal
+from ..errors import OptionError, check_modules, tell
+from ..options import ABOVE_0, OPTIONS
 from ..surface.mesh import Mesh, check_mesh
 from ..threads import check_fits, give_back, memory_bound
 from ..truth import Solid
@@ -24,6 +24,7 @@ from .walls import Walls
 # with the libraries that it loads.
 BYTES_PER_TRIANGLE = 1300
 NONE_SPARED = "the mesh was not simplified: none of its triangles can be spared within the error"
+SAME = Deviation(0.0, 0.0, 0.0, 0.0)
 UNREACHED = "{:,} triangles cannot be reached while the mesh stays a manifold of the same topology"
 
 
@@ -96,22 +97,25 @@ def simplified(
 ) -> SimplifiedMesh:
     """Return a simplified mesh with warnings of its own only, which are not issued."""
     check_mesh(mesh)
-    error, triangles = check_goal(error, triangles)
+    if (error is None) == (triangles is None):
+        raise OptionError("give error or triangles, and only one of them")
+    error = None if error is None else ABOVE_0.check(error, "error")
+    triangles = OPTIONS["triangles"].check(triangles)
     check_modules("simplifying", "simplify")
     give_back()  # otherwise freed memory counts as held
     count, most = len(mesh.faces), memory_bound(OPTIONS["max_memory"].check(max_memory))
     way_out = "use a smaller factor, do not simplify, or allow more (--max-memory)"
     check_fits(count * BYTES_PER_TRIANGLE, f"simplifying {count:,} triangles", way_out, most)
     if not count:
-        return SimplifiedMesh(mesh.vertices, mesh.faces, 0, Deviation(0.0, 0.0, 0.0, 0.0))
+        return SimplifiedMesh(mesh.vertices, mesh.faces, 0, SAME)
     of, warnings = Unsimplified(Walls.of(mesh)), tuple[str, ...]()
-    if triangles is None:
-        found = within(of, error or 0.0)
-        warnings = () if found else (NONE_SPARED,)
-    else:
-        found = down_to(of, triangles)
-        if (few := len(found.faces)) > triangles:
-            warnings = (f"{UNREACHED.format(triangles)}: it has {few:,}",)
-    result = Mesh(found.vertices, found.faces) if found else mesh
-    deviation = of.originals[0].compare(Solid(result), error or np.inf)[1]
-    return SimplifiedMesh(result.vertices, result.faces, count, deviation, warnings=warnings)
+    found = within(of, error or 0.0) if triangles is None else down_to(of, triangles)
+    found = found or of.walls
+    if triangles is None and len(found.faces) == count:
+        warnings = (NONE_SPARED,)
+    elif triangles is not None and len(found.faces) > triangles:
+        warnings = (f"{UNREACHED.format(triangles)}: it has {len(found.faces):,}",)
+    deviation = SAME
+    if len(found.faces) < count:
+        deviation = of.originals[0].compare(Solid(found), error or np.inf)[1]
+    return SimplifiedMesh(found.vertices, found.faces, count, deviation, warnings=warnings)
