@@ -31,10 +31,11 @@ def hear_signals() -> None:
 
 
 def start_command(*words: object) -> subprocess.Popen[str]:
-    """Start the command line as a process that hears all signals."""
+    """Start the command line as a process, of a group of its own, that hears all signals."""
     arguments = [sys.executable, "-c", COMMAND, *map(str, words)]
     pipe = subprocess.PIPE
-    return subprocess.Popen(arguments, stdout=pipe, stderr=pipe, text=True, preexec_fn=hear_signals)
+    how = {"stdout": pipe, "stderr": pipe, "text": True, "start_new_session": True}
+    return subprocess.Popen(arguments, **how, preexec_fn=hear_signals)
 
 
 def wait_until(condition: Callable[[], bool]) -> bool:

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import processes
 import psutil
 import pytest
 import trimesh
@@ -350,6 +351,20 @@ def test_a_batch_that_is_ended_or_killed_leaves_no_process_and_goes_on(number, b
     facts = batch("in", "--spacing", 1, "--origin", "0")[1]
     assert facts["failed"] + facts["failed_before"] == 1 and facts["closed"] == 11
     assert len(rows()) >= 12 and finished >= 2 and not Path("out/.super-sdf-parts").exists()
+
+
+def test_ctrl_c_while_workers_start_is_one_line():
+    """A terminal sends it to the workers, too."""
+    process = start_command("batch", "in", "--out", "out", "--jobs", 2, *SMALL)
+    workers = psutil.Process(process.pid).children
+
+    def import_numpy():
+        return any("numpy" in each.path for one in workers() for each in one.memory_maps())
+
+    assert processes.wait_until(import_numpy)
+    os.killpg(process.pid, signal.SIGINT)
+    err = process.communicate(timeout=PATIENCE)[1].strip()
+    assert process.returncode == 130 and err.startswith("Error: ") and "\n" not in err
 
 
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="PYTHONSAFEPATH is of Python 3.11")

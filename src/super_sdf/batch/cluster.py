@@ -15,9 +15,8 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import dask
 from distributed import Client, KilledWorker, LocalCluster, Security, get_worker, wait
@@ -29,9 +28,8 @@ from ..files.formats import split_member
 from ..threads import count_cores
 from .inputs import Job
 from .record import Row
-from .work import Death, Settings, convert_job
+from .work import Death, Settings, Task, convert_job
 
-Task = TypeVar("Task")
 CONNECT_SECONDS = 5  # that a scheduler has to answer
 FIRST_WORKER_SECONDS = 10  # that a cluster has to show a worker
 LOOK_SECONDS = 1.0  # between two looks at whether there are workers
@@ -101,6 +99,12 @@ def completed(
     worker with the bytes that it may hold, if known. The result is a Death if workers died of it or
     a bug was met. ClusterError if the scheduler or all workers are lost.
     """
+
+    def at_worker(task: Task) -> Any:
+        worker = get_worker()
+        limit = worker.memory_manager.memory_limit or 0
+        return work(task, memory=int(SHARE * limit / worker.state.nthreads) or None)
+
     running, threads, seen = dict[Any, Task](), 0, time.monotonic()
     try:
         while True:
@@ -110,7 +114,7 @@ def completed(
             if client.status != "running" or time.monotonic() - seen > PATIENCE_SECONDS:
                 raise ClusterError("the Dask scheduler, or all workers, were lost: run it again")
             while len(running) < max(threads, 1) and (task := take()) is not None:
-                running[client.submit(partial(_at_worker, work), task, pure=False)] = task
+                running[client.submit(at_worker, task, pure=False)] = task
             if not running:
                 return
             done = set[Any]()
@@ -136,13 +140,6 @@ def completed(
             client.cancel(list(running))
 
 
-def _at_worker(work: Callable[..., Any], task: Any) -> Any:
-    """Work at a task in a worker, within its memory."""
-    worker = get_worker()
-    limit = worker.memory_manager.memory_limit or 0
-    return work(task, memory=int(SHARE * limit / worker.state.nthreads) or None)
-
-
 def tiles_on(client: Client) -> Callable[..., Iterator[Any]]:
     """Return the ``map_tiles`` of ``mesh_grid`` that has tiles made, and signed, by workers."""
 
@@ -166,8 +163,7 @@ def convert_on_cluster(
     Workers have to see inputs, of which the ``first`` is looked for, and outputs by the same paths.
     """
     options, items, base = settings.options, settings.items, Path.cwd()
-    files = [base / stage, base / split_member(first.source)[0]]
-    files = [path for path in files if path.exists()]
+    files = [p for p in (base / stage, base / split_member(first.source)[0]) if p.exists()]
     if options.model and Path(options.model).exists():
         options = replace(options, model=str(base / options.model))
     there = replace(settings, options=options, folder=base / settings.folder)

@@ -118,8 +118,7 @@ class Batch:
             with closing(work_in_processes(take, work, count)) as results:
                 yield from results
         else:
-            while (job := take()) is not None:
-                yield job, work(job)
+            yield from ((job, work(job)) for job in iter(take, None))
 
     def _keep(self, job: Job, row: Row, stage: Path) -> None:
         """Add the row of a finished job to the report, then move its files to their places."""
@@ -204,7 +203,6 @@ class Batch:
             is_gone = row.get("status") == "ok" and not is_unchanged(folder / name, row["output"])
             if is_gone or row.get("asked", {}).get("labels") is not None:
                 del rows[name]
-
         facts = {"title": f"Batch: {folder}", "lead": lead}
         write_batch_page(path, facts, rows, force=self.settings.force)
 
