@@ -6,6 +6,7 @@ import warnings
 from pathlib import Path
 from zipfile import ZipFile
 
+import nibabel
 import numpy as np
 import pytest
 import trimesh
@@ -141,6 +142,14 @@ def test_a_unit_is_stated_and_glb_is_in_metres(mesh, command):
             want = [far.vertices.min(0), far.vertices.max(0)]
             bounds = trimesh.load("out.glb").bounds
             np.testing.assert_allclose(bounds, metres * np.array(want), rtol=1e-6)
+    for code, name in ((1, "meter"), (2, "millimeter"), (3, "micron")):
+        image = nibabel.Nifti1Image(ball(12, 3.0).values, np.eye(4))
+        image.header["xyzt_units"] = code
+        nibabel.save(image, "in.nii")
+        assert command("upsample", "in.nii", "u.3mf", "--force", "-q")[0] == 0
+        assert f'unit="{name}"' in ZipFile("u.3mf").read("3D/3dmodel.model").decode()
+    said = command("upsample", "in.nii", "v.3mf", "--unit", "mm")[2]
+    assert said == "Error: --unit mm: the file states um, leave it out\n"
     place(0.5, 3.0)
     assert command("upsample", "in.npz", "mm.glb", "--unit", "mm", "-q")[0] == 0
     code, out, err = command("check", "mm.glb", "in.npz", "--unit", "mm", "--no-faults")

@@ -64,6 +64,7 @@ def convert(
             write = saving.enter_context(saving_field(save_field, force=force))
             how["save_field"] = lambda field: saved.update(write(field))
         grid = read_grid(source, **options.reading())
+        unit = options.unit_for(Path(target), grid.flagged)
         if options.keep_volume:
             from .labels.volumes import check_has_volume  # imported here, as few need it
 
@@ -73,8 +74,7 @@ def convert(
         facts = _facts(grid, made, options)
         mesh = _finished(made.mesh, grid, options, facts)
         steps.lap("simplify" if options.goals() else "isosurface")
-        world = World(options.unit, grid.space)
-        write_meshes({Path(target): {"": mesh}}, force=force, world=world)
+        write_meshes({Path(target): {"": mesh}}, force=force, world=World(unit, grid.space))
         steps.lap("write")
     if saved:
         facts["saved_field"] = saved

@@ -35,6 +35,7 @@ DEFAULT_QUALITY: Final = "base"
 MESH_FORMATS = ("ply", "stl", "obj", "off", "glb", "3mf")
 LENGTHS = {"um": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254, "ft": 0.3048}
 """Units that mesh files state, in metres."""
+STATED = re.compile("(?i)it states, (?:(?P<mm>mm|milli)|(?P<um>[uµμ]m|micro)|(?P<cm>c)|(?P<m>m))")
 QUALITIES = {"fast": ("fast", 1), "base": ("base", 1), "best": ("base", 4)}
 """The file of each shipped network, and over how many turns of the grid it is averaged."""
 GOALS = ("simplify", "tolerance", "triangles")
@@ -225,8 +226,8 @@ class Options:
         "For masks and labels: move each surface, by an eighth of a voxel at most, until the mesh "
         "has the volume of the voxels inside.")
     unit: Unit | None = _option(None, MESH, "list labels", one_of(Unit),
-        "Unit of the world coordinates, stated in .3mf (default: millimetres) and .glb (default: "
-        "metres). Coordinates stay as they are.")
+        "Unit of the world coordinates, stated in .3mf (default: that of IN, else mm) and .glb "
+        "(default: metres). Coordinates stay as they are.")
     quality: Quality | None = _option(None, WORK, "labels", one_of(Quality),
         "Network: fast is quicker than base, the default; best averages base over 4 rotations of "
         "the grid, and takes 4 times as long.")
@@ -272,6 +273,14 @@ class Options:
     def factor_for(self, *, mask: bool) -> int:
         """Return the factor: masks show no details for which 2 is too few."""
         return self.factor or (2 if mask else 4)
+
+    def unit_for(self, target: Path, notes: Iterable[str]) -> str | None:
+        """Return the unit of a mesh file: of a .3mf by default that of the grid, as notes state."""
+        found = None if self.spacing else STATED.search("; ".join(notes))
+        unit = found.lastgroup if found else self.unit
+        if self.unit not in (None, unit):
+            raise OptionError(f"--unit {self.unit}: the file states {unit}, leave it out")
+        return unit if target.suffix.lower() == ".3mf" else self.unit
 
     def goals(self) -> dict[str, Any]:
         """Return what says how far the mesh is to be simplified, by its name: at most one."""

@@ -59,8 +59,7 @@ def refine_band(
     parts = nodes.share_parts(row_of[table[voxels]])
     del table
     nodes.average_shared(blocks, parts, factor, threads)  # Eq. 7
-    index = nodes.VoxelIndex(own_ijk, grid.shape)
-    fit_to_spheres(blocks, parts, factor, band, index, threads)
+    fit_to_spheres(blocks, parts, factor, band, nodes.VoxelIndex(own_ijk, grid.shape), threads)
     keep_within_bounds(blocks, parts, factor, own_ijk, band.trusted, threads)
     decoded = blocks[:, :-1]
     if grid.field.sides_only:

@@ -94,7 +94,6 @@ class ImageAccessor:
         if residuals:
             from ..check import check_mesh
 
-            options = Options(offset=how.get("offset", 0.0), max_memory=most)
-            found = check_mesh(mesh, grid, options)
+            found = check_mesh(mesh, grid, Options(offset=how.get("offset", 0.0), max_memory=most))
             surface.point_data["residual"] = found.residuals_at(mesh.vertices)
         return surface

@@ -158,8 +158,7 @@ def cross_over(value: Value, start: Vectors, before: Numbers, normals: Vectors) 
         middle = np.minimum((low + high) / 2, np.clip(2 * low, REACH, FARTHEST))
         crossed = value(start + middle[:, None] * ways) * before <= 0
         low, high = np.where(crossed, low, middle), np.where(crossed, middle, high)
-    found = np.isfinite(high)
-    return start + np.where(found, (low + high) / 2, 0)[:, None] * ways
+    return start + np.where(np.isfinite(high), (low + high) / 2, 0)[:, None] * ways
 
 
 def step_down(value: Value, start: Vectors, before: Numbers) -> tuple[Vectors, Numbers]:

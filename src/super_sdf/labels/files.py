@@ -70,6 +70,7 @@ def convert_labels(
     options = with_numbers(replace(options, labels=options.labels or "all"), known)
     check_mesh_suffix(Path(target))
     image = find_image(source, options, [getattr(options, name) for name in PLACE], partly=True)
+    unit = options.unit_for(Path(target), image.grid.flagged)
     called, lacking = names_of(image.volumes, known), names_of(image.missing, known)
     paths = paths_of(Path(target), called, known)
     for path in set(paths):
@@ -89,7 +90,7 @@ def convert_labels(
         row |= {"cavities": mesh.cavities(), "closed": True, "volume": mesh.volume()}
         rows.append({**row, "sample_volume": image.volumes[n]})
     colours = {name: colour for name, colour in called.values() if colour}
-    write_meshes(files, force=force, world=World(options.unit, image.grid.space, colours))
+    write_meshes(files, force=force, world=World(unit, image.grid.space, colours))
     watch.lap("write")
     pairs = {row["name"]: (row["volume"], row["sample_volume"]) for row in rows}
     notes += volume_notes(pairs, NOTED if options.keep_volume else FAR)

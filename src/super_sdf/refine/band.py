@@ -297,5 +297,4 @@ def is_lipschitz(patches: FloatArray) -> BoolArray:
     This fails nearly everywhere in a noisy field, and in many places of a field that is not a
     distance.
     """
-    apart = np.abs(patches - patches[:, CENTRE, None])
-    return np.asarray((apart <= MAX_DIFFERENCE).all(1))
+    return np.asarray((np.abs(patches - patches[:, CENTRE, None]) <= MAX_DIFFERENCE).all(1))

@@ -88,8 +88,7 @@ def simplify_mesh(
         extra ``simplify`` is not installed, or simplifying would not fit in memory.
     """
     found = simplified(mesh, error, triangles, max_memory)
-    doubts = mesh.warnings + tell((), found.warnings)[1]
-    return replace(found, notes=mesh.notes, warnings=doubts)
+    return replace(found, notes=mesh.notes, warnings=mesh.warnings + tell((), found.warnings)[1])
 
 
 def simplified(

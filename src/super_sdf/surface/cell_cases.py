@@ -72,8 +72,7 @@ def _loops(inside: int, joined: int) -> Iterator[tuple[int, ...]]:
     """Yield the closed loops of cell edges that the surface crosses."""
     after: dict[int, int] = {}
     for n, face in enumerate(FACES):
-        bits = tuple(inside >> corner & 1 for corner in face)
-        after |= segments(n, bits, joined >> n & 1)
+        after |= segments(n, tuple(inside >> corner & 1 for corner in face), joined >> n & 1)
     while after:
         first, edge = after.popitem()
         loop = [first]

@@ -146,8 +146,7 @@ def _transform(file: _Bytes) -> NDArray[np.float64]:
         raise GridError(f"its transform is a {kind}: resample the grid to a linear transform")
     vectors = file.array(F8, MAPS[kind], 3)
     moved = vectors[0] if "Translat" in kind else np.zeros(3)
-    scale = vectors[-5] if "Scale" in kind else np.ones(3)
-    return np.column_stack([np.diag(scale), moved])
+    return np.column_stack([np.diag(vectors[-5] if "Scale" in kind else np.ones(3)), moved])
 
 
 class _Tree:

@@ -308,8 +308,7 @@ def wedges_of(point: Vectors, normal: Vectors, there: BoolArray) -> Wedges:
     stiffness = np.stack([(normal[i] * normal).sum(1) for i in range(3)]) / count
     values, vectors = np.linalg.eigh(np.moveaxis(stiffness, 2, 0))
     middle = (point * there).sum(1) / count
-    height = inner(point - middle[:, None], normal)
-    right = (height * normal).sum(1) / count
+    right = (inner(point - middle[:, None], normal) * normal).sum(1) / count
     inverse = np.where(values > RANK * values[:, -1:], 1 / np.maximum(values, 1e-9), 0)
     step = np.einsum("pij,pj->pi", vectors, inverse * np.einsum("pij,ip->pj", vectors, right))
     peak = middle + step.T
