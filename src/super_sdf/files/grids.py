@@ -139,7 +139,7 @@ def open_volume(
             request = Request(file, member or None, numbers, order, files, max_memory)
             yield getattr(readers, f"read_{format_.key}")(request), request
     except SuperSdfError as error:
-        if str(file) in error.flagged:
+        if str(file) in error.flagged.split(": ")[0]:  # not only in the way out
             raise
         raise type(error)(f"{path}: {error.flagged}") from None
     except MemoryError:
