@@ -148,8 +148,7 @@ def test_a_unit_is_stated_and_glb_is_in_metres(mesh, command):
         nibabel.save(image, "in.nii")
         assert command("upsample", "in.nii", "u.3mf", "--force", "-q")[0] == 0
         assert f'unit="{name}"' in ZipFile("u.3mf").read("3D/3dmodel.model").decode()
-    said = command("upsample", "in.nii", "v.3mf", "--unit", "mm")[2]
-    assert said == "Error: --unit mm: the file states um, leave it out\n"
+    assert "the file states um" in command("upsample", "in.nii", "v.3mf", "--unit", "mm")[2]
     place(0.5, 3.0)
     assert command("upsample", "in.npz", "mm.glb", "--unit", "mm", "-q")[0] == 0
     code, out, err = command("check", "mm.glb", "in.npz", "--unit", "mm", "--no-faults")

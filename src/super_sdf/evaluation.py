@@ -187,8 +187,7 @@ class Sampled:
         points, normals = self.drawn
         near = self.tree.query(points, EDGE_NEIGHBOURS, distance_upper_bound=EDGE_RADIUS)[1]
         or_none = np.append(normals, [[np.nan] * 3], axis=0)  # missing neighbours have the index n
-        cosine = np.abs(dot(normals[:, None], or_none[near]))
-        found = points[(cosine < SHARP_COSINE).any(1)]
+        found = points[(np.abs(dot(normals[:, None], or_none[near])) < SHARP_COSINE).any(1)]
         return found if len(found) else DOT.vertices
 
 

@@ -37,9 +37,9 @@ def check_has_volume(grid: SdfGrid, offset: float, *, cap: bool) -> None:
 
 def volume_notes(volumes: Mapping[str, tuple[float, float]], least: float = NOTED) -> list[str]:
     """Return a note on meshes whose volume is not that of their samples, both by a name."""
-    off = {name: mesh / samples - 1 for name, (mesh, samples) in volumes.items()}
-    far = [f"{name} {share:+.1%}" for name, share in off.items() if abs(share) > least]
-    way_out = " (see --keep-volume)" * (least == FAR)
+    off = {name: x for name, (mesh, own) in volumes.items() if abs(x := mesh / own - 1) > least}
+    way_out = " (see --keep-volume)" * (least == FAR and any(abs(x) < 0.5 for x in off.values()))
+    far = [f"{name} {share:+.1%}" for name, share in off.items()]
     return [f"volumes that are off those of the samples: {', '.join(far)}{way_out}"] * bool(far)
 
 

@@ -185,8 +185,7 @@ def lost_places(original: Solid, after: Mesh) -> Points | None:
     if count == left and 2 * (used - kept) == len(before.faces) - len(after.faces):
         return None
     component = root[before.faces[:, 0]]
-    some = np.unique(roots[after.faces[:, 0]])
-    found = component[original.nearest(after.vertices[some])[1]]
+    found = component[original.nearest(after.vertices[np.unique(roots[after.faces[:, 0]])])[1]]
     return before.vertices[before.faces[~np.isin(component, found)]].reshape(-1, 3)
 
 
