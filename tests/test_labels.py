@@ -178,9 +178,8 @@ def test_labels_may_be_nearly_whole_and_unknown_in_places(factor, fast):
     found, wanted = (reconstruct_labels(x, network=fast, spacing=1) for x in (stored, whole))
     assert found.keys() == wanted.keys()
     for label, mesh in found.items():
-        assert np.array_equal(
-            mesh.vertices, wanted[label].vertices
-        ) and "outside all labels" in str(mesh.notes)
+        assert np.array_equal(mesh.vertices, wanted[label].vertices)
+        assert "outside all labels" in str(mesh.notes)
 
 
 @pytest.mark.parametrize("message", UNFIT)
@@ -351,10 +350,7 @@ MASK = painted((18, 19, 20), (1, 1, 1), [ball((8.3, 9.1, 9.6), 6.7)]) > 0
 
 
 def test_keep_volume_is_advised_where_it_helps():
-    assert volume_notes({"speck": (0.3, 2)}, FAR)[0].endswith("samples: speck -85.0%")
-    assert volume_notes({"organ": (6, 8), "speck": (0.3, 2)}, FAR)[0].endswith(
-        "(see --keep-volume)"
-    )
+    assert ["keep" in volume_notes({"a": x}, FAR)[0] for x in ((0.3, 2), (6, 8))] == [False, True]
 
 
 def test_labels_have_the_volumes_of_their_samples_and_share_their_walls():
