@@ -143,10 +143,10 @@ def test_what_states_no_space_has_none(here, command):
     nrrd.write("plain.nrrd", VALUES, {"spacings": [0.5] * 3})
     nibabel.save(nibabel.Nifti1Image(VALUES, None), "plain.nii")
     for name in ("in.npz", "plain.nrrd", "plain.nii"):
-        said = f": {name} states neither RAS nor LPS, leave it out"
-        assert refusal(OptionError, read_grid, name, space="LPS") == f"space='LPS'{said}"
+        said = f"{name} states neither RAS nor LPS: leave out "
+        assert refusal(OptionError, read_grid, name, space="LPS") == f"{said}space='LPS'"
         code, _, err = command("upsample", name, "a.ply", "--space", "LPS")
-        assert code == 2 and err.endswith(f"--space LPS{said}\n")
+        assert code == 2 and err.endswith(f"{said}--space LPS\n")
 
 
 LEANING = np.array([[1, 0.3, 0], [0, np.sqrt(1 - 0.09), 0.2], [0, 0, np.sqrt(1 - 0.04)]])

@@ -142,7 +142,7 @@ class Volume:
         if space in (None, self.space):
             return self
         if self.space is None:
-            raise OptionError(f"--space {space}: {name} states neither RAS nor LPS, leave it out")
+            raise OptionError(f"{name} states neither RAS nor LPS: leave out --space {space}")
         turn = np.array([-1.0, -1.0, 1.0])  # between the two
         origin = None if self.origin is None else triple(turn * self.origin)
         turned = turn[:, None] * (XYZ if self.direction is None else self.direction)
