@@ -118,8 +118,7 @@ def find_image(
     if spacing is None:
         notes.append("spacing not given: taken as 1, since labels show none (give --spacing)")
     notes += ["origin not given: sample (0, 0, 0) is at 0, 0, 0"] * (origin is None)
-    is_float = samples.dtype.kind == "f"
-    if unknown := is_float and sum(int(np.isnan(plane).sum()) for plane in samples):
+    if unknown := int(samples.dtype.kind == "f" and sum(np.isnan(x).sum() for x in samples)):
         notes.append(f"{unknown:,} samples are unknown: taken as outside all labels")
     ends = [numbers.take(end, axis).ravel() for axis in range(3) for end in (0, -1)]
     if by := [[*counts][n - 1] for n in np.unique(np.concatenate(ends)) if n]:
