@@ -52,7 +52,7 @@ BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a r
     "cli": 898,  # 800; and standard streams, a row for each label, signals within a callback
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 90, 45, 114  # 90, 45, 110 in the design
-MOST_LINES, MOST_OF_ALL = 15_755, 36_000
+MOST_LINES, MOST_OF_ALL = 15_750, 36_000
 LIBRARIES = {"click", "numpy", "onnxruntime", "trimesh", "typing_extensions", "filelock", "psutil"}
 MODULES = {
     ".".join(path.relative_to(PACKAGE).with_suffix("").parts): path
