@@ -41,9 +41,9 @@ def start_command(*words: object) -> subprocess.Popen[str]:
 def wait_until(condition: Callable[[], bool]) -> bool:
     """Wait until a condition holds; return whether it does."""
     limit = time.monotonic() + PATIENCE
-    while not condition() and time.monotonic() < limit:
+    while not (holds := condition()) and time.monotonic() < limit:
         time.sleep(0.01)
-    return condition()
+    return holds
 
 
 def is_over(process: psutil.Process) -> bool:

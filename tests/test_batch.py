@@ -355,7 +355,7 @@ def test_a_batch_that_is_ended_or_killed_leaves_no_process_and_goes_on(number, b
 
 def test_ctrl_c_while_workers_start_is_one_line():
     """A terminal sends it to the workers, too."""
-    process = start_command("batch", "in", "--out", "out", "--jobs", 2, *SMALL)
+    process = start_command("batch", "in", "--out", "out", "--jobs", 2, *SMALL, "--factor", 16)
     workers = psutil.Process(process.pid).children
 
     def import_numpy():

@@ -49,7 +49,7 @@ BUDGETS = {  # of lines, for some rooms together, as in the design, or, with a r
     "simplify check truth evaluation": 1445,  # 1,100; the evaluation, for lab; what to simplify to
     "batch": 887,  # and what a page lacks is made again
     "pages": 384,
-    "cli": 898,  # 800; and standard streams, a row for each label, signals within a callback
+    "cli": 899,  # 800; and standard streams, a row for each label, signals within a callback
 }
 MOST_MODULES, MOST_LOADED, MOST_IMPORTS = 90, 45, 114  # 90, 45, 110 in the design
 MOST_LINES, MOST_OF_ALL = 15_750, 36_000

@@ -28,7 +28,7 @@ from .record import Row, fingerprint
 Task = TypeVar("Task")
 EXIT_SECONDS = 10.0  # that a broken process may take to end
 SPAWN = multiprocessing.get_context("spawn")  # forking harms the threads of onnxruntime
-mask: Any = getattr(signal, "pthread_sigmask", lambda *_: None)  # Windows has none
+sigmask: Any = getattr(signal, "pthread_sigmask", lambda *_: None)  # Windows has none
 load_once = lru_cache(maxsize=1)(load_network)
 
 
@@ -151,10 +151,10 @@ def work_in_processes(
     try:
         while True:
             while len(running) < count and (task := take()) is not None:
-                mask(signal.SIG_BLOCK, [signal.SIGINT])  # also in the process, which ignores it
+                sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # the process inherits it
                 worker = idle.pop() if idle else Worker(work)
                 running[worker.pipe] = worker, task
-                mask(signal.SIG_UNBLOCK, [signal.SIGINT])
+                sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
                 with suppress(OSError):  # if it has died, there is no answer, either
                     worker.pipe.send(task)
             if not running:
@@ -172,4 +172,4 @@ def work_in_processes(
     finally:
         for worker in (*idle, *(worker for worker, _ in running.values())):
             worker.end()
-        mask(signal.SIG_UNBLOCK, [signal.SIGINT])
+        sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])

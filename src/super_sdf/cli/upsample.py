@@ -72,7 +72,8 @@ def command(source: str, target: str, **given: Any) -> None:
         report |= {"precision": network.precision, "device": network.device}
         report |= {"device_notes": list(network.notes), **done.facts}
         seconds, start = seconds | done.seconds, time.perf_counter()
-        report["network"] = sha256(network.path.read_bytes()).hexdigest()
+        if given["as_json"] or page:
+            report["network"] = sha256(network.path.read_bytes()).hexdigest()
         if given["check"]:
             from ..check import check_mesh
             from ..truth import merged

@@ -1,9 +1,9 @@
 """How far a simplified mesh is from the mesh that it was made of, in both directions.
 
 Between two meshes that lie close to each other, distances are largest at vertices of either mesh
-and where their edges cross. So measured are the vertices of both, points along the edges of the
-simplified mesh, its centroids, and points along those edges of the original mesh whose ends are
-nearest to triangles that meet at an angle. Each distance is exact, from a point to triangles.
+and where their edges cross. So measured are the vertices of both, points along the edges and in
+the triangles of the simplified mesh, and points along those edges of the original mesh whose ends
+are nearest to triangles that meet at an angle. Each distance is exact, from a point to triangles.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Deviation(NamedTuple):
 
     largest: float  # from vertices of the mesh and points on its edges
     mean: float
-    largest_back: float  # from vertices of the simplified mesh, points on its edges, and centroids
+    largest_back: float  # from points of the simplified mesh: vertices, on edges, in triangles
     mean_back: float
 
 

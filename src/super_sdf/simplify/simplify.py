@@ -108,8 +108,7 @@ def simplified(
     if not count:
         return SimplifiedMesh(mesh.vertices, mesh.faces, 0, SAME)
     of, warnings = Unsimplified(Walls.of(mesh)), tuple[str, ...]()
-    found = within(of, error or 0.0) if triangles is None else down_to(of, triangles)
-    found = found or of.walls
+    found = (within(of, error or 0.0) if triangles is None else down_to(of, triangles)) or of.walls
     if triangles is None and len(found.faces) == count:
         warnings = (NONE_SPARED,)
     elif triangles is not None and len(found.faces) > triangles:
