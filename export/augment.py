@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from export.dataset import Sample, fill_shard, parser_of_options
-from super_sdf.arrays import NEIGHBOURHOOD, STRIDES, IntArray
+from super_sdf.arrays import NEIGHBOURHOOD, STRIDES, BoolArray, IntArray
 from super_sdf.grid import derived
 from super_sdf.network import contract
 from super_sdf.refine import band
@@ -42,7 +42,7 @@ CLEAN = Shares(0, 0, 0)
 class Prepared:
     """A sample as the network's inputs, with the targets."""
 
-    patches: Tensor  # (V, 27) float32
+    patches: Tensor  # (V, 27) float32; of masks also the ``wide_distances`` of each voxel
     table: Tensor  # (V, 27) int64 rows of the band, -1 where absent
     voxels: Tensor  # (D,) int64 rows of the band that have targets
     offsets: Tensor  # (Q, 3) float32
@@ -52,15 +52,22 @@ class Prepared:
         return Prepared(*(tensor.to(device) for tensor in vars(self).values()))
 
 
-def prepare(sample: Sample) -> Prepared:
-    """Gather a sample with the functions of the runtime; targets outside the band are dropped."""
+def prepare(sample: Sample, inside: BoolArray | None = None) -> Prepared:
+    """Gather a sample with the functions of the runtime; targets outside the band are dropped.
+
+    ``inside`` is the mask that the sample was made of, with a margin of its own.
+    """
     ijk = np.argwhere(band.is_active(sample.window)).astype(np.int32)
     shape = sample.window.shape
     rows = np.full(shape, -1)
     rows[tuple(ijk.T)] = np.arange(len(ijk))
     voxels = rows[tuple(sample.voxel_ijk.T)]
+    patches = band.gather_patches(sample.window, ijk)
+    if inside is not None:
+        wide = derived.wide_distances(inside, ijk + (len(inside) - shape[0]) // 2)
+        patches = np.hstack([patches, 2 * wide])
     arrays = (
-        band.gather_patches(sample.window, ijk),
+        patches,
         band.neighbour_table(ijk, shape).astype(np.int64),
         voxels[voxels >= 0],
         sample.offsets,
@@ -81,14 +88,16 @@ def turned(sample: Prepared, number: int) -> Prepared:
     symmetry = cube_symmetries()[number]
     places = torch.from_numpy((NEIGHBOURHOOD @ symmetry + 1) @ STRIDES).to(sample.table)
     offsets = sample.offsets @ torch.from_numpy(symmetry.T).to(sample.offsets)
-    patches, table = sample.patches[:, places], sample.table[:, places]
+    others = torch.arange(27, sample.patches.shape[1], device=places.device)
+    patches, table = sample.patches[:, torch.cat([places, others])], sample.table[:, places]
     return replace(sample, patches=patches, table=table, offsets=offsets)
 
 
 def change(rng: np.random.Generator, sample: Sample, inputs: str, shares: Shares) -> Prepared:
     """Make a mask of a sample, or shift, roughen and truncate some; then gather it."""
     if inputs == contract.MASKS:
-        return prepare(masked(rng, sample))
+        return masked(rng, sample)
+    sample = sample.cropped()
     window, targets = sample.window, sample.targets.astype(np.float32)
     if rng.random() < shares.shifted:  # another zero level, up to half a voxel away (Sec. 5.3)
         level = np.float32(rng.uniform(-1, 1))
@@ -103,16 +112,21 @@ def change(rng: np.random.Generator, sample: Sample, inputs: str, shares: Shares
     return prepared
 
 
-def masked(rng: np.random.Generator, sample: Sample) -> Sample:
-    """Replace the distances by those of the mask at a level up to half a voxel from zero.
+def masked(rng: np.random.Generator, sample: Sample) -> Prepared:
+    """Gather what is known of the mask of a sample at a level up to half a voxel from zero.
 
     Without a sample on each side there is nothing to learn: the window is then empty, and so is the
     band.
     """
     level = np.float32(rng.uniform(-1, 1))
     targets = sample.targets.astype(np.float32) - level
-    window = 2 * derived.mask_distances(sample.window < level)
-    return replace(sample, window=window, targets=targets)
+    return of_mask(replace(sample, targets=targets), sample.window < level)
+
+
+def of_mask(sample: Sample, inside: BoolArray) -> Prepared:
+    """Gather what is known of a mask, (nx, ny, nz), with the targets of a sample."""
+    window = 2 * derived.mask_distances(inside)
+    return prepare(replace(sample, window=window).cropped(), inside)
 
 
 def draw_samples(count: int = 200, inputs: str = DISTANCES) -> list[Prepared]:

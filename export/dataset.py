@@ -34,6 +34,7 @@ from export.shapes.smooth import RADII, Field, draw_smooth, foot_points, length,
 from export.shapes.solid import FAMILIES, random_solid
 from super_sdf import Mesh
 from super_sdf.errors import FileError
+from super_sdf.grid.derived import BLURRED
 from super_sdf.refine import band, nodes
 from super_sdf.truth import Solid, read_mesh, sample_solid
 
@@ -56,8 +57,14 @@ class Sample:
 
     window: np.ndarray
     offsets: np.ndarray
-    voxel_ijk: np.ndarray
+    voxel_ijk: np.ndarray  # counted from the margin on
     targets: np.ndarray
+    margin: int = 0  # samples beside the window, on every side, from which masks are made
+
+    def cropped(self) -> Sample:
+        """Return the sample without the margin."""
+        inner = tuple(slice(self.margin, n - self.margin) for n in self.window.shape[:3])
+        return replace(self, window=self.window[inner], margin=0)
 
 
 def draw_pose(
@@ -102,6 +109,7 @@ def make_sample(
     sizes: tuple[float, float] = SIZES,
     slices: float = 1.0,
     lowest: tuple[float, float] = (-np.inf, np.inf),
+    margin: int = 0,
 ) -> Sample | None:
     """Sample a shape; return None if no sample is near the surface, or all are inside.
 
@@ -111,31 +119,35 @@ def make_sample(
     posed = draw_pose(rng, mesh, sizes, slices)
     shape, first = draw_window(rng, posed)
     truth = Solid(posed)
-    values = sample_solid(truth, (shape, 1.0, first)).values
-    window = 2 * values
-    voxel_ijk = np.argwhere(np.abs(window) <= band.DECODE_LIMIT)
+    wide = tuple(n + 2 * margin for n in shape)
+    whole = (
+        2 * sample_solid(truth, (wide, 1.0, first - margin), band=4.0 if margin else None).values
+    )
+    values = whole[tuple(slice(margin, margin + n) for n in shape)] / 2
+    voxel_ijk = np.argwhere(np.abs(2 * values) <= band.DECODE_LIMIT)
     if not lowest[0] < values.min() < lowest[1] or not len(voxel_ijk) or (values < 0).all():
         return None
     offsets = draw_offsets(rng)
     points = (voxel_ijk[:, None] + first + offsets / 2).reshape(-1, 3)
     targets = 2 * signed_distance(rng, truth, points).reshape(len(voxel_ijk), -1)
-    return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets.astype(np.float16))
+    return Sample(whole, offsets, voxel_ijk.astype(np.uint8), targets.astype(np.float16), margin)
 
 
-def make_smooth_sample(rng: np.random.Generator, slices: float) -> Sample:
+def make_smooth_sample(rng: np.random.Generator, slices: float, margin: int = 0) -> Sample:
     """Sample a smooth body, half of them inverted, round a point of its surface."""
     sample = None
     while sample is None:
         field = draw_smooth(rng, slices)
         middle = foot_points(field, rng.normal(size=(1, 3)) * log_uniform(rng, *RADII))
-        sample = sample_field(rng, field, middle - WINDOW * rng.uniform(0.3, 0.7, (1, 3)), WINDOW)
+        low = middle - WINDOW * rng.uniform(0.3, 0.7, (1, 3))
+        sample = sample_field(rng, field, low, WINDOW, margin)
     if rng.random() < 0.5:
         return replace(sample, window=-sample.window, targets=-sample.targets)
     return sample
 
 
 def sample_field(
-    rng: np.random.Generator, field: Field, low: np.ndarray, size: int
+    rng: np.random.Generator, field: Field, low: np.ndarray, size: int, margin: int = 0
 ) -> Sample | None:
     """Sample the exact distance to the zero of a field in a cube from ``low`` on.
 
@@ -143,13 +155,15 @@ def sample_field(
     not certain, or hardly any sample is near the surface.
     """
     first = np.floor(low)
-    points = np.indices((size,) * 3).reshape(3, -1).T + first
+    wide = size + 2 * margin
+    points = np.indices((wide,) * 3).reshape(3, -1).T + (first - margin)
     values, gradients = field(points)
     values /= np.maximum(length(gradients), 1e-6)
     near = np.abs(values) < SETTLED_WITHIN
     values[near], off = settle(field, points[near])
-    window = 2 * values.reshape((size,) * 3).astype(np.float32)
-    voxel_ijk = np.argwhere(np.abs(window) <= band.DECODE_LIMIT)
+    window = 2 * values.reshape((wide,) * 3).astype(np.float32)
+    inner = window[(slice(margin, margin + size),) * 3]
+    voxel_ijk = np.argwhere(np.abs(inner) <= band.DECODE_LIMIT)
     voxel_ijk = voxel_ijk[(np.abs(voxel_ijk - (size - 1) / 2) < size / 2 - EDGE).all(1)]
     if len(voxel_ijk) < FEWEST or off.max() > UNSETTLED:
         return None
@@ -158,7 +172,7 @@ def sample_field(
     if off.max() > UNSETTLED:
         return None
     targets = 2 * targets.reshape(len(voxel_ijk), -1).astype(np.float16)
-    return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets)
+    return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets, margin)
 
 
 def signed_distance(rng: np.random.Generator, truth: Solid, points: np.ndarray) -> np.ndarray:
@@ -190,6 +204,7 @@ def write_shard(path: Path, samples: list[Sample]) -> None:
             voxel_ijk=np.concatenate([s.voxel_ijk for s in samples]),
             targets=np.concatenate([s.targets for s in samples]),
             voxel_count=np.array([len(s.voxel_ijk) for s in samples]),
+            margin=np.array(samples[0].margin),
         )
     part.rename(path)
 
@@ -206,8 +221,10 @@ def read_shard(path: Path) -> Iterator[Sample]:
     windows = np.split(shard["windows"], window_ends[:-1])
     voxels = np.split(shard["voxel_ijk"], voxel_ends[:-1])
     targets = np.split(shard["targets"], voxel_ends[:-1])
+    margin = int(shard["margin"])
     for n, shape in enumerate(shard["window_shape"]):
-        yield Sample(windows[n].reshape(shape), shard["offsets"][n], voxels[n], targets[n])
+        window = windows[n].reshape(shape)
+        yield Sample(window, shard["offsets"][n], voxels[n], targets[n], margin)
 
 
 def mesh_order(folder: Path | None, count: int, seed: int) -> list[Path]:
@@ -249,15 +266,17 @@ def fill_shard(
         thin = rng.random() < options.thin
         sample, file = None, files[number] if files and not thin else None
         if options.smooth:
-            sample = make_smooth_sample(rng, options.slices)
+            sample = make_smooth_sample(rng, options.slices, options.margin)
         elif file and rng.random() >= options.procedural:
-            sample = make_sample(rng, draw_mesh(rng, file), options.sizes, options.slices)
+            mesh = draw_mesh(rng, file)
+            sample = make_sample(rng, mesh, options.sizes, options.slices, margin=options.margin)
         while sample is None:
             mesh = random_solid(rng, options.families)
             if thin:  # squeezed along its axes until hardly any sample lies inside
                 mesh = mesh.transformed(np.diag(np.exp(rng.normal(0, 1, 3))), np.zeros(3))
             lowest = THIN if thin else (-np.inf, np.inf)
-            sample = make_sample(rng, mesh, options.sizes, options.slices, lowest)
+            size = options.sizes, options.slices
+            sample = make_sample(rng, mesh, *size, lowest, options.margin)
         samples.append(sample)
     return samples
 
@@ -274,6 +293,8 @@ def parser_of_options() -> Parser:
     add("--sizes", type=positive, nargs=2, default=SIZES, help="voxels along a diagonal, from, to")
     thick = f"thickest slices, over the other spacings, of {SLICED:g} of the samples"
     add("--slices", type=positive, default=1.0, help=thick)
+    beside = f"samples beside a window, on which distances of masks depend: {BLURRED} for masks"
+    add("--margin", type=at_least(0), default=0, help=beside)
     add("--smooth", action="store_true", help="smooth bodies, in shards of their own")
     add("--out", type=Path, required=True, help="folder for the shards")
     add("--count", type=at_least(1), default=5000, help="samples to make")

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from export.arguments import Parser
-from export.augment import DISTANCES, Prepared, prepare
+from export.augment import DISTANCES, Prepared, of_mask
 from export.dataset import Sample
 from export.losses import measure
 from export.network import SuperSdfNet
@@ -48,12 +48,12 @@ def reach_of(net: SuperSdfNet) -> float:
     goes half of the way, and half of ``STEPPED`` if all do.
     """
     x, _, z = np.indices((2 * STEP, 2 * STEP, 2 * STEP))
-    window = 2 * mask_distances(z < STEP + (x >= STEP))
-    voxel_ijk = np.argwhere(np.abs(window) < 2)  # beside the plane
+    inside = z < STEP + (x >= STEP)
+    voxel_ijk = np.argwhere(np.abs(mask_distances(inside)) < 1)  # beside the plane
     nowhere = np.zeros((1, 3), np.float32), voxel_ijk, np.zeros((len(voxel_ijk), 1), np.float32)
     device = net.correction.weight.device.type
-    plane = prepare(Sample(window, *nowhere)).on(device)
-    values = np.full(window.shape, np.nan)
+    plane = of_mask(Sample(inside, *nowhere), inside).on(device)
+    values = np.full(inside.shape, np.nan)
     at_samples = net(plane.patches, plane.table, plane.voxels, plane.offsets)
     values[tuple(voxel_ijk.T)] = at_samples[:, 0].cpu()
     inside, outside = values[STEP : STEP + STEPPED, STEP, STEP : STEP + 2].T

@@ -43,6 +43,7 @@ class NetworkConfig:
     frequencies: int = 4
     keeps_samples: bool = True  # the sample's value, where it can be a distance; not with masks
     gated: int = 0  # of the blocks, the last ones, that run only where the gate is open
+    wide: int = 0  # inputs of a voxel besides its patch: of masks, ``grid.derived.wide_distances``
     places: tuple[int, ...] = ()  # that each of ``all_blocks`` sees; all 27 if nothing is given
 
     @property
@@ -52,9 +53,11 @@ class NetworkConfig:
 
 SIZES = {
     "fast": NetworkConfig(blocks=4, functions=192),
-    "base": NetworkConfig(channels=96, blocks=12, hidden=192, functions=320, gated=6),
+    "base": NetworkConfig(
+        channels=96, blocks=12, hidden=192, functions=320, gated=6, places=(19,) * 6 + (7,) * 7
+    ),
     "noisy": NetworkConfig(blocks=9),
-    "mask": NetworkConfig(blocks=9, keeps_samples=False),
+    "mask": NetworkConfig(blocks=9, keeps_samples=False, wide=2),
 }
 """The sizes of the shipped networks, by name."""
 
@@ -229,7 +232,7 @@ class Encoded:
     """The inputs of the head for each voxel; of a gated network also what the first blocks say."""
 
     features: Tensor  # (V, C)
-    patches: Tensor  # (V, 27)
+    patches: Tensor  # (V, 27 or more)
     noisy: Tensor  # (V, 1) of 0 and 1
     early: Tensor | None = None  # (V, C) features after the block for voxels that go no deeper
     doubts: Tensor | None = None  # (V,) logarithm of what is lost with these
@@ -244,7 +247,9 @@ def is_noisy(patches: Tensor, table: Tensor) -> Tensor:
     In such a patch two samples differ by more than their distance, as in
     ``refine.band.is_lipschitz``.
     """
-    excess = (patches - patches[:, CENTRE, None]).abs() - patches.new_tensor(band.MAX_DIFFERENCE)
+    excess = (patches[:, :27] - patches[:, CENTRE, None]).abs() - patches.new_tensor(
+        band.MAX_DIFFERENCE
+    )
     most = torch.cat([excess.amax(1), patches.new_zeros(1)])
     return (most[table].amax(1, keepdim=True) > 0).float()
 
@@ -256,7 +261,9 @@ class SuperSdfNet(nn.Module):
         super().__init__()
         self.config = config
         self.stem = nn.Sequential(
-            nn.Linear(27, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.channels)
+            nn.Linear(27 + config.wide, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, config.channels),
         )
         places = config.places or [27] * (config.blocks + 1)
         self.blocks = nn.ModuleList(Block(config, count) for count in places[: config.blocks])
@@ -316,7 +323,7 @@ class SuperSdfNet(nn.Module):
         with in_float32(offsets):
             features, at = voxels.features.float(), offsets.flatten(0, 1)
             branch = torch.relu(self.branch(features))
-            inputs = torch.cat([features, branch, voxels.patches], 1)
+            inputs = torch.cat([features, branch, voxels.patches[:, :27]], 1)
             functions = torch.cat([self.trunk(at), interpolation_weights(at)], 1)
             parts = zip(inputs.split(counts), functions.view(*offsets.shape[:2], -1))
             values = torch.cat([some @ weights.T for some, weights in parts])

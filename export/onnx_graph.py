@@ -141,7 +141,7 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     scan_head(graph, whole, excess, graph.op("Transpose", per_offset, perm=[1, 0]))
     graph.constants.append(numpy_helper.from_array(np.array([CHUNK], np.int64), CHUNK_INPUT))
     inputs = [
-        declared("patches", TensorProto.FLOAT, ["V", 27]),
+        declared("patches", TensorProto.FLOAT, ["V", 27 + net.config.wide]),
         declared("neighbours", TensorProto.INT32, ["V", 27]),
         declared("voxels", TensorProto.INT32, ["D"]),
         declared("offsets", TensorProto.FLOAT, ["Q", 3]),
@@ -170,6 +170,13 @@ def masked_chunks(graph: Graph, numbers: str, count: str) -> tuple[str, str]:
     return present, graph.op("Reshape", there, column)
 
 
+def samples_of(body: Graph, patches: str) -> str:
+    """Return patches without the inputs besides the samples, (n, 27)."""
+    if not body.net.config.wide:
+        return patches
+    return body.op("Slice", patches, body.wholes(0), body.wholes(27), body.wholes(1))
+
+
 def scan_stem(graph: Graph, numbers: str, there: str) -> tuple[str, str]:
     """Add the stem; return features (n, chunk, C) and excess (n chunk, 1).
 
@@ -178,7 +185,7 @@ def scan_stem(graph: Graph, numbers: str, there: str) -> tuple[str, str]:
     body = Graph(graph.net, "stem_")
     patch = body.op("Gather", "patches", "some", axis=0)
     made = body.two_layers(patch, graph.net.stem[0], graph.net.stem[2])
-    features = body.op("Mul", made, "there")
+    features, patch = body.op("Mul", made, "there"), samples_of(body, patch)
     centre = body.op("Gather", patch, body.wholes(CENTRE), axis=1)
     apart = body.op("Abs", body.op("Sub", patch, centre))
     beyond = body.op("Sub", apart, body.constant(band.MAX_DIFFERENCE))
@@ -271,7 +278,7 @@ def scan_head(graph: Graph, features: str, excess: str, per_offset: str) -> None
     body, net = Graph(graph.net, "head_"), graph.net
     chosen = body.op("Gather", features, "some", axis=0)
     branch = body.op("Relu", body.layer(chosen, net.branch))
-    patches = body.op("Gather", "patches", "some", axis=0)
+    patches = samples_of(body, body.op("Gather", "patches", "some", axis=0))
     kept = body.op("MatMul", body.op("Concat", chosen, branch, patches, axis=1), per_offset)
     correction = body.layer(chosen, net.correction)
     if net.config.keeps_samples:

@@ -24,6 +24,7 @@ from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
 from super_sdf import load_network
 from super_sdf.errors import ModelError
+from super_sdf.grid.derived import BLURRED
 from super_sdf.network import contract
 from super_sdf.refine import band, nodes
 
@@ -55,7 +56,7 @@ def write_model(net: SuperSdfNet, path: Path, card: dict[str, Any]) -> None:
     onnx.save(model, path)
 
 
-def noisy_ball(seed: int = 0) -> tuple[np.ndarray, ...]:
+def noisy_ball(seed: int = 0, wide: int = 0) -> tuple[np.ndarray, ...]:
     """Return inputs to compare networks on: noisy, and with voxels that are not decoded."""
     rng = np.random.default_rng(seed)
     ijk = np.indices((24, 20, 22))
@@ -63,13 +64,14 @@ def noisy_ball(seed: int = 0) -> tuple[np.ndarray, ...]:
     rescaled = (2 * (radius - 7) + rng.normal(0, 0.3, radius.shape)).astype(np.float32)
     ijk = np.argwhere(band.is_active(rescaled)).astype(np.int32)
     patches, table = band.gather_patches(rescaled, ijk), band.neighbour_table(ijk, rescaled.shape)
+    others = rng.normal(0, 1, (len(ijk), wide)).astype(np.float32)
     voxels = np.flatnonzero(rng.random(len(ijk)) < 0.7).astype(np.int32)
-    return patches, table, voxels, nodes.block_offsets(4)
+    return np.hstack([patches, others]), table, voxels, nodes.block_offsets(4)
 
 
 def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
     """Return the largest difference (half voxels) between torch and onnxruntime on a noisy ball."""
-    arrays = noisy_ball(seed)
+    arrays = noisy_ball(seed, net.config.wide)
     got = load_network(path, device="cpu")(*arrays)
     with torch.no_grad():
         want = net(*(torch.from_numpy(array) for array in arrays))
@@ -99,6 +101,7 @@ def read_network(path: Path) -> SuperSdfNet:
         trunk=trunk,
         frequencies=(inputs - 3) // 6,
         keeps_samples=card.get("inputs") != contract.MASKS,
+        wide=weights["stem.0.weight"].shape[1] - 27,
         gated=int(card.get("gated", 0)),
         places=() if set(places) == {27} else places,
     )
@@ -123,7 +126,7 @@ def make_card(
         "format_version": contract.FORMAT_VERSION,
         "name": name,
         "band": "abs(value) < 1.5 h",
-        "receptive_field": net.config.receptive_field,
+        "receptive_field": net.config.receptive_field + BLURRED * bool(net.config.wide),
         "channels": net.config.channels,
         "value_scaling": "2 / h",
         "training_factors": [2, 4, 8, 16],
@@ -133,7 +136,7 @@ def make_card(
         "accuracy": accuracy,
         "licence": "MIT",
         **({} if inputs == DISTANCES else {"inputs": inputs}),
-        **({"gated": net.config.gated} if net.config.gated else {}),
+        **{name: n for name in ("gated", "wide") if (n := getattr(net.config, name))},
     }
 
 

@@ -94,6 +94,9 @@ class Run:
         for name, array in fresh.items():
             if name not in weights and ".reduce." in name:
                 array.zero_()
+            if name == "stem.0.weight" and name in weights:
+                more = array.shape[1] - weights[name].shape[1]  # inputs that change nothing yet
+                weights[name] = torch.nn.functional.pad(weights[name], (0, more))
             if name in weights and name.endswith("conv.weight"):
                 weights[name] = of_places(weights[name], len(array))
         try:
@@ -246,7 +249,7 @@ def run_training(options: argparse.Namespace) -> None:
         blocks=options.blocks or size.blocks,
         keeps_samples=options.inputs == DISTANCES,
         gated=size.gated if options.gated is None else options.gated,
-        places=tuple(options.places),
+        places=tuple(options.places) or (() if options.blocks else size.places),
     )
     drawn = {name: getattr(options, name) for name in ("shifted", "noisy", "truncated")}
     recipe = replace(

@@ -13,7 +13,7 @@ from solids import box_distance
 
 from super_sdf import make_grid, reconstruct
 from super_sdf.errors import GridError
-from super_sdf.grid import look, samples
+from super_sdf.grid import derived, look, samples
 from super_sdf.grid.sdf_grid import crop
 from super_sdf.options import OPTIONS
 
@@ -351,6 +351,21 @@ def test_a_mask_shows_no_spacing():
         "1, since a mask shows none (give spacing=)",
         "0.37, the step of the transform",
     ]
+
+
+@pytest.mark.parametrize("radius", [8, 28])
+def test_a_blurred_mask_tells_distances_from_a_ball_without_a_bias(radius):
+    side = 2 * radius + 9
+    ijk = np.indices((side,) * 3).reshape(3, -1).T
+    away = np.linalg.norm(ijk - (radius + np.array([3.6, 4.1, 4.3])), axis=1) - radius
+    inside, near = (away < 0).reshape((side,) * 3), np.abs(away) < 0.5
+    found = derived.wide_distances(inside, ijk[near])
+    off = found - away[near, None]
+    assert (np.abs(off).mean(0) < [0.07, 0.04]).all() and (np.abs(off.mean(0)) < 0.015).all()
+    np.testing.assert_allclose(derived.wide_distances(~inside, ijk[near]), -found, atol=1e-6)
+    own, first = ijk[near][:, 0] >= 2 * derived.BLURRED, derived.BLURRED
+    some = derived.wide_distances(inside[first:], ijk[near][own] - [first, 0, 0])
+    np.testing.assert_array_equal(some, found[own])
 
 
 def test_a_smooth_field_of_another_slope_is_that_of_its_spline():

@@ -20,7 +20,7 @@ from super_sdf import errors, load_network, reconstruct
 from super_sdf.cli import info
 from super_sdf.errors import EXTRAS, DeviceError, FileError, ModelError, OptionError
 from super_sdf.network import network, onnx
-from super_sdf.network.contract import INPUTS, TRIAL
+from super_sdf.network.contract import INPUTS, trial
 from super_sdf.network.network import KIND_MODELS, shipped_models
 from super_sdf.network.onnx import CHUNK_INPUT, CPU, CUDA, CUDA_OPTIONS, VERSION, ort
 from super_sdf.options import QUALITIES
@@ -264,7 +264,7 @@ def test_a_provider_that_falls_back_or_fails_is_an_error(cuda_session):
     cuda_session.run_with_iobinding.side_effect = RuntimeError(said)
     failed = "the network failed on cuda: CUDA failure 2: out of memory"
     with pytest.raises(DeviceError, match=f"^{failed}$"):
-        loaded(*TRIAL.values())
+        loaded(*trial().values())
     with pytest.raises(DeviceError, match=f"^{ASKED}{failed}; or use device='cpu'$"):
         load_network(device="cuda")
     cuda_session.get_providers.return_value = [CPU]

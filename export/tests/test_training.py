@@ -8,12 +8,14 @@ import torch
 
 from export import dataset, measure, store, to_onnx, train
 from export.augment import CLEAN, DISTANCES, USUAL, change, masked, turned
+from export.dataset import Sample
 from export.losses import RECIPE, batch_of, errors_of, predict, window_losses
 from export.network import PLACES, SuperSdfNet, interpolation_weights
 from export.store import Sampler, Store, chances
 from export.tests.conftest import SMALL
 from super_sdf import load_network
 from super_sdf.arrays import CENTRE, NEIGHBOURHOOD
+from super_sdf.grid.derived import BLURRED
 from super_sdf.network import contract
 from super_sdf.refine import nodes
 
@@ -36,7 +38,8 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys):
     assert len(lines[1]) == len(train.COLUMNS) and np.isfinite(float(lines[1][-1]))
     to_onnx.main(["--run", str(run), "--out", str(file)])
     card = load_network(file).card
-    assert card["inputs"] == contract.MASKS and card["receptive_field"] == 10
+    assert card["inputs"] == contract.MASKS and card["wide"] == 2
+    assert card["receptive_field"] == 10 + BLURRED
     measure.main(["--store", str(folder), str(file), str(run)])
     tables = capsys.readouterr().out
     assert "| small.onnx | 0." in tables and "| bias | reach |" in tables
@@ -82,13 +85,21 @@ def test_a_turned_sample_of_a_plane_is_one_of_the_turned_plane(prepared):
         torch.testing.assert_close(values, now.targets, atol=1e-5, rtol=0)
 
 
-def test_masks_have_the_sides_of_a_level_and_its_targets(samples):
-    sample = samples[0]
-    mask = masked(np.random.default_rng(0), sample)
-    level = float(np.median(sample.targets.astype(np.float32) - mask.targets))
-    assert abs(level) <= 1 == np.abs(mask.window).min()  # half a voxel
-    np.testing.assert_array_equal(mask.window < 0, sample.window < np.float32(level))
-    rough = change(np.random.default_rng(0), sample, DISTANCES, replace(CLEAN, noisy=1))
+def test_masks_have_the_sides_of_a_level_and_its_targets():
+    """And the wide distances, to a third of the error of those half-way between samples."""
+    away = np.linalg.norm(np.indices((44, 44, 44)).T - 21.3, axis=-1).T - 9.2
+    inner = away[(slice(BLURRED, -BLURRED),) * 3]
+    ijk = np.argwhere(np.abs(inner) < 1)
+    targets = 2 * inner[tuple(ijk.T)][:, None]
+    ball = Sample(2 * away, np.zeros((1, 3), np.float32), ijk, targets, BLURRED)
+    mask = masked(np.random.default_rng(0), ball)
+    found, level = mask.patches[mask.voxels].numpy(), float((targets - mask.targets.numpy())[0, 0])
+    assert len(found) == len(ijk) and np.abs(found[:, CENTRE]).min() == 1  # half a voxel
+    np.testing.assert_array_equal(found[:, CENTRE] < 0, targets[:, 0] < level)
+    near = np.abs(targets[:, 0] - level) < 1
+    off = np.abs(found - mask.targets.numpy())[near].mean(0)
+    assert off[28] < off[CENTRE] / 3
+    rough = change(np.random.default_rng(0), ball, DISTANCES, replace(CLEAN, noisy=1))
     assert torch.isfinite(rough.patches).all()
 
 
@@ -167,7 +178,7 @@ def test_blocks_that_see_fewer_places_start_with_the_weights_of_these(tmp_path, 
 
 
 def test_the_reach_is_what_a_step_in_a_plane_moves_the_surface_beside_it():
-    net = SuperSdfNet(replace(SMALL, keeps_samples=False))
+    net = SuperSdfNet(replace(SMALL, keeps_samples=False, wide=2))
     torch.nn.init.zeros_(net.correction.weight)
     torch.nn.init.constant_(net.correction.bias, 0.4)  # half voxels, so a fifth of a voxel
     assert measure.reach_of(net) == pytest.approx(0.2 * measure.STEPPED, abs=1e-6)

@@ -3,9 +3,10 @@
 Inputs are ``patches`` (V, 27), ``neighbours`` (V, 27), ``voxels`` (D,) and ``offsets`` (Q, 3); the
 output is ``values`` (D, Q). Distances and offsets are in half voxels. The metadata, the model card,
 holds the training factors, data and accuracy, the width (``channels``), and the receptive field; a
-network that sees farther, up to the whole grid, states none. Its entry ``inputs`` is what the
-network was trained on: ``EXACT_DISTANCES``, hardly any of them noisy; or ``MASKS``; without the
-entry, distances of which some were noisy.
+network that sees farther, up to the whole grid, states none. If it states ``wide``, 2, patches have
+two more columns: ``grid.derived.wide_distances``. Its entry ``inputs`` is what the network was
+trained on: ``EXACT_DISTANCES``, hardly any of them noisy; or ``MASKS``; without the entry,
+distances of which some were noisy.
 """
 
 from __future__ import annotations
@@ -32,18 +33,18 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT = {"values": "tensor(float)"}
-WHOLE = ("receptive_field", "channels")  # of a card: voxels to each side, and width
-TRIAL: dict[str, Any] = {  # one voxel, and two offsets to notice an output with its axes swapped
-    "patches": np.zeros((1, 27), np.float32),
-    "neighbours": np.full((1, 27), -1, np.int32),
-    "voxels": np.zeros(1, np.int32),
-    "offsets": np.zeros((2, 3), np.float32),
-}
+WHOLE = ("receptive_field", "channels", "wide")  # of a card: voxels to each side, width, inputs
 MAX_VALUE = np.float32(1e15)  # half voxels; sums of squares are still finite in single precision
 Decoder = Callable[[FloatArray, IntArray, IntArray, FloatArray], FloatArray]
 """A network, or any function, that returns values (D, Q) of patches (V, 27), neighbour table
 (V, 27), voxels (D,) and offsets (Q, 3). It may have the attributes of ``Adapter``.
 """
+
+
+def trial(wide: int = 0) -> dict[str, Any]:
+    """Return inputs of one voxel, and two offsets, to notice an output with its axes swapped."""
+    arrays = np.zeros((1, 27 + wide), np.float32), np.full((1, 27), -1, np.int32)
+    return dict(zip(INPUTS, (*arrays, np.zeros(1, np.int32), np.zeros((2, 3), np.float32))))
 
 
 def read_card(session: Any, path: Path) -> dict[str, Any]:
@@ -76,6 +77,7 @@ class Adapter:
     receptive_field: int | None = None  # voxels to each side; None: it must see the whole band
     memory_bytes: tuple[float, float] = (680.0, 8.0)  # per voxel that it sees, and per value
     threads: int = 0  # of the CPU, also for the other steps; 0 for one per core
+    wide: int = 0  # inputs of a voxel besides its patch
 
     def __call__(self, *inputs: Any) -> FloatArray:
         """Return what the network does."""
@@ -87,7 +89,8 @@ def adapt(network: Decoder) -> Adapter:
     if isinstance(network, Adapter):
         return network
     names = "receptive_field", "memory_bytes", "threads"
-    return Adapter(network, **{n: getattr(network, n) for n in names if hasattr(network, n)})
+    known = {n: getattr(network, n) for n in names if hasattr(network, n)}
+    return Adapter(network, **known, wide=getattr(network, "card", {}).get("wide", 0))
 
 
 def decode(

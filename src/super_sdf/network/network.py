@@ -16,7 +16,7 @@ from ..arrays import NEIGHBOURHOOD, STRIDES, FloatArray, IntArray
 from ..errors import DeviceError, FileError
 from ..options import OPTIONS, QUALITIES, Device, Precision, Quality
 from ..threads import cores_of_system, useful_threads
-from .contract import EXACT_DISTANCES, INPUTS, MASKS, TRIAL, Decoder, read_card
+from .contract import EXACT_DISTANCES, INPUTS, MASKS, Decoder, read_card, trial
 from .onnx import has_driver, open_session, run
 
 MODELS = Path(__file__).parent.parent / "models"
@@ -86,7 +86,7 @@ class Network:
         mean = np.zeros((count, width), np.float32)
         for signs in HALF_TURNS[: self.symmetries]:
             places = (NEIGHBOURHOOD * signs + 1) @ STRIDES
-            turned = [np.ascontiguousarray(array[:, places]) for array in (patches, table)]
+            turned = np.hstack([patches[:, places], patches[:, 27:]]), table.take(places, 1)
             feeds = dict(zip(INPUTS, (*turned, voxels, offsets * signs.astype(np.float32))))
             values = run(self.session, feeds, self.device)[:count]
             with np.errstate(invalid="ignore"):  # ``decode`` checks for infinities
@@ -162,7 +162,7 @@ def load_network(
         on_cuda, _ = find_model(model, "float32")
         try:  # a session can open although it cannot run: a GPU may be too old, or its memory full
             session = open_session(on_cuda, "cuda", used)
-            run(session, TRIAL, "cuda")
+            run(session, trial(read_card(session, on_cuda).get("wide", 0)), "cuda")
             path, runs_on = on_cuda, "cuda"
         except DeviceError as error:
             failure = error

@@ -9,7 +9,7 @@ out, so that the bits of a result do not depend on how the grid was cut.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -46,10 +46,11 @@ def predict(
     A large band is worked on in runs of planes, with the planes beside them that values depend on.
     """
     plane, offsets, reach = band.voxel_ijk[:, 0], block_offsets(factor), network.receptive_field
+    patches = np.hstack([band.patches, widely(band)]) if network.wide else band.patches
     parts = -(-len(plane) // AT_ONCE)
     blocks = np.zeros((len(offsets), len(voxels) + 1), np.float32)
     if parts == 1 or reach is None:
-        decode(network, (band.patches, table, voxels), offsets, blocks[:, :-1], threads)
+        decode(network, (patches, table, voxels), offsets, blocks[:, :-1], threads)
         return blocks
     ends = {-1, *plane[np.arange(1, parts) * len(plane) // parts].tolist(), band.grid.shape[0]}
     for first, last in pairwise(sorted(ends)):  # the planes after the first, to the last
@@ -57,11 +58,38 @@ def predict(
         own = slice(*np.searchsorted(plane[voxels], [first, last], "right").tolist())
         near = table[start:stop] - np.int32(start)
         near[(near < 0) | (near >= stop - start)] = -1
-        inputs = band.patches[start:stop], near, voxels[own] - np.int32(start)
+        inputs = patches[start:stop], near, voxels[own] - np.int32(start)
         decode(network, inputs, offsets, blocks[:, own], threads)
         if progress:
             progress(last / band.grid.shape[0])
     return blocks
+
+
+def widely(band: Band) -> FloatArray:
+    """Return what the sides of the samples round voxels tell of their distances, (V, 2)."""
+    from ..grid.derived import BLURRED, wide_distances  # imported here, as few need it
+
+    found = np.empty((len(band.voxel_ijk), 2), np.float32)
+    for rows, ijk, values in _in_cubes(band, band.voxel_ijk, BLURRED):
+        found[rows] = 2 * wide_distances(values <= 0, ijk)
+    return found
+
+
+def _in_cubes(
+    band: Band, voxel_ijk: IntArray, beyond: int
+) -> Iterator[tuple[NDArray[np.intp], IntArray, FloatArray]]:
+    """Yield the rows of the voxels (n, 3) in each cube, with the samples of a box round them.
+
+    Of each the place in the box is given, (m, 3), and of the box the values in half voxels.
+    """
+    shape, unit = np.array(band.grid.shape), band.grid.voxel_size / 2
+    cube = np.ravel_multi_index(tuple((voxel_ijk // CUBE).T), tuple(shape // CUBE + 1))
+    order = np.argsort(cube, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(cube[order])) + 1) if len(order) else []:
+        ijk = voxel_ijk[rows]
+        low, high = np.maximum(ijk.min(0) - beyond, 0), np.minimum(ijk.max(0) + beyond + 1, shape)
+        values = in_spacings(read_box(band.grid.samples, low, high), unit)
+        yield rows, ijk - low, values - np.float32(band.offset / unit)
 
 
 def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
@@ -70,21 +98,14 @@ def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
     Voxels (D,) are rows of a band. Where values jump, as in fused depth images, a spline would
     swing, and nodes are interpolated linearly.
     """
-    grid, voxel_ijk, unit = band.grid, band.voxel_ijk[voxels], band.grid.voxel_size / 2
-    shape = np.array(grid.shape)
+    grid, voxel_ijk = band.grid, band.voxel_ijk[voxels]
     # the weights of samples -2 to 2 for the nodes along an axis, (K + 1, 5)
     far = np.abs(np.arange(factor + 1)[:, None] / factor - 0.5 - np.arange(-2, 3))
     linear = np.clip(1 - far, 0, None).astype(np.float32)
     tails = np.clip(2 - far, 0, None) ** 3 / 6
     cubic = np.where(far < 1, 2 / 3 - far**2 + far**3 / 2, tails).astype(np.float32)
     blocks = np.zeros(((factor + 1) ** 3, len(voxel_ijk) + 1), np.float32)
-    cube = np.ravel_multi_index(tuple((voxel_ijk // CUBE).T), tuple(shape // CUBE + 1))
-    order = np.argsort(cube, kind="stable")
-    for rows in np.split(order, np.flatnonzero(np.diff(cube[order])) + 1) if len(order) else []:
-        ijk = voxel_ijk[rows]
-        low, high = np.maximum(ijk.min(0) - BEYOND, 0), np.minimum(ijk.max(0) + BEYOND + 1, shape)
-        ijk = ijk - low
-        values = in_spacings(read_box(grid.samples, low, high), unit)
+    for rows, ijk, values in _in_cubes(band, voxel_ijk, BEYOND):
         found = _evaluate(prefilter(values), ijk + 2, cubic)
         if grid.field.has_jumps:
             rough = roughness(values * np.float32(0.5))[tuple(ijk.T)]
@@ -94,10 +115,9 @@ def interpolate(band: Band, voxels: IntArray, factor: int) -> FloatArray:
         middle, nodes = factor // 2, found.reshape(factor + 1, factor + 1, factor + 1, -1)
         for axis in range(3):  # beyond the outermost samples the surface goes straight on
             lines, at = np.moveaxis(nodes, axis, 0), voxel_ijk[rows, axis]
-            for outer, end in ((slice(0, middle), 0), (slice(middle, None), shape[axis] - 1)):
+            for outer, end in ((slice(0, middle), 0), (slice(middle, None), grid.shape[axis] - 1)):
                 lines[outer][..., at == end] = lines[middle][..., at == end]
         blocks[:, rows] = found
-    blocks[:, :-1] -= np.float32(band.offset / unit)
     return blocks
 
 
