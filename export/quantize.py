@@ -303,7 +303,7 @@ def distance_apart(
 
 
 def take_shift_out(path: Path, shift: float) -> None:
-    """Subtract a shift, in voxels, from the correction of whole voxels, which all of a mask have."""
+    """Subtract a shift, in voxels, from the correction that all voxels of a mask have."""
     model = onnx.load(path)
     bodies = [a.g for node in model.graph.node for a in node.attribute if a.name == "body"]
     bias = next(i for body in bodies for i in body.initializer if i.name == "correction.bias")

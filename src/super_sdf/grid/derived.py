@@ -31,8 +31,7 @@ REACH = 4  # voxels; patches are clipped to 3 (``refine.band.PATCH_LIMIT``), hal
 
 BLURS = 1, 1, 2, 2, 4  # steps of the blurs of a mask, each by (1, 2, 1) / 4 along all axes
 BLURRED = sum(BLURS)  # samples to each side on which a blurred one depends
-# After two, four and five blurs the deviation of the kernel is 1, 5^.5 and 13^.5 samples. By these
-# shares of what two kernels differ the first is corrected, and by these the sums are distances.
+# After two, four and five blurs the kernel's deviation is 1, 5^.5 and 13^.5 samples; hence follow:
 GAINS, SLOPES = np.array([[[0.809], [1.633]], [[1.732], [3.46]]], np.float32)
 
 NO_FOOT = 2.6  # largest spacings: the distance of a sample without a foot point near it
@@ -71,8 +70,8 @@ def wide_distances(inside: BoolArray, ijk: IntArray) -> FloatArray:
     """Return what a mask, blurred, tells of the distances of samples (n, 3): (n, 2), in voxels.
 
     In proportion to its width a kernel mistakes a curvature for a distance. So of two kernels a sum
-    is taken in which that cancels out. It is the distance of a plane up to some tenths of a voxel,
-    and grows less beyond: the first sum, of narrow kernels, to 0.9 voxels, the second to 1.7.
+    is taken in which that cancels out: the distance of a plane up to some tenths of a voxel, and
+    less beyond. The first sum is of narrow kernels, the second of wide ones.
     """
     values, blurred = (~inside).astype(np.float32), list[FloatArray]()
     for step in BLURS:
