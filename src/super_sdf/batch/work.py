@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -108,7 +109,6 @@ class Worker:
     """A process that gets one task at a time: so the task of one that dies is known."""
 
     def __init__(self, work: Callable[[Any], Any]) -> None:
-        os.environ.setdefault("PYTHONSAFEPATH", "1")  # import nothing from the current folder
         self.pipe, its_end = SPAWN.Pipe()
         self.process = SPAWN.Process(target=_serve, args=(its_end, work), daemon=True)
         self.process.start()
@@ -146,15 +146,22 @@ def work_in_processes(
     ``take`` returns the next task, None while there is none. What ``work`` raises is raised here.
     """
     idle, running = list[Worker](), dict[Any, tuple[Worker, Task]]()
+
+    def start() -> None:
+        sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # of this thread: the process inherits it
+        idle.append(Worker(work))
+
+    os.environ.setdefault("PYTHONSAFEPATH", "1")  # processes import nothing from the current folder
     if os.name == "posix":
         multiprocessing.resource_tracker.ensure_running()  # later it would unblock SIGINT
     try:
         while True:
             while len(running) < count and (task := take()) is not None:
-                sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # the process inherits it
-                worker = idle.pop() if idle else Worker(work)
-                running[worker.pipe] = worker, task
-                sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+                if not idle:
+                    with ThreadPoolExecutor(1) as thread:  # where no signal interrupts the start
+                        thread.submit(start).result()
+                running[idle[-1].pipe] = idle[-1], task
+                worker = idle.pop()
                 with suppress(OSError):  # if it has died, there is no answer, either
                     worker.pipe.send(task)
             if not running:
@@ -172,4 +179,3 @@ def work_in_processes(
     finally:
         for worker in (*idle, *(worker for worker, _ in running.values())):
             worker.end()
-        sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
