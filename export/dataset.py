@@ -44,6 +44,7 @@ SWAYED = 0.3  # share of the meshes that are bent
 THIN = -0.2, 0.6  # range of the lowest sample of a thin solid, in spacings
 SLICED = 0.4  # share of samples in thick slices, if any are
 WINDOW = 32  # samples along each axis: a whole shape at 32^3, a piece of it at 64^3
+NEAR_MASKS = 4.0  # voxels from the surface up to which samples with a margin are exact
 EDGE = 4  # samples from the border of a window of a smooth body within which none has targets
 SETTLED_WITHIN = 2.5  # voxels from a smooth surface within which distances are exact ...
 UNSETTLED = 0.003  # ... to so much; a window with worse ones is drawn again, as is one with ...
@@ -63,7 +64,7 @@ class Sample:
 
     def cropped(self) -> Sample:
         """Return the sample without the margin."""
-        inner = tuple(slice(self.margin, n - self.margin) for n in self.window.shape[:3])
+        inner = tuple(slice(self.margin, n - self.margin) for n in self.window.shape)
         return replace(self, window=self.window[inner], margin=0)
 
 
@@ -120,17 +121,16 @@ def make_sample(
     shape, first = draw_window(rng, posed)
     truth = Solid(posed)
     wide = tuple(n + 2 * margin for n in shape)
-    whole = (
-        2 * sample_solid(truth, (wide, 1.0, first - margin), band=4.0 if margin else None).values
-    )
-    values = whole[tuple(slice(margin, margin + n) for n in shape)] / 2
-    voxel_ijk = np.argwhere(np.abs(2 * values) <= band.DECODE_LIMIT)
-    if not lowest[0] < values.min() < lowest[1] or not len(voxel_ijk) or (values < 0).all():
+    exact = NEAR_MASKS if margin else None
+    window = 2 * sample_solid(truth, (wide, 1.0, first - margin), band=exact).values
+    inner = window[tuple(slice(margin, margin + n) for n in shape)]
+    voxel_ijk = np.argwhere(np.abs(inner) <= band.DECODE_LIMIT)
+    if not lowest[0] < inner.min() / 2 < lowest[1] or not len(voxel_ijk) or (inner < 0).all():
         return None
     offsets = draw_offsets(rng)
     points = (voxel_ijk[:, None] + first + offsets / 2).reshape(-1, 3)
     targets = 2 * signed_distance(rng, truth, points).reshape(len(voxel_ijk), -1)
-    return Sample(whole, offsets, voxel_ijk.astype(np.uint8), targets.astype(np.float16), margin)
+    return Sample(window, offsets, voxel_ijk.astype(np.uint8), targets.astype(np.float16), margin)
 
 
 def make_smooth_sample(rng: np.random.Generator, slices: float, margin: int = 0) -> Sample:
@@ -221,7 +221,7 @@ def read_shard(path: Path) -> Iterator[Sample]:
     windows = np.split(shard["windows"], window_ends[:-1])
     voxels = np.split(shard["voxel_ijk"], voxel_ends[:-1])
     targets = np.split(shard["targets"], voxel_ends[:-1])
-    margin = int(shard["margin"])
+    margin = int(shard.get("margin", 0))
     for n, shape in enumerate(shard["window_shape"]):
         window = windows[n].reshape(shape)
         yield Sample(window, shard["offsets"][n], voxels[n], targets[n], margin)

@@ -196,7 +196,7 @@ def pin_to_skipped(
 def take_lone_points_out(blocks: FloatArray, factor: int) -> None:
     """Put samples of 0 outside whose six nodes beside are outside, in ``blocks`` (Q, D).
 
-    0 counts as inside: a lone sample of 0, such as on an edge, would get a mesh of no size.
+    0 counts as inside, so a single sample of 0, as on an edge, would get a mesh without volume.
     """
     middle = len(blocks) // 2
     around = np.flatnonzero(np.abs(block_ijk(factor) - factor // 2).sum(1) == 1)
