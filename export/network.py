@@ -45,6 +45,7 @@ class NetworkConfig:
     gated: int = 0  # of the blocks, the last ones, that run only where the gate is open
     wide: int = 0  # inputs of a voxel besides its patch: of masks, ``grid.derived.wide_distances``
     places: tuple[int, ...] = ()  # that each of ``all_blocks`` sees; all 27 if nothing is given
+    seen: int = 0  # channels, the first ones, that blocks before the gated ones see; 0 for all
 
     @property
     def receptive_field(self) -> int:
@@ -130,11 +131,11 @@ def gathered(features: Tensor, table: Tensor) -> Iterator[tuple[slice, Tensor]]:
 
 
 class NeighbourConv(nn.Module):
-    """A sparse convolution over the band, of which a voxel sees some of the 27 places."""
+    """A sparse convolution over the band: of some of the 27 places it sees some channels."""
 
-    def __init__(self, channels: int, places: int) -> None:
+    def __init__(self, channels: int, places: int, seen: int) -> None:
         super().__init__()
-        self.places, rows = places, places * channels
+        self.places, self.seen, rows = places, seen, places * seen
         self.weight = nn.Parameter(torch.randn(rows, channels) / rows**0.5)
         self.bias = nn.Parameter(torch.zeros(channels))
 
@@ -143,17 +144,18 @@ class NeighbourConv(nn.Module):
         dtype = torch.bfloat16 if torch.is_autocast_enabled(features.device.type) else torch.float32
         if self.places < table.shape[1]:
             table = table[:, PLACES[self.places]]
-        others = (features[:0] if around is None else around).detach().to(dtype)
-        mixed = GatherMatMul.apply(features.to(dtype), self.weight.to(dtype), table, others)
+        others = (features[:0] if around is None else around).detach()
+        some = (given[:, : self.seen].to(dtype) for given in (features, others))
+        mixed = GatherMatMul.apply(next(some), self.weight.to(dtype), table, next(some))
         return mixed + self.bias.to(dtype)
 
 
 class Block(nn.Module):
     """A residual block: neighbour convolution, then a pointwise layer; starts as the identity."""
 
-    def __init__(self, config: NetworkConfig, places: int) -> None:
+    def __init__(self, config: NetworkConfig, places: int, seen: int) -> None:
         super().__init__()
-        self.conv = NeighbourConv(config.channels, places)
+        self.conv = NeighbourConv(config.channels, places, seen)
         self.expand = nn.Linear(config.channels, config.hidden)
         self.reduce = nn.Linear(config.hidden, config.channels)
         nn.init.normal_(self.reduce.weight, std=0.02)
@@ -266,9 +268,11 @@ class SuperSdfNet(nn.Module):
             nn.Linear(config.hidden, config.channels),
         )
         places = config.places or [27] * (config.blocks + 1)
-        self.blocks = nn.ModuleList(Block(config, count) for count in places[: config.blocks])
+        first, channels = config.blocks - config.gated, config.channels
+        seen = [config.seen or channels] * first + [channels] * config.gated
+        self.blocks = nn.ModuleList(Block(config, *pair) for pair in zip(places, seen))
         if config.gated:
-            self.early = Block(config, places[config.blocks])
+            self.early = Block(config, places[config.blocks], channels)
             self.gate = Gate(config)
         self.branch = nn.Linear(config.channels, config.functions - config.channels)
         self.correction = nn.Linear(config.channels, 1)

@@ -131,7 +131,8 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     features, excess = scan_stem(graph, numbers, there)
     channels, gated = net.config.channels, net.config.gated
     for number in range(len(net.blocks) - gated):
-        everywhere = graph.flat(features, channels)
+        seen = net.blocks[number].conv.seen
+        everywhere = graph.flat(first_channels(graph, features, seen, channels), seen)
         features = scan_block(graph, number, features, everywhere, numbers, there)
     whole = graph.flat(features, channels)
     if gated:
@@ -150,6 +151,14 @@ def build_graph(net: SuperSdfNet) -> onnx.GraphProto:
     ]
     outputs = [declared("values", TensorProto.FLOAT, ["D", "Q"])]
     return helper.make_graph(graph.nodes, "super_sdf", inputs, outputs, graph.constants)
+
+
+def first_channels(graph: Writer, features: str, count: int, channels: int) -> str:
+    """Return the first ones of the channels of features (..., C)."""
+    if count == channels:
+        return features
+    ends = (graph.constant(np.array([end], np.int64)) for end in (0, count, -1))
+    return graph.op("Slice", features, *ends)
 
 
 def fill_up(graph: Graph, count: str, size: str) -> str:

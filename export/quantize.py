@@ -33,7 +33,7 @@ from torch import Tensor, nn
 from export.augment import DISTANCES, Prepared, draw_samples
 from export.losses import batch_of
 from export.network import Block, SuperSdfNet
-from export.onnx_graph import EARLY, Writer, declared, rows_of
+from export.onnx_graph import EARLY, Writer, declared, first_channels, rows_of
 from export.to_onnx import read_card, read_network, write_model
 from super_sdf import load_network
 from super_sdf.network import contract, onnx as sessions
@@ -102,7 +102,7 @@ def in_even_units(net: SuperSdfNet, ranges: list[Ranges]) -> tuple[SuperSdfNet, 
     units = units.clamp(min=LEAST_STEP * units.max())
     net, count = copy.deepcopy(net), len(units)
     for block in net.all_blocks():
-        block.conv.weight *= units.repeat(block.conv.places)[:, None]
+        block.conv.weight *= units[: block.conv.seen].repeat(block.conv.places)[:, None]
     for layer in (net.stem[2], *(block.reduce for block in net.all_blocks())):
         layer.weight /= units[:, None]
         layer.bias /= units
@@ -125,15 +125,17 @@ class IntLayer:
 
 @dataclass(frozen=True, eq=False)
 class IntBlock:
-    """A residual block. Its features f are quantized as ``f / step + zero``, from 0 to 255."""
+    """A residual block. The features f it sees are ``f / step + zero``, from 0 to 255."""
 
     step: np.float32
     zero: np.uint8
+    seen: int  # channels, the first ones
     layers: dict[str, IntLayer]
 
 
 def whole_block(block: Block, ranges: Ranges) -> IntBlock:
-    low, high = float(ranges.low.min()), float(ranges.high.max())
+    seen = block.conv.seen
+    low, high = float(ranges.low[:seen].min()), float(ranges.high[:seen].max())
     step = np.float32((high - low) / LEVELS or 1)
     zero = np.uint8(np.rint(-low / step).clip(0, LEVELS))
     mixed, expanded = steps_of(ranges.mixed), steps_of(ranges.expanded)
@@ -141,7 +143,7 @@ def whole_block(block: Block, ranges: Ranges) -> IntBlock:
     conv = whole_layer(block.conv.weight, block.conv.bias, steps, mixed, float(zero))
     expand = whole_layer(block.expand.weight.T, block.expand.bias, mixed, expanded)
     reduce = whole_layer(block.reduce.weight.T, block.reduce.bias, expanded, plain)
-    return IntBlock(step, zero, {"conv": conv, "expand": expand, "reduce": reduce})
+    return IntBlock(step, zero, seen, {"conv": conv, "expand": expand, "reduce": reduce})
 
 
 def steps_of(width: Tensor) -> Array:
@@ -179,6 +181,9 @@ def replace_blocks(graph: onnx.GraphProto, blocks: list[IntBlock]) -> None:
         read = made_by[body_of(scan).node[1].input[0]]  # the first node gathers the table
         gathered = made_by[read.input[2]] if read.op_type == "ScatterND" else read
         source = gathered.input[0]
+        if made_by[source].op_type == "Slice":  # of channels, which are sliced when rounded
+            graph.node.remove(made_by[source])
+            source = made_by[source].input[0]
         if source not in rounded:  # two blocks may read the same features
             rounded[source] = add_rounded(body_of(made_by[source]), block)
             made_by[source].output.append(rounded[source])
@@ -199,16 +204,18 @@ def add_rounded(body: onnx.GraphProto, block: IntBlock) -> str:
     """
     writer = Writer(f"{body.name}_rounded_")
     step, zero = writer.constant(block.step, "step"), writer.constant(block.zero, "zero")
-    rounded = writer.op("QuantizeLinear", body.output[0].name, step, zero)
+    channels = len(block.layers["reduce"].scales)
+    seen = first_channels(writer, body.output[0].name, block.seen, channels)
+    rounded = writer.op("QuantizeLinear", seen, step, zero)
     body.node.extend(writer.nodes)
     body.initializer.extend(writer.constants)
-    body.output.append(rows_of(rounded, TensorProto.UINT8, len(block.layers["reduce"].scales)))
+    body.output.append(rows_of(rounded, TensorProto.UINT8, block.seen))
     return f"{rounded}_chunks"
 
 
 def keep_absent(graph: onnx.GraphProto, read: onnx.NodeProto, block: IntBlock) -> None:
     """Set the last row that a block reads, which index -1 refers to, to the zero point."""
-    name, width = read.output[0], len(block.layers["reduce"].scales)
+    name, width = read.output[0], block.seen
     writer = Writer(f"{read.name}_absent_")
     read.output[0] = f"{name}_written"
     row = writer.constant(np.full((1, width), block.zero))

@@ -92,7 +92,12 @@ def read_network(path: Path) -> SuperSdfNet:
     convs = {name for name in weights if name.endswith("conv.weight")}
     early = convs & {"early.conv.weight"}
     in_order = [*(f"blocks.{number}.conv.weight" for number in range(len(convs - early))), *early]
-    places = tuple(len(weights[name]) // channels for name in in_order)
+    gated, seen = (int(card.get(name, 0)) for name in ("gated", "seen"))
+    first = len(convs - early) - gated
+    places = tuple(
+        len(weights[name]) // (seen if seen and number < first else channels)
+        for number, name in enumerate(in_order)
+    )
     config = NetworkConfig(
         channels=channels,
         blocks=len(convs - early),
@@ -102,7 +107,8 @@ def read_network(path: Path) -> SuperSdfNet:
         frequencies=(inputs - 3) // 6,
         keeps_samples=card.get("inputs") != contract.MASKS,
         wide=weights["stem.0.weight"].shape[1] - 27,
-        gated=int(card.get("gated", 0)),
+        gated=gated,
+        seen=seen,
         places=() if set(places) == {27} else places,
     )
     net = SuperSdfNet(config)
@@ -136,7 +142,7 @@ def make_card(
         "accuracy": accuracy,
         "licence": "MIT",
         **({} if inputs == DISTANCES else {"inputs": inputs}),
-        **{name: n for name in ("gated", "wide") if (n := getattr(net.config, name))},
+        **{name: n for name in ("gated", "wide", "seen") if (n := getattr(net.config, name))},
     }
 
 

@@ -29,7 +29,7 @@ from export.arguments import Parser, at_least, positive, share
 from export.augment import DISTANCES, INPUTS, USUAL
 from export.losses import RECIPE, Batch, Recipe, measure, window_losses
 from export.measure import OF_MASKS, cells_of_masks
-from export.network import PLACES, SIZES, SuperSdfNet
+from export.network import PLACES, SIZES, NeighbourConv, SuperSdfNet
 from export.store import HELD_OUT, Store, check_store
 from export.to_onnx import read_weights
 from super_sdf.arrays import CENTRE
@@ -98,7 +98,9 @@ class Run:
                 more = array.shape[1] - weights[name].shape[1]  # inputs that change nothing yet
                 weights[name] = torch.nn.functional.pad(weights[name], (0, more))
             if name in weights and name.endswith("conv.weight"):
-                weights[name] = of_places(weights[name], len(array))
+                weights[name] = of_places(
+                    weights[name], self.net.get_submodule(name.removesuffix(".weight"))
+                )
         try:
             self.net.load_state_dict({**fresh, **weights})
         except RuntimeError as error:
@@ -133,11 +135,13 @@ class Run:
         return float(total.detach()), losses.tolist()
 
 
-def of_places(weight: Tensor, rows: int) -> Tensor:
-    """Return the rows, (n C, C), of a convolution's weight that belong to the n places it keeps."""
+def of_places(weight: Tensor, conv: NeighbourConv) -> Tensor:
+    """Return the rows of a convolution's weight, (n C, C), for the places and channels it keeps."""
+    if len(weight) == len(conv.weight):
+        return weight
     width = weight.shape[1]
-    given, wanted = (PLACES.get(count // width, CENTRE) for count in (len(weight), rows))
-    return weight.view(-1, width, width)[np.isin(given, wanted)].flatten(0, 1)
+    given, wanted = (PLACES.get(count, CENTRE) for count in (len(weight) // width, conv.places))
+    return weight.view(-1, width, width)[np.isin(given, wanted), : conv.seen].flatten(0, 1)
 
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:
@@ -213,6 +217,7 @@ NUMBERS = (
     ("batch", at_least(1), RECIPE.batch_voxels, "voxels of a batch; its last window may be more"),
     ("blocks", at_least(1), None, "number of blocks, if not that of the size"),
     ("gated", at_least(0), None, "last blocks, run where much is lost, if not those of the size"),
+    ("seen", at_least(0), None, "channels that the blocks before these see, 0 for all, likewise"),
     ("seed", at_least(0), 0, "of all that is drawn"),
 )
 
@@ -249,6 +254,7 @@ def run_training(options: argparse.Namespace) -> None:
         blocks=options.blocks or size.blocks,
         keeps_samples=options.inputs == DISTANCES,
         gated=size.gated if options.gated is None else options.gated,
+        seen=size.seen if options.seen is None else options.seen,
         places=tuple(options.places) or (() if options.blocks else size.places),
     )
     drawn = {name: getattr(options, name) for name in ("shifted", "noisy", "truncated")}

@@ -34,10 +34,10 @@ def prepared(samples):
 def net(request):
     """A network away from the start, where blocks do nothing; half of the voxels pass its gate.
 
-    The blocks of the gated one see 27, 19 or 7 places.
+    The blocks of the gated one see 27, 19 or 7 places, the first ones of these 12 channels.
     """
     torch.manual_seed(0)
-    gated = replace(SMALL, gated=2, places=(27, 19, 7, 19, 7))
+    gated = replace(SMALL, gated=2, places=(27, 19, 7, 19, 7), seen=12)
     made = SuperSdfNet(gated if request.param == "gated" else SMALL)
     for parameter in made.parameters():
         torch.nn.init.normal_(parameter, std=0.1)
