@@ -55,7 +55,13 @@ class NetworkConfig:
 SIZES = {
     "fast": NetworkConfig(blocks=4, functions=192),
     "base": NetworkConfig(
-        channels=96, blocks=12, hidden=192, functions=320, gated=6, places=(19,) * 6 + (7,) * 7
+        channels=96,
+        blocks=11,
+        hidden=192,
+        functions=320,
+        gated=6,
+        places=(19,) * 5 + (7,) * 7,
+        seen=64,
     ),
     "noisy": NetworkConfig(blocks=9),
     "mask": NetworkConfig(blocks=9, keeps_samples=False, wide=2),
