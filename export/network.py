@@ -20,6 +20,7 @@ can be distances. The distances of a mask are right to half a voxel only, and no
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -344,6 +345,29 @@ class SuperSdfNet(nn.Module):
         table = torch.where(table < 0, len(patches), table)  # index of the row of zeros
         encoded = self.encode_all(patches, table).some(voxels)
         return self.decode(encoded, [len(voxels)], offsets[None])
+
+
+@torch.no_grad()
+def in_basis(net: SuperSdfNet, basis: Tensor, inverse: Tensor) -> SuperSdfNet:
+    """Return a network with the same values, whose features are ``basis`` (C, C) times those given.
+
+    The basis must not mix channels that a block sees with others.
+    """
+    net, count = copy.deepcopy(net), len(basis)
+    for block in net.all_blocks():
+        of_seen = inverse[: block.conv.seen, : block.conv.seen].T
+        given = block.conv.weight.view(block.conv.places, block.conv.seen, count)
+        block.conv.weight.copy_((of_seen @ given).flatten(0, 1))
+    for layer in (net.stem[2], *(block.reduce for block in net.all_blocks())):
+        layer.weight.copy_(basis @ layer.weight)
+        layer.bias.copy_(basis @ layer.bias)
+    gates = [net.gate.layers[0]] if net.config.gated else []
+    for layer in (net.branch, net.correction, *gates):
+        layer.weight.copy_(layer.weight @ inverse)
+    last = net.trunk.layers[-1]
+    last.weight[:count] = inverse.T @ last.weight[:count]
+    last.bias[:count] = inverse.T @ last.bias[:count]
+    return net
 
 
 def in_float32(given: Tensor) -> torch.autocast:

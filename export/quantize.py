@@ -32,7 +32,7 @@ from torch import Tensor, nn
 
 from export.augment import DISTANCES, Prepared, draw_samples
 from export.losses import batch_of
-from export.network import Block, SuperSdfNet
+from export.network import Block, SuperSdfNet, in_basis
 from export.onnx_graph import EARLY, Writer, declared, first_channels, rows_of
 from export.to_onnx import read_card, read_network, write_model
 from super_sdf import load_network
@@ -100,17 +100,7 @@ def in_even_units(net: SuperSdfNet, ranges: list[Ranges]) -> tuple[SuperSdfNet, 
     most = torch.stack([torch.maximum(-each.low, each.high) for each in ranges])
     units = (most / most.square().mean(1, keepdim=True).sqrt().clamp(min=1e-30)).amax(0)
     units = units.clamp(min=LEAST_STEP * units.max())
-    net, count = copy.deepcopy(net), len(units)
-    for block in net.all_blocks():
-        block.conv.weight *= units[: block.conv.seen].repeat(block.conv.places)[:, None]
-    for layer in (net.stem[2], *(block.reduce for block in net.all_blocks())):
-        layer.weight /= units[:, None]
-        layer.bias /= units
-    gates = [net.gate.layers[0]] if net.config.gated else []
-    for layer in (net.branch, net.correction, *gates):
-        layer.weight *= units
-    net.trunk.layers[-1].weight[:count] *= units[:, None]
-    net.trunk.layers[-1].bias[:count] *= units
+    net = in_basis(net, torch.diag(1 / units), torch.diag(units))
     return net, [replace(each, low=each.low / units, high=each.high / units) for each in ranges]
 
 

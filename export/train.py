@@ -29,10 +29,9 @@ from export.arguments import Parser, at_least, positive, share
 from export.augment import DISTANCES, INPUTS, USUAL
 from export.losses import RECIPE, Batch, Recipe, measure, window_losses
 from export.measure import OF_MASKS, cells_of_masks
-from export.network import PLACES, SIZES, NeighbourConv, SuperSdfNet
+from export.network import SIZES, SuperSdfNet
 from export.store import HELD_OUT, Store, check_store
-from export.to_onnx import read_weights
-from super_sdf.arrays import CENTRE
+from export.to_onnx import read_network
 from super_sdf.errors import OptionError
 
 SAVE_SECONDS = 300  # between checkpoints, each with a line in the log
@@ -97,10 +96,6 @@ class Run:
             if name == "stem.0.weight" and name in weights:
                 more = array.shape[1] - weights[name].shape[1]  # inputs that change nothing yet
                 weights[name] = torch.nn.functional.pad(weights[name], (0, more))
-            if name in weights and name.endswith("conv.weight"):
-                weights[name] = of_places(
-                    weights[name], self.net.get_submodule(name.removesuffix(".weight"))
-                )
         try:
             self.net.load_state_dict({**fresh, **weights})
         except RuntimeError as error:
@@ -133,15 +128,6 @@ class Run:
         for kept, buffer in zip(self.average.buffers(), self.net.buffers()):
             kept.copy_(buffer)
         return float(total.detach()), losses.tolist()
-
-
-def of_places(weight: Tensor, conv: NeighbourConv) -> Tensor:
-    """Return the rows of a convolution's weight, (n C, C), for the places and channels it keeps."""
-    if len(weight) == len(conv.weight):
-        return weight
-    width = weight.shape[1]
-    given, wanted = (PLACES.get(count, CENTRE) for count in (len(weight) // width, conv.places))
-    return weight.view(-1, width, width)[np.isin(given, wanted), : conv.seen].flatten(0, 1)
 
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:
@@ -217,7 +203,6 @@ NUMBERS = (
     ("batch", at_least(1), RECIPE.batch_voxels, "voxels of a batch; its last window may be more"),
     ("blocks", at_least(1), None, "number of blocks, if not that of the size"),
     ("gated", at_least(0), None, "last blocks, run where much is lost, if not those of the size"),
-    ("seen", at_least(0), None, "channels that the blocks before these see, 0 for all, likewise"),
     ("seed", at_least(0), 0, "of all that is drawn"),
 )
 
@@ -228,11 +213,9 @@ def main(words: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add("--store", type=Path, required=True, help="folder of shards")
     add("--run", type=Path, required=True, help="folder of the run")
-    add("--size", choices=SIZES, default="base", help="size of the network")
+    add("--size", choices=SIZES, help="size of the network: that of --start if not given, or base")
     add("--inputs", choices=INPUTS, default=DISTANCES, help="what the network is trained on")
-    add("--start", type=Path, help="an .onnx file of that width to start from")
-    seen = "neighbours that each block sees, then that beside the gated ones; all if not given"
-    add("--places", type=int, nargs="+", choices=PLACES, default=(), help=seen)
+    add("--start", type=Path, help="an .onnx file of its width to start from")
     clock = "count the minutes from the start of this call, reading and pauses included"
     add("--by-clock", action="store_true", help=clock)
     add("--device", choices=["cpu", "cuda"], default="cpu")
@@ -247,15 +230,14 @@ def run_training(options: argparse.Namespace) -> None:
     """Check the store before anything is written, then train."""
     began = time.monotonic() if options.by_clock else None
     check_store(options.store, HELD_OUT)
-    weights = read_weights(options.start) if options.start else None
-    size = SIZES[options.size]
+    given = read_network(options.start) if options.start else None
+    size = given.config if given and not options.size else SIZES[options.size or "base"]
     config = replace(
         size,
         blocks=options.blocks or size.blocks,
         keeps_samples=options.inputs == DISTANCES,
         gated=size.gated if options.gated is None else options.gated,
-        seen=size.seen if options.seen is None else options.seen,
-        places=tuple(options.places) or (() if options.blocks else size.places),
+        places=() if options.blocks else size.places,
     )
     drawn = {name: getattr(options, name) for name in ("shifted", "noisy", "truncated")}
     recipe = replace(
@@ -270,8 +252,8 @@ def run_training(options: argparse.Namespace) -> None:
     options.run.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(options.seed)
     run = Run(options.run, SuperSdfNet(config), recipe, options.device)
-    if weights:
-        run.start_from(weights)
+    if given:
+        run.start_from(given.state_dict())
     run.resume()
     train(run, store, options.minutes, options.seed, began)
 

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from export import dataset, measure, store, to_onnx, train
+from export import dataset, measure, smaller, store, to_onnx, train
 from export.augment import CLEAN, DISTANCES, USUAL, change, masked, turned
 from export.dataset import Sample
 from export.losses import RECIPE, batch_of, errors_of, predict, window_losses
-from export.network import PLACES, SuperSdfNet, interpolation_weights
+from export.network import SuperSdfNet, interpolation_weights
 from export.store import Sampler, Store, chances
 from export.tests.conftest import SMALL
+from export.to_onnx import read_network
 from super_sdf import load_network
 from super_sdf.arrays import CENTRE, NEIGHBOURHOOD
 from super_sdf.grid.derived import BLURRED
@@ -43,6 +44,16 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys):
     measure.main(["--store", str(folder), str(file), str(run)])
     tables = capsys.readouterr().out
     assert "| small.onnx | 0." in tables and "| bias | reach |" in tables
+    words = f"{file} --store {folder} --without 0 3 --seen 60 --out {tmp_path / 'smaller.onnx'}"
+    for each in (words, f"{tmp_path / 'smaller.onnx'} --store {folder}"):
+        smaller.main(each.split())
+    tables = capsys.readouterr().out
+    assert "| small.onnx | 0." in tables and "| without 6 | 0." in tables
+    words = f"--store {folder} --run {tmp_path / 'more'} --inputs masks --batch 1 --minutes 0.001"
+    train.main([*words.split(), "--start", str(tmp_path / "smaller.onnx")])
+    assert (
+        to_onnx.load_run(tmp_path / "more").config == read_network(tmp_path / "smaller.onnx").config
+    )
 
 
 @pytest.mark.parametrize(
@@ -164,17 +175,26 @@ def test_a_network_starts_from_one_with_fewer_blocks_and_has_its_values(tmp_path
         run.start_from(SuperSdfNet(replace(SMALL, hidden=64)).state_dict())
 
 
-def test_blocks_that_see_fewer_places_start_with_the_weights_of_these(tmp_path, prepared):
+def test_a_network_without_a_dead_block_has_its_values_and_one_that_sees_less_nearly(prepared):
     torch.manual_seed(0)
-    places, batch = (27, 19, 7, 7, 19), batch_of(prepared[:1])
-    whole, some = SuperSdfNet(replace(SMALL, gated=2)), replace(SMALL, gated=2, places=places)
-    run = train.Run(tmp_path, SuperSdfNet(some))
-    run.start_from(whole.state_dict())
+    net, batch = SuperSdfNet(replace(SMALL, gated=1)).eval(), batch_of(prepared[:1])
+    for number, block in enumerate(net.blocks):
+        torch.nn.init.normal_(block.reduce.weight, std=0.1 * (number != 1))
+        torch.nn.init.normal_(block.reduce.bias)
+    changes = smaller.mean_changes(net, prepared)
+    places, count = (19, 7, 27, 27), SMALL.channels
     with torch.no_grad():
-        for block, count in zip(whole.all_blocks(), places):
-            block.conv.weight.view(27, -1)[np.setdiff1d(range(27), PLACES[count])] = 0
-        values = [predict(each, batch) for each in (whole, run.average)]
-    torch.testing.assert_close(*values)
+        fewer = smaller.without(net, [1], changes)
+        same, less, least = (
+            smaller.seeing_less(fewer, kept, seen, prepared)
+            for kept, seen in (((27,) * 4, count), (places, count - 4), (places, 1))
+        )
+        want = predict(net, batch)
+        apart = [float((predict(n, batch) - want).abs().mean()) for n in (fewer, same, less, least)]
+    assert less.config == replace(fewer.config, places=places, seen=count - 4)
+    assert max(apart[:2]) < 1e-4 < apart[2] < apart[3]
+    with pytest.raises(train.OptionError, match=r"^without \[3\]: the first 3 blocks can go"):
+        smaller.without(net, [3], changes)
 
 
 def test_the_reach_is_what_a_step_in_a_plane_moves_the_surface_beside_it():
