@@ -35,6 +35,7 @@ class Recipe:
     reach: float = 0.5  # half voxels: decay length of the weight away from the surface ...
     far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5
+    bias_weight: float = 0.5  # of a window's mean error near the surface, for masks
     first_weight: float = 0.2  # of the loss after the first blocks of a gated network
     gate_weight: float = 0.01  # of the error of what its gate says of that loss
     shares_gated: tuple[float, float] = (0.05, 0.5)  # of a batch's voxels, drawn between these
@@ -140,12 +141,14 @@ def differences(values: Tensor) -> Tensor:
     return 2 * (quadruples[:, :, 1:] - quadruples[:, :, :1])
 
 
-def voxel_losses(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
-    """Return the loss of each voxel, (D,): the error of values and of their gradient.
+def weights_near(target: Tensor, recipe: Recipe) -> Tensor:
+    """Return the weight of each value: more near the surface, where it moves the mesh."""
+    return recipe.far_weight + torch.exp(-target.abs() / recipe.reach)
 
-    Both count more near the surface, where they move the mesh.
-    """
-    weight = recipe.far_weight + torch.exp(-target.abs() / recipe.reach)
+
+def voxel_losses(prediction: Tensor, target: Tensor, recipe: Recipe) -> Tensor:
+    """Return the loss of each voxel, (D,): the error of values and of their gradient."""
+    weight = weights_near(target, recipe)
     loss = (weight * (prediction - target).abs()).mean(1)
     apart = (differences(prediction) - differences(target)).abs().sum(2)
     return loss + recipe.gradient_weight * (weight[:, : 4 * CORNERS : 4] * apart).mean(1)
@@ -155,23 +158,33 @@ def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
     """Return the loss of each sample of a batch, (B,).
 
     Of a gated network, at a share of voxels drawn at random, it is also that after the first
-    blocks, and the error of what the gate says of this.
+    blocks, and the error of what the gate says of this. Of masks it is also the mean error of a
+    sample: a mask hardly tells a curved surface from a flat one, which has the least loss a voxel.
     """
+    if not net.config.gated:
+        values = predict(net, batch)
+        losses = window_means(voxel_losses(values, batch.targets, recipe), batch)
+        if net.config.keeps_samples:
+            return losses
+        apart = weights_near(batch.targets, recipe) * (values - batch.targets)
+        return losses + recipe.bias_weight * window_means(apart.mean(1), batch).abs()
 
-    def lost(encoded: Encoded | None = None) -> Tensor:
+    def lost(encoded: Encoded) -> Tensor:
         return voxel_losses(predict(net, batch, encoded), batch.targets, recipe)
 
-    if net.config.gated:
-        low, high = recipe.shares_gated
-        share = low + (high - low) * float(torch.rand(()))
-        encoded = net.encode_all(batch.patches, batch.table, share)
-        of_first = lost(replace(encoded, features=encoded.early))
-        apart = encoded.doubts[batch.voxels] - of_first.detach().log()
-        loss = recipe.first_weight * of_first + recipe.gate_weight * apart.abs() + lost(encoded)
-    else:
-        loss = lost()
-    sums = loss.new_zeros(len(batch.counts)).index_add(0, batch.window, loss)
-    return sums / torch.tensor(batch.counts, device=loss.device)
+    low, high = recipe.shares_gated
+    share = low + (high - low) * float(torch.rand(()))
+    encoded = net.encode_all(batch.patches, batch.table, share)
+    of_first = lost(replace(encoded, features=encoded.early))
+    apart = encoded.doubts[batch.voxels] - of_first.detach().log()
+    loss = recipe.first_weight * of_first + recipe.gate_weight * apart.abs() + lost(encoded)
+    return window_means(loss, batch)
+
+
+def window_means(values: Tensor, batch: Batch) -> Tensor:
+    """Return the mean of values of voxels, (D,), in each sample, (B,)."""
+    sums = values.new_zeros(len(batch.counts)).index_add(0, batch.window, values)
+    return sums / torch.tensor(batch.counts, device=values.device)
 
 
 NEAR = 0.5  # half voxels from the surface: limit for normals; half of it for values
