@@ -64,8 +64,8 @@ SIZES = {
         places=(19,) * 5 + (7,) * 7,
         seen=64,
     ),
-    "noisy": NetworkConfig(blocks=9),
-    "mask": NetworkConfig(blocks=9, keeps_samples=False, wide=2),
+    "noisy": NetworkConfig(blocks=5, places=(19,) * 5),
+    "mask": NetworkConfig(blocks=7, keeps_samples=False, wide=2),
 }
 """The sizes of the shipped networks, by name."""
 
