@@ -1,17 +1,19 @@
 """Smaller networks with nearly the same values, to ship or to start from.
 
-    python -m export.smaller base.onnx --store training/store     # the errors without each block
-    python -m export.smaller base.onnx --store training/store --without 0 --out smaller.onnx
-    python -m export.smaller smaller.onnx --store training/store --seen 64 --out start.onnx
+    python -m export.smaller base.onnx --store S     # the errors without each block
+    python -m export.smaller base.onnx --store S --without 0 --out smaller.onnx
+    python -m export.smaller smaller.onnx --store S --seen 64 --minutes 18 --out start.onnx
 
 In training a block may die: then it changes all voxels alike, or hardly any, and a network without
 it has the same values in less time. Blocks that are to see fewer places or channels are fitted to
-what they gave, by least squares, one after the other. Which channels they see is decided anew: the
-features are turned, so that the first ones decide most of what the blocks give.
+what they gave, by least squares, one after the other, and then trained to give the same features
+together. Which channels they see is decided anew: the features are turned, so that the first ones
+decide most of what the blocks give.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
@@ -21,19 +23,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from export.arguments import Parser, at_least
+from export.arguments import Parser, at_least, positive
 from export.augment import CLEAN, DISTANCES, Prepared, Shares, change
 from export.dataset import read_shard
-from export.losses import batch_of, measure
+from export.losses import RECIPE, batch_of, measure
 from export.network import PLACES, NeighbourConv, SuperSdfNet, gathered, in_basis
-from export.store import HELD_OUT, check_store, shards_of
+from export.store import HELD_OUT, Store, check_store, shards_of
 from export.to_onnx import load_run, make_card, parity, read_network, write_model
+from export.train import Run, autocast
 from super_sdf.errors import OptionError
 from super_sdf.network import contract
 
 WINDOWS = 100  # that blocks are fitted to; a quarter as many are measured on
 RIDGE = 1e-5  # over the mean square of an input
 NOISY = Shares(0, 1, 0)
+RATE = 0.2  # of the usual rates of training, for features that are to be the same
 
 
 def windows_of(folder: Path, inputs: str, shares: Shares) -> tuple[list[Prepared], list[Prepared]]:
@@ -120,8 +124,7 @@ def decisive_first(net: SuperSdfNet, windows: Sequence[Prepared]) -> SuperSdfNet
 def seeing_less(
     net: SuperSdfNet, places: tuple[int, ...], seen: int, windows: Sequence[Prepared]
 ) -> SuperSdfNet:
-    """Return a network whose first blocks see fewer places, or channels, fitted to ``net``."""
-    net = decisive_first(net, windows)
+    """Return a network whose first blocks see fewer places, or channels, fitted to another."""
     small = SuperSdfNet(replace(net.config, places=places, seen=seen)).eval()
     weights, own = net.state_dict(), small.state_dict()
     small.load_state_dict({n: a if a.shape == own[n].shape else own[n] for n, a in weights.items()})
@@ -147,6 +150,23 @@ def fit(conv: NeighbourConv, old: NeighbourConv, both: list[tuple[Tensor, Tensor
     conv.bias.copy_(fitted[-1])
 
 
+def follow(
+    small: SuperSdfNet, net: SuperSdfNet, store: Store, minutes: float, folder: Path
+) -> SuperSdfNet:
+    """Train the first blocks to give the features that those of another network give."""
+    rates = {"hidden_rate": RATE * RECIPE.hidden_rate, "outer_rate": RATE * RECIPE.outer_rate}
+    run, rng = Run(folder, small, replace(RECIPE, **rates)), np.random.default_rng(0)
+    began = time.monotonic()
+    while (spent := (time.monotonic() - began) / (60 * minutes)) < 1:
+        batch = store.draw_batch(rng, run.recipe)[1]
+        with autocast("cpu"):
+            with torch.no_grad():
+                wanted = net.encode(batch.patches, batch.table).float()
+            apart = (small.encode(batch.patches, batch.table) - wanted).abs().mean(0)
+        run.descend((apart / wanted.std(0).clamp(min=1e-3)).mean(), spent)
+    return run.average.eval()
+
+
 def main(words: Sequence[str] | None = None) -> None:
     """Print the errors without each block, or write a smaller network and print its errors."""
     parser = Parser(description=__doc__.split("\n")[0])
@@ -157,6 +177,7 @@ def main(words: Sequence[str] | None = None) -> None:
     add("--without", type=int, nargs="+", default=(), help="blocks to leave out")
     add("--places", type=int, nargs="+", choices=PLACES, help="of each block, as of export.train")
     add("--seen", type=at_least(1), help="channels that the blocks before a gate see")
+    add("--minutes", type=positive, help="of training to have the same features, after the fit")
     add("--out", type=Path, help="the smaller .onnx file")
     options = parser.parse_args(words)
     with parser.one_line_errors():
@@ -179,7 +200,13 @@ def main(words: Sequence[str] | None = None) -> None:
             net = without(net, options.without, changes)
         if options.places or options.seen:
             places = tuple(options.places or net.config.places)
-            net = seeing_less(net, places, options.seen or net.config.seen, windows)
+            net = decisive_first(net, windows)
+            small = seeing_less(net, places, options.seen or net.config.seen, windows)
+            if options.minutes:
+                line("fitted", small)
+                store = Store(options.store, inputs=inputs, shares=shares)
+                small = follow(small, net, store, options.minutes, options.out.parent)
+            net = small
         write_model(net, options.out, make_card(net, options.out.stem, "fitted", "not measured"))
         line(options.out.name, net)
         print(f"differs from torch by {parity(net, options.out) / 2:.1e} voxels")

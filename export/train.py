@@ -105,18 +105,23 @@ class Run:
 
     def advance(self, batch: Batch, spent: float) -> tuple[float, list[float]]:
         """Take one step at the rate for this share of the budget; return the loss, and each's."""
-        cosine = 0.5 * (1 + math.cos(math.pi * min(spent, 1)))  # after the warm-up
-        for optimiser, peak in zip(self.optimisers, self.peaks):
-            rate = peak * (min(spent / self.recipe.warm_up, cosine) + 1e-3)
-            optimiser.param_groups[0]["lr"] = rate
-            optimiser.zero_grad()
         with autocast(self.device):
             losses = window_losses(self.net, batch, self.recipe)
         # Small shapes have few voxels and large errors. With equal weights they make up more than
         # half of the loss, and of its noise; weighted by voxels they would hardly count.
         weights = losses.new_tensor(batch.counts) ** self.recipe.voxel_power
         total = (weights * losses).sum() / weights.sum()
-        total.backward()
+        self.descend(total, spent)
+        return float(total.detach()), losses.tolist()
+
+    def descend(self, loss: Tensor, spent: float) -> None:
+        """Take one step down the gradient of a loss, and into the averaged weights."""
+        cosine = 0.5 * (1 + math.cos(math.pi * min(spent, 1)))  # after the warm-up
+        for optimiser, peak in zip(self.optimisers, self.peaks):
+            rate = peak * (min(spent / self.recipe.warm_up, cosine) + 1e-3)
+            optimiser.param_groups[0]["lr"] = rate
+            optimiser.zero_grad()
+        loss.backward()
         torch.nn.utils.clip_grad_norm_(self.net.parameters(), 1.0)
         for optimiser in self.optimisers:
             optimiser.step()
@@ -127,7 +132,6 @@ class Run:
             torch._foreach_lerp_(average, now, 1 - decay)
         for kept, buffer in zip(self.average.buffers(), self.net.buffers()):
             kept.copy_(buffer)
-        return float(total.detach()), losses.tolist()
 
 
 def make_optimisers(net: SuperSdfNet, recipe: Recipe) -> list[torch.optim.Optimizer]:
