@@ -368,6 +368,16 @@ def test_a_blurred_mask_tells_distances_from_a_ball_without_a_bias(radius):
     np.testing.assert_array_equal(some, found[own])
 
 
+@pytest.mark.parametrize("cavity", [False, True])
+def test_the_mask_of_a_ball_is_meshed_within_a_thirtieth_of_a_voxel_without_a_bias(cavity):
+    centre, radius = np.array([20.3, 19.8, 20.1]), 14
+    away = np.linalg.norm(np.indices((41,) * 3).T - centre, axis=3).T - radius
+    mesh = reconstruct((away < 0) ^ cavity, spacing=1.0, origin=(0, 0, 0))
+    off = np.linalg.norm(mesh.vertices - centre, axis=1) - radius
+    off = off[off < 4]  # not the border of the grid
+    assert 0.01 < np.abs(off).mean() < 0.033 and abs(off.mean()) < 0.01
+
+
 def test_a_smooth_field_of_another_slope_is_that_of_its_spline():
     grid = make_grid(ellipsoid(), **PLACE, field="smooth")
     mesh = reconstruct(grid, lambda *given: -trilinear(*given))  # always wrong
