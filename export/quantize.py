@@ -4,10 +4,10 @@
     python -m export.quantize base-int8.onnx   # optimises its graph again
 
 Only the blocks change; stem, head and the features between the blocks stay float32. Weights are
-integers with one scale per output channel. The features have one step, in units that make their
-channels alike, and the other inputs of a layer one per channel. The steps are static, calibrated on
-procedural shapes, or on masks of them: dynamic steps would make the values of a voxel depend on all
-others in the call.
+integers with one scale per output channel. The features, turned at random so that their channels
+are alike, have one step, and the other inputs of a layer one per channel. The steps are static,
+calibrated on procedural shapes, or on masks of them: dynamic steps would make the values of a voxel
+depend on all others in the call.
 
 Layers are written in the sequence that onnxruntime fuses: dequantize, multiply, quantize, which
 rectifies, too. With a Relu between, onnxruntime 1.21 to 1.30 make two nodes of one name in a Scan
@@ -94,14 +94,17 @@ def find_ranges(net: SuperSdfNet, samples: list[Prepared]) -> list[Ranges]:
     return found[: net.config.blocks - net.config.gated] + last
 
 
-@torch.no_grad()
-def in_even_units(net: SuperSdfNet, ranges: list[Ranges]) -> tuple[SuperSdfNet, list[Ranges]]:
-    """Return a network with the same values, its features in units in which channels are alike."""
-    most = torch.stack([torch.maximum(-each.low, each.high) for each in ranges])
-    units = (most / most.square().mean(1, keepdim=True).sqrt().clamp(min=1e-30)).amax(0)
-    units = units.clamp(min=LEAST_STEP * units.max())
-    net = in_basis(net, torch.diag(1 / units), torch.diag(units))
-    return net, [replace(each, low=each.low / units, high=each.high / units) for each in ranges]
+def turned(net: SuperSdfNet) -> SuperSdfNet:
+    """Return a network with the same values, its features turned at random.
+
+    Then all channels have nearly the same range, and one step fits all (QuaRot, Ashkboos et al.
+    2024). Channels that some blocks do not see are turned among themselves.
+    """
+    seen, random = net.config.seen or net.config.channels, torch.Generator().manual_seed(0)
+    parts = [n for n in (seen, net.config.channels - seen) if n]
+    turns = (torch.linalg.qr(torch.randn(n, n, generator=random))[0] for n in parts)
+    basis = torch.block_diag(*turns)
+    return in_basis(net, basis, basis.T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,8 +251,8 @@ def replace_layers(scan: onnx.NodeProto, block: IntBlock) -> None:
 def quantize(
     source: Path, target: Path, samples: list[Prepared], accuracy: str = "not measured"
 ) -> None:
-    net = read_network(source)
-    net, ranges = in_even_units(net, find_ranges(net, samples))
+    net = turned(read_network(source))
+    ranges = find_ranges(net, samples)
     changed = {"name": target.stem, "precision": "int8", "accuracy": accuracy}
     write_model(net, target, {**read_card(source), **changed})
     model = onnx.load(target)
