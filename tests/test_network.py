@@ -112,6 +112,7 @@ WRONG = {
         {"card": {"format_version": "1", "receptive_field": "-5"}},
         OF_FORMAT + r"\(receptive_field -5\)",
     ),
+    "other inputs": ({"card": {"format_version": "1", "wide": "3"}}, OF_FORMAT + r"\(wide 3\)"),
 }
 
 

@@ -33,7 +33,7 @@ INPUTS = {
     "offsets": "tensor(float)",
 }
 OUTPUT = {"values": "tensor(float)"}
-WHOLE = ("receptive_field", "channels", "wide")  # of a card: voxels to each side, width, inputs
+WHOLE = {"receptive_field": range(1, 2**31), "channels": range(1, 2**31), "wide": [2]}  # of a card
 MAX_VALUE = np.float32(1e15)  # half voxels; sums of squares are still finite in single precision
 Decoder = Callable[[FloatArray, IntArray, IntArray, FloatArray], FloatArray]
 """A network, or any function, that returns values (D, Q) of patches (V, 27), neighbour table
@@ -61,7 +61,7 @@ def read_card(session: Any, path: Path) -> dict[str, Any]:
     for key, text in card.items():
         with suppress(ValueError, RecursionError):  # others stay text
             card[key] = json.loads(text)
-        if key in WHOLE and (type(card[key]) is not int or card[key] < 1):  # True is an int, too
+        if key in WHOLE and (type(card[key]) is not int or card[key] not in WHOLE[key]):
             fault = f"{key} {seen(card[key])}"
     if fault:
         said = f"{path} is no super-sdf network of format {FORMAT_VERSION} ({fault})"
