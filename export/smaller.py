@@ -124,12 +124,22 @@ def decisive_first(net: SuperSdfNet, windows: Sequence[Prepared]) -> SuperSdfNet
 def seeing_less(
     net: SuperSdfNet, places: tuple[int, ...], seen: int, windows: Sequence[Prepared]
 ) -> SuperSdfNet:
-    """Return a network whose first blocks see fewer places, or channels, fitted to another."""
+    """Return a network whose blocks before a gate see fewer places, or channels, fitted to another.
+
+    ``places`` has a number for each of these blocks; all others see what they saw.
+    """
+    first = net.config.blocks - net.config.gated
+    if len(places) != first or net.config.seen:
+        raise OptionError(
+            f"places {places}, channels {net.config.seen}: give {first} numbers of places, and a "
+            "network whose blocks see all channels"
+        )
+    places = (*places, *(block.conv.places for block in net.all_blocks()[first:]))
     small = SuperSdfNet(replace(net.config, places=places, seen=seen)).eval()
     weights, own = net.state_dict(), small.state_dict()
     small.load_state_dict({n: a if a.shape == own[n].shape else own[n] for n, a in weights.items()})
     both = [(features, features, table) for features, table in encoded(net, windows)]
-    for old, new in list(zip(net.blocks, small.blocks))[: net.config.blocks - net.config.gated]:
+    for old, new in list(zip(net.blocks, small.blocks))[:first]:
         fit(new.conv, old.conv, both)
         both = [(old(given, table), new(made, table), table) for given, made, table in both]
     return small
@@ -175,7 +185,13 @@ def main(words: Sequence[str] | None = None) -> None:
     add("--store", type=Path, required=True, help="folder of shards")
     add("--noisy", action="store_true", help="fit and measure on noisy windows only")
     add("--without", type=int, nargs="+", default=(), help="blocks to leave out")
-    add("--places", type=int, nargs="+", choices=PLACES, help="of each block, as of export.train")
+    add(
+        "--places",
+        type=int,
+        nargs="+",
+        choices=PLACES,
+        help="neighbours that each block before a gate sees",
+    )
     add("--seen", type=at_least(1), help="channels that the blocks before a gate see")
     add("--minutes", type=positive, help="of training to have the same features, after the fit")
     add("--out", type=Path, help="the smaller .onnx file")
@@ -199,13 +215,14 @@ def main(words: Sequence[str] | None = None) -> None:
         if options.without:
             net = without(net, options.without, changes)
         if options.places or options.seen:
-            places = tuple(options.places or net.config.places)
-            net = decisive_first(net, windows)
-            small = seeing_less(net, places, options.seen or net.config.seen, windows)
+            before = len(net.blocks) - net.config.gated
+            places = tuple(options.places or (b.conv.places for b in net.blocks[:before]))
+            turned = decisive_first(net, windows) if not net.config.seen else net
+            small = seeing_less(turned, places, options.seen or net.config.channels, windows)
             if options.minutes:
                 line("fitted", small)
                 store = Store(options.store, inputs=inputs, shares=shares)
-                small = follow(small, net, store, options.minutes, options.out.parent)
+                small = follow(small, turned, store, options.minutes, options.out.parent)
             net = small
         write_model(net, options.out, make_card(net, options.out.stem, "fitted", "not measured"))
         line(options.out.name, net)

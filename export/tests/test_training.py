@@ -181,16 +181,18 @@ def test_a_network_without_a_dead_block_has_its_values_and_one_that_sees_less_ne
         torch.nn.init.normal_(block.reduce.weight, std=0.1 * (number != 1))
         torch.nn.init.normal_(block.reduce.bias)
     changes = smaller.mean_changes(net, prepared)
-    places, count = (19, 7, 27, 27), SMALL.channels
+    places, count = (19, 7), SMALL.channels
     with torch.no_grad():
         fewer = smaller.without(net, [1], changes)
         same, less, least = (
             smaller.seeing_less(smaller.decisive_first(fewer, prepared), kept, seen, prepared)
-            for kept, seen in (((27,) * 4, count), (places, count - 4), (places, 1))
+            for kept, seen in (((27,) * 2, count), (places, count - 4), (places, 1))
         )
         want = predict(net, batch)
         apart = [float((predict(n, batch) - want).abs().mean()) for n in (fewer, same, less, least)]
-    assert less.config == replace(fewer.config, places=places, seen=count - 4)
+    assert less.config == replace(fewer.config, places=(*places, 27, 27), seen=count - 4)
+    with pytest.raises(train.OptionError, match=r"^places \(19, 7\), channels 12: give 2 numbers"):
+        smaller.seeing_less(less, places, 4, prepared)
     assert max(apart[:2]) < 1e-4 < apart[2] < apart[3]
     with pytest.raises(train.OptionError, match=r"^without \[3\]: the first 3 blocks can go"):
         smaller.without(net, [3], changes)
