@@ -4,10 +4,12 @@
 
 So a shipped network can be compared with one in training, of which the averaged weights are
 measured. Errors are those of the log of a run. ``lab figures --only masks`` has whole bodies.
+``--time examples/part.npz`` adds what a voxel of that grid costs, in the int8 variant of a file.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,11 +23,15 @@ from export.losses import measure
 from export.network import SuperSdfNet
 from export.store import HELD_OUT, held_out
 from export.to_onnx import load_run, read_network
+from super_sdf import SdfGrid, load_network, read_grid
 from super_sdf.grid.derived import mask_distances
 from super_sdf.network import contract
+from super_sdf.refine.band import neighbour_table, survey
+from super_sdf.refine.nodes import block_offsets
 
 STEP, STEPPED = 16, 9  # samples to a step in a plane; those beside it, by which reach is measured
 OF_MASKS = "smooth", "bias", "reach"
+FACTOR, RUNS = 4, 7  # of the refinement that is timed, and how often it is
 
 
 def cells_of_masks(net: SuperSdfNet, smooth: Sequence[Prepared]) -> list[str]:
@@ -60,11 +66,26 @@ def reach_of(net: SuperSdfNet) -> float:
     return float((0.5 - inside / (inside - outside)).sum())
 
 
+def microseconds(path: Path, grid: SdfGrid) -> float:
+    """Return the processor time a voxel of the band of a grid, on one thread, head included."""
+    int8 = path.with_name(f"{path.stem}-int8.onnx")
+    network, band = load_network(int8 if int8.is_file() else path, threads=1), survey(grid)
+    table = neighbour_table(band.voxel_ijk, grid.shape)
+    patches = np.pad(band.patches, ((0, 0), (0, network.card.get("wide", 0))))
+    decoded, seconds = np.flatnonzero(band.decoded).astype(np.int32), list[float]()
+    for _ in range(RUNS):
+        clock = time.process_time()
+        network(patches, table, decoded, block_offsets(FACTOR))
+        seconds.append(time.process_time() - clock)
+    return 1e6 * min(seconds) / len(table)
+
+
 def main(words: Sequence[str] | None = None) -> None:
     """Print the tables."""
     parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("files", type=Path, nargs="+", help=".onnx files and folders of runs")
     parser.add_argument("--store", type=Path, required=True, help="folder of shards")
+    parser.add_argument("--time", type=Path, metavar="GRID", help="time files on a grid, too")
     options = parser.parse_args(words)
     with parser.one_line_errors():
         nets = {f: load_run(f) if f.is_dir() else read_network(f) for f in options.files}
@@ -73,9 +94,13 @@ def main(words: Sequence[str] | None = None) -> None:
         samples = held_out(options.store, kind, HELD_OUT)
         smooth = held_out(options.store, kind, 1, "smooth") if masks else []
         columns = ["network", "everywhere", "near", "normal", *OF_MASKS[: 3 * bool(smooth)]]
+        grid = read_grid(options.time) if options.time else None
+        columns += ["us a voxel"] * bool(grid)
         print(f"| {' | '.join(columns)} |\n| --- {'| ---: ' * (len(columns) - 1)}|")
         for path, net in nets.items():
             cells = measure(net, samples).cells() + cells_of_masks(net, smooth)
+            if grid:
+                cells.append("-" if path.is_dir() else f"{microseconds(path, grid):.2f}")
             print(f"| {path.name} | {' | '.join(cells)} |", flush=True)
 
 

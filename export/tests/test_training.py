@@ -1,6 +1,7 @@
 """From shapes to a file that the runtime loads, in small, by the commands of the README."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,9 +42,11 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys):
     card = load_network(file).card
     assert card["inputs"] == contract.MASKS and card["wide"] == 2
     assert card["receptive_field"] == SIZES["mask"].blocks + 1 + BLURRED
-    measure.main(["--store", str(folder), str(file), str(run)])
+    example = str(Path(__file__).parents[2] / "examples" / "part.npz")
+    measure.main(["--store", str(folder), str(file), str(run), "--time", example])
     tables = capsys.readouterr().out
-    assert "| small.onnx | 0." in tables and "| bias | reach |" in tables
+    assert "| small.onnx | 0." in tables and "| bias | reach | us a voxel |" in tables
+    assert tables.endswith(" | - |\n")  # a run has no file to time
     less = tmp_path / "smaller.onnx"
     words = f"{file} --store {folder} --without 0 3 --seen 60 --minutes 0.01 --out {less}"
     for each in (words, f"{less} --store {folder}"):
