@@ -38,7 +38,7 @@ class Recipe:
     bias_weight: float = 0.5  # of a window's mean error near the surface, for masks
     first_weight: float = 0.2  # of the loss after the first blocks of a gated network
     gate_weight: float = 0.01  # of the error of what its gate says of that loss
-    shares_gated: tuple[float, float] = (0.05, 0.5)  # of a batch's voxels, drawn between these
+    shares_gated: tuple[float, float] = (0.05, 0.5)  # of the voxels that can hold the surface
     shares: Shares = USUAL
 
 
@@ -161,24 +161,21 @@ def window_losses(net: SuperSdfNet, batch: Batch, recipe: Recipe) -> Tensor:
     blocks, and the error of what the gate says of this. Of masks it is also the mean error of a
     sample: a mask hardly tells a curved surface from a flat one, which has the least loss a voxel.
     """
-    if not net.config.gated:
-        values = predict(net, batch)
-        losses = window_means(voxel_losses(values, batch.targets, recipe), batch)
-        if net.config.keeps_samples:
-            return losses
-        apart = weights_near(batch.targets, recipe) * (values - batch.targets)
-        return losses + recipe.bias_weight * window_means(apart.mean(1), batch).abs()
-
-    def lost(encoded: Encoded) -> Tensor:
-        return voxel_losses(predict(net, batch, encoded), batch.targets, recipe)
-
-    low, high = recipe.shares_gated
-    share = low + (high - low) * float(torch.rand(()))
-    encoded = net.encode_all(batch.patches, batch.table, share)
-    of_first = lost(replace(encoded, features=encoded.early))
-    apart = encoded.doubts[batch.voxels] - of_first.detach().log()
-    loss = recipe.first_weight * of_first + recipe.gate_weight * apart.abs() + lost(encoded)
-    return window_means(loss, batch)
+    encoded, of_gate = None, batch.targets.new_zeros(())
+    if net.config.gated:
+        low, high = recipe.shares_gated
+        share = low + (high - low) * float(torch.rand(()))
+        encoded = net.encode_all(batch.patches, batch.table, share)
+        first = predict(net, batch, replace(encoded, features=encoded.early))
+        of_first = voxel_losses(first, batch.targets, recipe)
+        apart = encoded.doubts[batch.voxels] - of_first.detach().log()
+        of_gate = recipe.first_weight * of_first + recipe.gate_weight * apart.abs()
+    values = predict(net, batch, encoded)
+    losses = window_means(of_gate + voxel_losses(values, batch.targets, recipe), batch)
+    if net.config.keeps_samples:
+        return losses
+    off = weights_near(batch.targets, recipe) * (values - batch.targets)
+    return losses + recipe.bias_weight * window_means(off.mean(1), batch).abs()
 
 
 def window_means(values: Tensor, batch: Batch) -> Tensor:

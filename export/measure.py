@@ -1,10 +1,11 @@
 """The errors of networks on the windows held out of a store; of those for masks bias and reach.
 
-    python -m export.measure --store training/store src/super_sdf/models/mask.onnx training/run
+    python -m export.measure --store training/store src/super_sdf/models/base.onnx training/run
 
 So a shipped network can be compared with one in training, of which the averaged weights are
-measured. Errors are those of the log of a run. ``lab figures --only masks`` has whole bodies.
-``--time examples/part.npz`` adds what a voxel of that grid costs, in the int8 variant of a file.
+measured. Errors are those of the log of a run, which has a third of these windows.
+``lab figures --only masks`` has whole bodies. ``--time examples/part.npz`` adds what a voxel of
+that grid costs in the int8 variant of a file, if it has one.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from export.network import SuperSdfNet
 from export.store import HELD_OUT, held_out
 from export.to_onnx import load_run, read_network
 from super_sdf import SdfGrid, load_network, read_grid
+from super_sdf.errors import OptionError
 from super_sdf.grid.derived import mask_distances
 from super_sdf.network import contract
 from super_sdf.refine.band import neighbour_table, survey
@@ -66,10 +68,15 @@ def reach_of(net: SuperSdfNet) -> float:
     return float((0.5 - inside / (inside - outside)).sum())
 
 
-def microseconds(path: Path, grid: SdfGrid) -> float:
-    """Return the processor time a voxel of the band of a grid, on one thread, head included."""
+def microseconds(path: Path, grid: SdfGrid) -> str:
+    """Return the processor time a voxel of the band of a grid, on one thread, head included.
+
+    It is that of the int8 variant beside a file; a run, or a file without it, has none.
+    """
     int8 = path.with_name(f"{path.stem}-int8.onnx")
-    network, band = load_network(int8 if int8.is_file() else path, threads=1), survey(grid)
+    if not int8.is_file():
+        return "-"
+    network, band = load_network(int8, threads=1), survey(grid)
     table = neighbour_table(band.voxel_ijk, grid.shape)
     patches = np.pad(band.patches, ((0, 0), (0, network.card.get("wide", 0))))
     decoded, seconds = np.flatnonzero(band.decoded).astype(np.int32), list[float]()
@@ -77,7 +84,7 @@ def microseconds(path: Path, grid: SdfGrid) -> float:
         clock = time.process_time()
         network(patches, table, decoded, block_offsets(FACTOR))
         seconds.append(time.process_time() - clock)
-    return 1e6 * min(seconds) / len(table)
+    return f"{1e6 * min(seconds) / len(table):.2f}"
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -89,7 +96,10 @@ def main(words: Sequence[str] | None = None) -> None:
     options = parser.parse_args(words)
     with parser.one_line_errors():
         nets = {f: load_run(f) if f.is_dir() else read_network(f) for f in options.files}
-        masks = not all(net.config.keeps_samples for net in nets.values())
+        masks = {not net.config.keeps_samples for net in nets.values()}
+        if len(masks) > 1:
+            raise OptionError("networks for masks and for distances: measure them apart")
+        (masks,) = masks
         kind = contract.MASKS if masks else DISTANCES
         samples = held_out(options.store, kind, HELD_OUT)
         smooth = held_out(options.store, kind, 1, "smooth") if masks else []
@@ -100,7 +110,7 @@ def main(words: Sequence[str] | None = None) -> None:
         for path, net in nets.items():
             cells = measure(net, samples).cells() + cells_of_masks(net, smooth)
             if grid:
-                cells.append("-" if path.is_dir() else f"{microseconds(path, grid):.2f}")
+                cells.append(microseconds(path, grid))
             print(f"| {path.name} | {' | '.join(cells)} |", flush=True)
 
 

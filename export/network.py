@@ -44,7 +44,7 @@ class NetworkConfig:
     frequencies: int = 4
     keeps_samples: bool = True  # the sample's value, where it can be a distance; not with masks
     gated: int = 0  # of the blocks, the last ones, that run only where the gate is open
-    wide: int = 0  # inputs of a voxel besides its patch: of masks, ``grid.derived.wide_distances``
+    wide: int = 0  # inputs of a voxel besides its patch: of masks the ``WIDE`` ones
     places: tuple[int, ...] = ()  # that each of ``all_blocks`` sees; all 27 if nothing is given
     seen: int = 0  # channels, the first ones, that blocks before the gated ones see; 0 for all
 
@@ -53,6 +53,7 @@ class NetworkConfig:
         return self.blocks + 1
 
 
+WIDE = 2  # of masks, ``grid.derived.wide_distances``
 SIZES = {
     "fast": NetworkConfig(blocks=4, functions=192),
     "base": NetworkConfig(
@@ -65,13 +66,13 @@ SIZES = {
         seen=64,
     ),
     "noisy": NetworkConfig(blocks=5, places=(19,) * 5),
-    "mask": NetworkConfig(blocks=7, keeps_samples=False, wide=2),
+    "mask": NetworkConfig(blocks=7, keeps_samples=False, wide=WIDE),
 }
 """The sizes of the shipped networks, by name."""
 
 
 PLACES = {
-    n: np.flatnonzero(np.abs(NEIGHBOURHOOD).sum(1) <= k) for k, n in enumerate((1, 7, 19, 27))
+    n: np.flatnonzero(np.abs(NEIGHBOURHOOD).sum(1) <= k) for k, n in enumerate((7, 19, 27), 1)
 }
 """Which of the 27 places a block sees, by their number: without corners, or the faces only."""
 

@@ -29,7 +29,7 @@ from super_sdf.network import onnx as sessions
 from super_sdf.refine import band
 
 CHUNK_INPUT = sessions.CHUNK_INPUT
-CHUNK = 512  # voxels at a time; the runtime chooses its own, see ``cpu_chunk``
+CHUNK = 512  # voxels at a time; the runtime chooses its own, see ``CPU_CHUNK``
 EARLY = "_early"  # the block for voxels that go no deeper
 THRESHOLD = "gate.threshold"  # an input with a default, like the chunk
 

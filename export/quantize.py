@@ -30,6 +30,7 @@ import torch
 from onnx import TensorProto, numpy_helper
 from torch import Tensor, nn
 
+from export.arguments import Parser
 from export.augment import DISTANCES, Prepared, draw_samples
 from export.losses import batch_of
 from export.network import Block, SuperSdfNet, in_basis
@@ -312,16 +313,21 @@ def take_shift_out(path: Path, shift: float) -> None:
     onnx.save(model, path)
 
 
-def main() -> None:
+def main(words: Sequence[str] | None = None) -> None:
     """Write the file; keep it only if it is close to its source."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = Parser(description=__doc__.split("\n")[0])
     parser.add_argument("source", type=Path, help="an .onnx file of export.to_onnx")
     parser.add_argument("--out", type=Path, help="the int8 .onnx file")
     parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
-    options = parser.parse_args()
-    if options.out is None:
-        optimise(options.source)
-        return
+    options = parser.parse_args(words)
+    with parser.one_line_errors():
+        if options.out is None:
+            optimise(options.source)
+        else:
+            write_int8(options)
+
+
+def write_int8(options: argparse.Namespace) -> None:
     of_distances = read_network(options.source).config.keeps_samples
     samples = draw_samples(inputs=DISTANCES if of_distances else contract.MASKS)
     quantize(options.source, options.out, samples, options.accuracy)

@@ -1,7 +1,7 @@
 """Smaller networks with nearly the same values, to ship or to start from.
 
-    python -m export.smaller base.onnx --store S     # the errors without each block
-    python -m export.smaller base.onnx --store S --without 0 --out smaller.onnx
+    python -m export.smaller large.onnx --store S     # the errors without each block
+    python -m export.smaller large.onnx --store S --without 0 --out smaller.onnx
     python -m export.smaller smaller.onnx --store S --seen 64 --minutes 18 --out start.onnx
 
 In training a block may die: then it changes all voxels alike, or hardly any, and a network without
@@ -29,7 +29,7 @@ from export.dataset import read_shard
 from export.losses import RECIPE, batch_of, measure
 from export.network import PLACES, NeighbourConv, SuperSdfNet, gathered, in_basis
 from export.store import HELD_OUT, Store, check_store, shards_of
-from export.to_onnx import load_run, make_card, parity, read_network, write_model
+from export.to_onnx import load_run, make_card, parity, read_card, read_network, write_model
 from export.train import Run, autocast
 from super_sdf.errors import OptionError
 from super_sdf.network import contract
@@ -126,14 +126,18 @@ def seeing_less(
 ) -> SuperSdfNet:
     """Return a network whose blocks before a gate see fewer places, or channels, fitted to another.
 
-    ``places`` has a number for each of these blocks; all others see what they saw.
+    ``places`` has a number for each of these blocks; all others see what they saw. ``seen`` is 0
+    for all channels. OptionError if the numbers do not fit, or the network sees less already.
     """
     first = net.config.blocks - net.config.gated
-    if len(places) != first or net.config.seen:
+    if len(places) != first:
+        raise OptionError(f"--places {' '.join(map(str, places))}: give {first} numbers")
+    if net.config.seen:
         raise OptionError(
-            f"places {places}, channels {net.config.seen}: give {first} numbers of places, and a "
-            "network whose blocks see all channels"
+            f"its blocks see {net.config.seen} channels: give a network that sees all"
         )
+    if not 0 <= seen <= net.config.channels:
+        raise OptionError(f"--seen {seen}: give at most {net.config.channels}, all channels")
     places = (*places, *(block.conv.places for block in net.all_blocks()[first:]))
     small = SuperSdfNet(replace(net.config, places=places, seen=seen)).eval()
     weights, own = net.state_dict(), small.state_dict()
@@ -207,6 +211,9 @@ def main(words: Sequence[str] | None = None) -> None:
         def line(name: str, net: SuperSdfNet) -> None:
             print(f"| {name} | {' | '.join(measure(net, new).cells())} |", flush=True)
 
+        changed = options.without or options.places or options.seen
+        if bool(changed) != bool(options.out) or (options.minutes and not changed):
+            raise OptionError("--out is for a network that --without, --places or --seen makes")
         line(options.source.name, net)
         if options.out is None:
             for number in range(len(changes)):
@@ -217,14 +224,18 @@ def main(words: Sequence[str] | None = None) -> None:
         if options.places or options.seen:
             before = len(net.blocks) - net.config.gated
             places = tuple(options.places or (b.conv.places for b in net.blocks[:before]))
-            turned = decisive_first(net, windows) if not net.config.seen else net
-            small = seeing_less(turned, places, options.seen or net.config.channels, windows)
+            turned = decisive_first(net, windows)
+            small = seeing_less(turned, places, options.seen or 0, windows)
             if options.minutes:
                 line("fitted", small)
                 store = Store(options.store, inputs=inputs, shares=shares)
                 small = follow(small, turned, store, options.minutes, options.out.parent)
             net = small
-        write_model(net, options.out, make_card(net, options.out.stem, "fitted", "not measured"))
+        card = make_card(net, options.out.stem)
+        if not options.source.is_dir():
+            kept = read_card(options.source)
+            card |= {name: kept[name] for name in ("trained_on", "inputs") if name in kept}
+        write_model(net, options.out, card)
         line(options.out.name, net)
         print(f"differs from torch by {parity(net, options.out) / 2:.1e} voxels")
 

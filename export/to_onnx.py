@@ -19,11 +19,11 @@ import onnx
 import torch
 from onnx import helper, numpy_helper
 
-from export.augment import DISTANCES
+from export.arguments import Parser
 from export.network import NetworkConfig, SuperSdfNet
 from export.onnx_graph import build_graph
 from super_sdf import load_network
-from super_sdf.errors import ModelError
+from super_sdf.errors import ModelError, OptionError
 from super_sdf.grid.derived import BLURRED
 from super_sdf.network import contract
 from super_sdf.refine import band, nodes
@@ -79,7 +79,7 @@ def parity(net: SuperSdfNet, path: Path, seed: int = 0) -> float:
 
 
 def load_run(folder: Path) -> SuperSdfNet:
-    state = torch.load(folder / "checkpoint.pt", weights_only=True)
+    state = torch.load(folder / "checkpoint.pt", weights_only=True, map_location="cpu")
     net = SuperSdfNet(NetworkConfig(**state["config"]))
     net.load_state_dict(state["average"])
     return net.eval()
@@ -120,11 +120,8 @@ def read_card(path: Path) -> dict[str, str]:
     return {prop.key: prop.value for prop in onnx.load(path).metadata_props}
 
 
-def make_card(
-    net: SuperSdfNet, name: str, data: str, accuracy: str, inputs: str = DISTANCES
-) -> dict[str, Any]:
+def make_card(net: SuperSdfNet, name: str) -> dict[str, Any]:
     """Return the metadata of the file, which the runtime shows."""
-    inputs = inputs if net.config.keeps_samples else contract.MASKS
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
     ).stdout.strip()
@@ -137,36 +134,48 @@ def make_card(
         "value_scaling": "2 / h",
         "training_factors": [2, 4, 8, 16],
         "parameters": sum(p.numel() for p in net.parameters()),
-        "trained_on": data,
+        "trained_on": "not given",
         "trained_from_commit": commit,
-        "accuracy": accuracy,
+        "accuracy": "not measured",
         "licence": "MIT",
-        **({} if inputs == DISTANCES else {"inputs": inputs}),
+        **({} if net.config.keeps_samples else {"inputs": contract.MASKS}),
         **{name: n for name in ("gated", "wide", "seen") if (n := getattr(net.config, name))},
     }
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Export a run, or rewrite a file; keep the result only if it agrees with PyTorch."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = Parser(description=__doc__.split("\n")[0])
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--run", type=Path, help="folder of the run")
     source.add_argument("--from", type=Path, dest="source", help="an .onnx file to rewrite")
     parser.add_argument("--out", type=Path, required=True, help="the .onnx file")
-    parser.add_argument("--data", default="not given", help="what it was trained on")
-    parser.add_argument("--accuracy", default="not measured", help="measured figures, in words")
+    parser.add_argument("--data", help="what it was trained on")
+    parser.add_argument("--accuracy", help="measured figures, in words")
     exact = "it was trained on hardly any noisy samples: noisy grids are for another network"
     parser.add_argument("--exact", action="store_true", help=exact)
     gate = "of the gate, the logarithm of a loss, if not that of the run"
     parser.add_argument("--threshold", type=float, help=gate)
     options = parser.parse_args(words)
+    with parser.one_line_errors():
+        export(options)
+
+
+def export(options: argparse.Namespace) -> None:
     net = read_network(options.source) if options.source else load_run(options.run)
+    card = read_card(options.source) if options.source else make_card(net, options.out.stem)
     if options.threshold is not None:
+        if not net.config.gated:
+            raise OptionError("--threshold is of a gate, which this network lacks: leave it out")
         net.gate.threshold.fill_(options.threshold)
-    inputs = contract.EXACT_DISTANCES if options.exact else DISTANCES
-    card = make_card(net, options.out.stem, options.data, options.accuracy, inputs)
+    if options.exact:
+        if not net.config.keeps_samples:
+            raise OptionError("--exact is for distances, this network for masks: leave it out")
+        card["inputs"] = contract.EXACT_DISTANCES
+    said = {"trained_on": options.data, "accuracy": options.accuracy}
+    card |= {name: text for name, text in said.items() if text}
     fresh = options.out.with_suffix(".new.onnx")  # the target may be the source
-    write_model(net, fresh, read_card(options.source) if options.source else card)
+    write_model(net, fresh, card)
     difference = parity(net, fresh)
     if difference > PARITY:
         fresh.unlink()

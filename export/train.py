@@ -29,10 +29,11 @@ from export.arguments import Parser, at_least, positive, share
 from export.augment import DISTANCES, INPUTS, USUAL
 from export.losses import RECIPE, Batch, Recipe, measure, window_losses
 from export.measure import OF_MASKS, cells_of_masks
-from export.network import SIZES, SuperSdfNet
+from export.network import SIZES, WIDE, NetworkConfig, SuperSdfNet
 from export.store import HELD_OUT, Store, check_store
 from export.to_onnx import read_network
 from super_sdf.errors import OptionError
+from super_sdf.network import contract
 
 SAVE_SECONDS = 300  # between checkpoints, each with a line in the log
 LONGEST_STEP = 30.0  # seconds: the rest of a longer one is taken as a pause (SIGSTOP)
@@ -95,7 +96,7 @@ class Run:
                 array.zero_()
             if name == "stem.0.weight" and name in weights:
                 more = array.shape[1] - weights[name].shape[1]  # inputs that change nothing yet
-                weights[name] = torch.nn.functional.pad(weights[name], (0, more))
+                weights[name] = torch.nn.functional.pad(weights[name], (0, max(more, 0)))
         try:
             self.net.load_state_dict({**fresh, **weights})
         except RuntimeError as error:
@@ -230,19 +231,33 @@ def main(words: Sequence[str] | None = None) -> None:
         run_training(options)
 
 
+def resized(
+    size: NetworkConfig, blocks: int | None, gated: int | None, inputs: str
+) -> NetworkConfig:
+    """Return the sizes of a network for these inputs; more blocks see as many places as the last.
+
+    OptionError if more blocks are gated than there are.
+    """
+    count, places = blocks or size.blocks, size.places
+    gated = size.gated if gated is None else gated
+    if gated > count:
+        raise OptionError(f"{gated} of {count} blocks cannot be gated: give fewer")
+    if places:
+        last = places[size.blocks - 1 : size.blocks]
+        early = places[size.blocks :] or last * bool(gated)
+        places = (*places[: size.blocks][:count], *last * (count - size.blocks), *early)
+    masks = inputs == contract.MASKS
+    sizes = {"blocks": count, "gated": gated, "places": places, "wide": WIDE * masks}
+    return replace(size, keeps_samples=not masks, **sizes)
+
+
 def run_training(options: argparse.Namespace) -> None:
     """Check the store before anything is written, then train."""
     began = time.monotonic() if options.by_clock else None
     check_store(options.store, HELD_OUT)
     given = read_network(options.start) if options.start else None
     size = given.config if given and not options.size else SIZES[options.size or "base"]
-    config = replace(
-        size,
-        blocks=options.blocks or size.blocks,
-        keeps_samples=options.inputs == DISTANCES,
-        gated=size.gated if options.gated is None else options.gated,
-        places=() if options.blocks else size.places,
-    )
+    config = resized(size, options.blocks, options.gated, options.inputs)
     drawn = {name: getattr(options, name) for name in ("shifted", "noisy", "truncated")}
     recipe = replace(
         RECIPE,

@@ -31,7 +31,7 @@ def file(net, tmp_path):
     if net.config.gated:
         with torch.no_grad():
             net.gate.threshold.fill_(net.encode_all(*ball_tensors()).doubts.quantile(0.5))
-    write_model(net, tmp_path / "small.onnx", make_card(net, "small", "nothing", "none"))
+    write_model(net, tmp_path / "small.onnx", make_card(net, "small"))
     return tmp_path / "small.onnx"
 
 
@@ -75,7 +75,7 @@ def test_networks_keep_samples_unless_they_are_noisy_or_of_masks(tmp_path):
         torch.nn.init.constant_(net.correction.bias, 0.5)
         at_sample = float(net(patches, table, torch.tensor([0]), torch.zeros(1, 3)).detach())
         assert (at_sample == pytest.approx(float(patches[0, 13]), abs=1e-5)) == keeps
-    write_model(net, tmp_path / "mask.onnx", make_card(net, "mask", "nothing", "none"))
+    write_model(net, tmp_path / "mask.onnx", make_card(net, "mask"))
     assert load_network(tmp_path / "mask.onnx").card["inputs"] == contract.MASKS
     assert not read_network(tmp_path / "mask.onnx").config.keeps_samples
     patches, table = ball_tensors()

@@ -43,10 +43,16 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys):
     assert card["inputs"] == contract.MASKS and card["wide"] == 2
     assert card["receptive_field"] == SIZES["mask"].blocks + 1 + BLURRED
     example = str(Path(__file__).parents[2] / "examples" / "part.npz")
-    measure.main(["--store", str(folder), str(file), str(run), "--time", example])
+    shipped = Path(load_network("base").path).with_name("mask.onnx")
+    words = ["--store", str(folder), str(file), str(run), str(shipped), "--time", example]
+    measure.main(words)
     tables = capsys.readouterr().out
     assert "| small.onnx | 0." in tables and "| bias | reach | us a voxel |" in tables
-    assert tables.endswith(" | - |\n")  # a run has no file to time
+    *times, last = (line.split("|")[-2] for line in tables.splitlines()[-3:])
+    assert times == [" - ", " - "] and float(last) > 0  # the others have no int8 variant
+    with pytest.raises(SystemExit):
+        measure.main(["--store", str(folder), str(file), str(shipped.with_name("fast.onnx"))])
+    assert "measure them apart" in capsys.readouterr().err
     less = tmp_path / "smaller.onnx"
     words = f"{file} --store {folder} --without 0 3 --seen 60 --minutes 0.01 --out {less}"
     for each in (words, f"{less} --store {folder}"):
@@ -194,11 +200,42 @@ def test_a_network_without_a_dead_block_has_its_values_and_one_that_sees_less_ne
         want = predict(net, batch)
         apart = [float((predict(n, batch) - want).abs().mean()) for n in (fewer, same, less, least)]
     assert less.config == replace(fewer.config, places=(*places, 27, 27), seen=count - 4)
-    with pytest.raises(train.OptionError, match=r"^places \(19, 7\), channels 12: give 2 numbers"):
-        smaller.seeing_less(less, places, 4, prepared)
+    for given, numbers, seen, message in (
+        (less, places, 4, "its blocks see 12 channels: give a network that sees all"),
+        (fewer, (19,), 4, "places=19: give 2 numbers"),
+        (fewer, places, count + 1, f"seen={count + 1}: give at most {count}, all channels"),
+    ):
+        with pytest.raises(train.OptionError, match=f"^{message}$"):
+            smaller.seeing_less(given, numbers, seen, prepared)
     assert max(apart[:2]) < 1e-4 < apart[2] < apart[3]
     with pytest.raises(train.OptionError, match=r"^without \[3\]: the first 3 blocks can go"):
         smaller.without(net, [3], changes)
+
+
+def test_a_size_is_changed_by_options_and_by_the_inputs():
+    base = SIZES["base"]
+    assert train.resized(base, None, None, DISTANCES) == base
+    more = train.resized(base, 13, None, DISTANCES)
+    assert more.places == (*base.places[:11], 7, 7, 7) and more.blocks == 13
+    assert train.resized(SIZES["noisy"], 6, 1, DISTANCES).places == (19,) * 7
+    masks = train.resized(SIZES["fast"], None, None, contract.MASKS)
+    assert masks.wide == 2 and not masks.keeps_samples
+    assert train.resized(SIZES["mask"], None, None, DISTANCES).wide == 0
+    with pytest.raises(train.OptionError, match=r"^6 of 4 blocks cannot be gated: give fewer$"):
+        train.resized(base, 4, None, DISTANCES)
+
+
+@pytest.mark.parametrize("gated", [0, 2])
+def test_of_masks_the_mean_error_of_a_window_is_lost_too(gated, prepared):
+    net = SuperSdfNet(replace(SMALL, gated=gated, keeps_samples=False))
+    losses = []
+    for weight in (0, 1, 3):
+        torch.manual_seed(0)  # the share of voxels where the gate opens is drawn
+        with torch.no_grad():
+            recipe = replace(RECIPE, bias_weight=weight)
+            losses.append(window_losses(net, batch_of(prepared[:2]), recipe))
+    assert (losses[1] > losses[0]).all()
+    torch.testing.assert_close(losses[2] - losses[0], 3 * (losses[1] - losses[0]))
 
 
 def test_the_reach_is_what_a_step_in_a_plane_moves_the_surface_beside_it():
