@@ -1,7 +1,7 @@
 """Training samples: windows of coarse grids with exact distances at fine query points.
 
     python -m export.dataset --meshes DIR --procedural 0.3 --out training/store --count 5000
-    python -m export.dataset --smooth --slices 6 --out training/store --seed 20 --count 2000
+    python -m export.dataset --smooth --slices 6 --margin 10 --out training/masks --count 400
 
 A sample is one shape in one pose at one resolution. It holds a window of the coarse grid and, for
 each voxel that can hold the surface, the exact distance at a set of query offsets that is drawn
@@ -12,7 +12,7 @@ rescaled (half voxels, Eqs. 4 and 5).
 
 Samples are stored in shards as concatenated flat arrays: ``windows`` (float32) with
 ``window_shape``, ``offsets`` (n, Q, 3), ``voxel_ijk`` (D, 3) and ``targets`` (D, Q) float16 with
-``voxel_count``. Each mesh is used once before any is repeated, but simple prisms are a sixth.
+``voxel_count``, and with ``margin`` samples more to each side of a window. Each mesh is used once before any is repeated, but simple prisms are a sixth.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class Recipe:
     reach: float = 0.5  # half voxels: decay length of the weight away from the surface ...
     far_weight: float = 0.25  # ... to this
     gradient_weight: float = 0.5
-    bias_weight: float = 0.5  # of a window's mean error near the surface, for masks
+    bias_weight: float = 1.0  # of a window's mean error near the surface, for masks
     first_weight: float = 0.2  # of the loss after the first blocks of a gated network
     gate_weight: float = 0.01  # of the error of what its gate says of that loss
     shares_gated: tuple[float, float] = (0.05, 0.5)  # of the voxels that can hold the surface
