@@ -78,6 +78,7 @@ TABLES: dict[str, Callable[[list[Row]], str]] = {
         among(rows, "method", "ours-marching"), shown_in("networks"), BY_SIZE),
     **{f"quality.{n}": lambda rows, n=n: tables.surface_table(pick(rows, size=n), n)
        for n in (32, 64, 128)},
+    "halves.table": lambda rows: listed(rows, tables.GAPS, ("size", "shapes", "method")),
     "quality.meaning": lambda rows: meanings(QUALITY),
     "edges.meaning": lambda rows: meanings("parts peers", but=QUALITY),
     "edges.parts": lambda rows: listed(

@@ -12,6 +12,7 @@ method, network, code, and for times the machine), so a run that was killed goes
 
 from __future__ import annotations
 
+import csv
 import datetime
 import json
 import statistics
@@ -47,6 +48,7 @@ from .shapes import Setting, Shape, find_meshes, spread
 from .tables import gaps_closed, mean_of, summary
 
 ROWS = "rows.jsonl"
+CHOICE = Path(__file__).with_name("validation.csv")  # the shapes, and which networks are chosen on
 FEW, FEW_PARTS, TIMED = 10, 6, 4  # shapes and parts of the smaller figures, and of times
 # Networks are compared by marching cubes of their fields, as the bound is made.
 NETWORKS = [f"ours-marching{model}" for model in ("@fast", "@noisy", "@base:float32", "@best")]
@@ -116,6 +118,26 @@ def quality(bench: Bench) -> list[Row]:
     baselines = ("mc", "mc-lewiner", "trilinear", "bspline")
     methods = [*baselines, "ours", "ours-marching", *others, "bound", FLOOR]
     return bench.measured("validation", [({"size": n}, Setting(n)) for n in bench.sizes], methods)
+
+
+def halves(bench: Bench) -> list[Row]:
+    """Return the gaps closed on shapes that networks were chosen on, and on the others."""
+    with CHOICE.open(newline="") as file:
+        chosen = {row["name"] for row in csv.DictReader(file) if row["chosen_on"] == "yes"}
+    methods, rows = ("bspline", "ours-marching", "ours", "bound"), []
+    settings = [Setting(n) for n in bench.sizes]
+    results = bench.results("validation", settings, methods)
+    for setting, half in product(settings, ("chosen on", "others")):
+        found = {
+            method: [row for row in results.of(setting, method)
+                     if (row["shape"] in chosen) == (half == "chosen on")]
+            for method in methods
+        }  # fmt: skip
+        for method in methods[1:-1]:
+            gaps = gaps_closed(found[method], found["bspline"], found["bound"])
+            words = {"size": setting.size, "shapes": half, "method": method}
+            rows.append({**words, "count": len(found[method]), **gaps})
+    return rows
 
 
 def edges(bench: Bench) -> list[Row]:
@@ -274,6 +296,7 @@ def large_row(grid: Path, limit: str, n: int, model: Sequence[str]) -> Row:
 # How each is measured, and by which networks.
 FIGURES: dict[str, tuple[Callable[[Bench], list[Row]], tuple[str, ...]]] = {
     "quality": (quality, ("fast", "base", "best", "noisy")),
+    "halves": (halves, ("base",)),
     "edges": (edges, ("base",)),
     "kinds": (kinds, ("base", "mask", "noisy")),
     "noise": (noise, ("base", "noisy")),

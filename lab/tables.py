@@ -20,6 +20,9 @@ LARGE = (Column("tiles", "tiles", digits=0), Column("band_voxels", "band voxels"
 OF_MASKS = (Column("voxels"), Column("bias"), Column("volume", digits=2))
 MASKS = (Column("faces", "triangles", digits=0), Column("closed", "closed"),
          Column("seconds", "ms", 1000, 1))  # fmt: skip
+GAPS = (Column("count", "number", digits=0),
+        *(Column(f"gap_{metric.key}", f"{metric.gap} %", 100, 1)
+          for metric in METRICS.values() if metric.gap))  # fmt: skip
 WALLS = (Column("voxels", "distance"), Column("most", "worst label"), Column("bias", "bias"),
          Column("gaps", "gaps %", 100), Column("overlaps", "overlaps %", 100), *MASKS[:1],
          Column("open", "open edges", digits=0), Column("megabytes", "MB", digits=1),

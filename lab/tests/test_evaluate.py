@@ -143,8 +143,8 @@ def test_documents_show_what_was_measured():
 def test_figures_are_measured_kept_and_printed(meshes, tmp_path, command):
     out = tmp_path / "out"
     words = ["figures", "--shapes", meshes, "--parts", meshes, "--sizes", 8, "--jobs", 0]
-    code, printed, _ = command(*words, "--only", "simplify", "--out", out)
-    assert code == 0
+    code, printed, _ = command(*words, "--only", "simplify", "halves", "--out", out)
+    assert code == 0 and "| 8^3 | others | super-sdf |" in printed
     assert "simplify.table" in printed and "| parts | super-sdf, marching |" in printed
     content = documents.read(out / "simplify.json")
     assert len(content["rows"]) == 4 and content["networks"].keys() == {"base"}
