@@ -12,7 +12,8 @@ rescaled (half voxels, Eqs. 4 and 5).
 
 Samples are stored in shards as concatenated flat arrays: ``windows`` (float32) with
 ``window_shape``, ``offsets`` (n, Q, 3), ``voxel_ijk`` (D, 3) and ``targets`` (D, Q) float16 with
-``voxel_count``, and with ``margin`` samples more to each side of a window. Each mesh is used once before any is repeated, but simple prisms are a sixth.
+``voxel_count``. With ``margin`` a window has samples more to each side. Each mesh is used once
+before any is repeated, but simple prisms are a sixth.
 """
 
 from __future__ import annotations
