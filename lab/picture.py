@@ -4,6 +4,7 @@
     python -m lab picture case.nii.gz                # all labels of an image, each in a colour
     python -m lab picture                            # a level set: a splash
     python -m lab picture --masks                    # a mask beside other tools
+    python -m lab picture MESHES --weak              # details under a voxel, for the card of base
     python -m lab picture grid.npz --out grid.png    # any other grid
 
 PARTS is the folder of ``python -m export.parts PARTS``. Lengths in a picture can be compared.
@@ -32,10 +33,11 @@ from .shapes import Case, Setting, Shape, turn_of
 from .surfaces import closed_isosurface
 from .tables import label_of
 
-IMAGES = Path("docs/images")
+IMAGES, CARDS = Path("docs/images"), Path("src/super_sdf/models")
 FIRST, FIRST_SIZE = "part-06-housing", 48  # README's part
 PARTS, PARTS_SIZE = ("part-03-clevis", "part-02-rod", "part-16-slide"), 32
 METHODS = ("mc", "ours-marching", "ours")
+WEAK = ("tm-fixed_top", "p2m-thorn2")  # of the validation shapes: notches and thorns under a voxel
 AXES = np.array([[5, 3, 0], [-2.7, 4.5, 6.8]])  # of a panel, in the world: to the right, and up
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
 MARGIN, PIXELS = 1.06, (640, 480)
@@ -119,6 +121,16 @@ def panels_of_part(folder: Path, name: str, size: int, methods: Sequence[str]) -
     return compared(zip(titles, ([mesh] for mesh in meshes)), turn_of(name, SEED))
 
 
+def panels_of_shape(path: Path) -> list[Panel]:
+    """Return a shape, sampled, and meshed by marching cubes and super-sdf, and its true surface."""
+    shape = Shape.read(path)
+    case = Case(shape, Setting(PARTS_SIZE))
+    methods, network = METHODS[::2], load_network()
+    meshes = [[make_surface(method, case, network).mesh] for method in methods]
+    found = zip((f"{label_of(method)}, {PARTS_SIZE}^3" for method in methods), meshes)
+    return compared([*found, ("true surface", [shape.mesh])])
+
+
 def compared(
     found: Iterable[tuple[str, Sequence[Mesh]]], turn: NDArray[np.float64] | None = None
 ) -> list[Panel]:
@@ -176,10 +188,14 @@ def main() -> None:
     parser.add_argument("source", nargs="?", type=Path, help="a grid, labels, or a folder of parts")
     parser.add_argument("--out", type=Path, help="PNG file; default: the picture in the documents")
     parser.add_argument("--masks", action="store_true", help="draw a mask beside other tools")
+    parser.add_argument("--weak", action="store_true", help="draw what base rounds off or invents")
     words = parser.parse_args()
     source = words.source
     if words.masks:
         draw(panels_of_mask(), words.out or IMAGES / "masks.png", 3, (400, 340))
+    elif words.weak and source:
+        panels = [panel for name in WEAK for panel in panels_of_shape(source / f"{name}.ply")]
+        draw(panels, words.out or CARDS / "base-weak.png", 3, (400, 340))
     elif source is None:
         draw(panels_of_grid(splash()), words.out or IMAGES / "level-set.png", 2)
     elif source.is_dir():
