@@ -33,7 +33,7 @@ from super_sdf.refine.nodes import block_offsets
 
 STEP, STEPPED = 16, 9  # samples to a step in a plane; those beside it, by which reach is measured
 OF_MASKS = "smooth", "bias", "reach"
-FACTOR, RUNS = 4, 7  # of the refinement that is timed, and how often it is
+FACTOR, RUNS = 4, 11  # of the refinement that is timed, and how often it is
 
 
 def cells_of_masks(net: SuperSdfNet, smooth: Sequence[Prepared]) -> list[str]:
@@ -68,23 +68,23 @@ def reach_of(net: SuperSdfNet) -> float:
     return float((0.5 - inside / (inside - outside)).sum())
 
 
-def microseconds(path: Path, grid: SdfGrid) -> str:
+def microseconds(paths: Sequence[Path], grid: SdfGrid) -> dict[Path, float]:
     """Return the processor time a voxel of the band of a grid, on one thread, head included.
 
-    It is that of the int8 variant beside a file; a run, or a file without it, has none.
+    It is the median for the int8 variant beside a file, and the files are run in turn. A run, or a
+    file without the variant, has none.
     """
-    int8 = path.with_name(f"{path.stem}-int8.onnx")
-    if not int8.is_file():
-        return "-"
-    network, band = load_network(int8, threads=1), survey(grid)
+    band = survey(grid)
     table = neighbour_table(band.voxel_ijk, grid.shape)
-    patches = np.pad(band.patches, ((0, 0), (0, network.card.get("wide", 0))))
-    decoded, seconds = np.flatnonzero(band.decoded).astype(np.int32), list[float]()
-    for _ in range(RUNS):
+    decoded, seconds = np.flatnonzero(band.decoded).astype(np.int32), {}
+    int8 = {path: path.with_name(f"{path.stem}-int8.onnx") for path in paths}
+    networks = {p: load_network(file, threads=1) for p, file in int8.items() if file.is_file()}
+    for path, network in list(networks.items()) * RUNS:
+        patches = np.pad(band.patches, ((0, 0), (0, network.card.get("wide", 0))))
         clock = time.process_time()
         network(patches, table, decoded, block_offsets(FACTOR))
-        seconds.append(time.process_time() - clock)
-    return f"{1e6 * min(seconds) / len(table):.2f}"
+        seconds.setdefault(path, []).append(time.process_time() - clock)
+    return {path: 1e6 * float(np.median(some)) / len(table) for path, some in seconds.items()}
 
 
 def main(words: Sequence[str] | None = None) -> None:
@@ -104,13 +104,13 @@ def main(words: Sequence[str] | None = None) -> None:
         samples = held_out(options.store, kind, HELD_OUT)
         smooth = held_out(options.store, kind, 1, "smooth") if masks else []
         columns = ["network", "everywhere", "near", "normal", *OF_MASKS[: 3 * bool(smooth)]]
-        grid = read_grid(options.time) if options.time else None
-        columns += ["us a voxel"] * bool(grid)
+        times = microseconds(options.files, read_grid(options.time)) if options.time else None
+        columns += ["us a voxel"] * (times is not None)
         print(f"| {' | '.join(columns)} |\n| --- {'| ---: ' * (len(columns) - 1)}|")
         for path, net in nets.items():
             cells = measure(net, samples).cells() + cells_of_masks(net, smooth)
-            if grid:
-                cells.append(microseconds(path, grid))
+            if times is not None:
+                cells.append(f"{times[path]:.2f}" if path in times else "-")
             print(f"| {path.name} | {' | '.join(cells)} |", flush=True)
 
 
