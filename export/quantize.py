@@ -328,6 +328,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def write_int8(options: argparse.Namespace) -> None:
+    """Write the int8 variant of a file; of masks without the shift that rounding gives them."""
     of_distances = read_network(options.source).config.keeps_samples
     samples = draw_samples(inputs=DISTANCES if of_distances else contract.MASKS)
     quantize(options.source, options.out, samples, options.accuracy)

@@ -13,6 +13,7 @@ decide most of what the blocks give.
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -189,55 +190,56 @@ def main(words: Sequence[str] | None = None) -> None:
     add("--store", type=Path, required=True, help="folder of shards")
     add("--noisy", action="store_true", help="fit and measure on noisy windows only")
     add("--without", type=int, nargs="+", default=(), help="blocks to leave out")
-    add(
-        "--places",
-        type=int,
-        nargs="+",
-        choices=PLACES,
-        help="neighbours that each block before a gate sees",
-    )
+    seen = "neighbours that each block before a gate sees"
+    add("--places", type=int, nargs="+", choices=PLACES, help=seen)
     add("--seen", type=at_least(1), help="channels that the blocks before a gate see")
     add("--minutes", type=positive, help="of training to have the same features, after the fit")
     add("--out", type=Path, help="the smaller .onnx file")
     options = parser.parse_args(words)
     with parser.one_line_errors():
-        net = load_run(options.source) if options.source.is_dir() else read_network(options.source)
-        inputs = DISTANCES if net.config.keeps_samples else contract.MASKS
-        shares = NOISY if options.noisy else CLEAN
-        windows, new = windows_of(options.store, inputs, shares)
-        changes = mean_changes(net, windows)
-        print("| network | everywhere | near | normal |\n| --- | ---: | ---: | ---: |")
-
-        def line(name: str, net: SuperSdfNet) -> None:
-            print(f"| {name} | {' | '.join(measure(net, new).cells())} |", flush=True)
-
-        changed = options.without or options.places or options.seen
-        if bool(changed) != bool(options.out) or (options.minutes and not changed):
+        less = options.places or options.seen
+        if bool(options.without or less) != bool(options.out):
             raise OptionError("--out is for a network that --without, --places or --seen makes")
-        line(options.source.name, net)
-        if options.out is None:
-            for number in range(len(changes)):
-                line(f"without {number}", without(net, [number], changes))
-            return
-        if options.without:
-            net = without(net, options.without, changes)
-        if options.places or options.seen:
-            before = len(net.blocks) - net.config.gated
-            places = tuple(options.places or (b.conv.places for b in net.blocks[:before]))
-            turned = decisive_first(net, windows)
-            small = seeing_less(turned, places, options.seen or 0, windows)
-            if options.minutes:
-                line("fitted", small)
-                store = Store(options.store, inputs=inputs, shares=shares)
-                small = follow(small, turned, store, options.minutes, options.out.parent)
-            net = small
-        card = make_card(net, options.out.stem)
-        if not options.source.is_dir():
-            kept = read_card(options.source)
-            card |= {name: kept[name] for name in ("trained_on", "inputs") if name in kept}
-        write_model(net, options.out, card)
-        line(options.out.name, net)
-        print(f"differs from torch by {parity(net, options.out) / 2:.1e} voxels")
+        if options.minutes and not less:
+            raise OptionError("--minutes are for blocks that see less: give --places or --seen")
+        run(options)
+
+
+def run(options: argparse.Namespace) -> None:
+    """Print errors, and write the smaller network if one is asked for."""
+    net = load_run(options.source) if options.source.is_dir() else read_network(options.source)
+    inputs = DISTANCES if net.config.keeps_samples else contract.MASKS
+    shares = NOISY if options.noisy else CLEAN
+    windows, new = windows_of(options.store, inputs, shares)
+    changes = mean_changes(net, windows)
+    print("| network | everywhere | near | normal |\n| --- | ---: | ---: | ---: |")
+
+    def line(name: str, net: SuperSdfNet) -> None:
+        print(f"| {name} | {' | '.join(measure(net, new).cells())} |", flush=True)
+
+    line(options.source.name, net)
+    if options.out is None:
+        for number in range(len(changes)):
+            line(f"without {number}", without(net, [number], changes))
+        return
+    if options.without:
+        net = without(net, options.without, changes)
+    if options.places or options.seen:
+        before = len(net.blocks) - net.config.gated
+        places = tuple(options.places or (b.conv.places for b in net.blocks[:before]))
+        turned = decisive_first(net, windows)
+        net = seeing_less(turned, places, options.seen or 0, windows)
+        if options.minutes:
+            line("fitted", net)
+            store = Store(options.store, inputs=inputs, shares=shares)
+            net = follow(net, turned, store, options.minutes, options.out.parent)
+    card = make_card(net, options.out.stem)
+    if not options.source.is_dir():
+        kept = read_card(options.source)
+        card |= {name: kept[name] for name in ("trained_on", "inputs") if name in kept}
+    write_model(net, options.out, card)
+    line(options.out.name, net)
+    print(f"differs from torch by {parity(net, options.out) / 2:.1e} voxels")
 
 
 if __name__ == "__main__":

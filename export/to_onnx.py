@@ -162,6 +162,7 @@ def main(words: Sequence[str] | None = None) -> None:
 
 
 def export(options: argparse.Namespace) -> None:
+    """Write the file and say how far it is from PyTorch; OptionError if an option does not fit."""
     net = read_network(options.source) if options.source else load_run(options.run)
     card = read_card(options.source) if options.source else make_card(net, options.out.stem)
     if options.threshold is not None:

@@ -127,10 +127,10 @@ def halves(bench: Bench) -> list[Row]:
     methods, rows = ("bspline", "ours-marching", "ours", "bound"), []
     settings = [Setting(n) for n in bench.sizes]
     results = bench.results("validation", settings, methods)
-    for setting, half in product(settings, ("chosen on", "others")):
+    for setting, (half, of_chosen) in product(settings, (("chosen on", True), ("others", False))):
         found = {
             method: [row for row in results.of(setting, method)
-                     if (row["shape"] in chosen) == (half == "chosen on")]
+                     if (row["shape"] in chosen) == of_chosen]
             for method in methods
         }  # fmt: skip
         for method in methods[1:-1]:

@@ -4,7 +4,7 @@
     python -m lab picture case.nii.gz                # all labels of an image, each in a colour
     python -m lab picture                            # a level set: a splash
     python -m lab picture --masks                    # a mask beside other tools
-    python -m lab picture MESHES --weak              # details under a voxel, for the card of base
+    python -m lab picture --weak MESHES              # details under a voxel, for the card of base
     python -m lab picture grid.npz --out grid.png    # any other grid
 
 PARTS is the folder of ``python -m export.parts PARTS``. Lengths in a picture can be compared.
@@ -113,22 +113,15 @@ def colours(count: int) -> list[tuple[float, ...]]:
     return [colorsys.hsv_to_rgb(hue % 1, 0.16 if count == 1 else 0.42, 0.87) for hue in hues]
 
 
-def panels_of_part(folder: Path, name: str, size: int, methods: Sequence[str]) -> list[Panel]:
-    """Return a part, turned, sampled, and meshed by some methods."""
-    case = Case(Shape.read(folder / f"{name}.ply", SEED), Setting(size))
+def panels_of_mesh(
+    path: Path, size: int, methods: Sequence[str], seed: int | None = SEED
+) -> list[Panel]:
+    """Return a mesh, turned if there is a seed, sampled, and meshed by some methods."""
+    case = Case(Shape.read(path, seed), Setting(size))
     meshes = [make_surface(method, case, load_network()).mesh for method in methods]
     titles = [f"{label_of(method)}, {size}^3" for method in methods]
-    return compared(zip(titles, ([mesh] for mesh in meshes)), turn_of(name, SEED))
-
-
-def panels_of_shape(path: Path) -> list[Panel]:
-    """Return a shape, sampled, and meshed by marching cubes and super-sdf, and its true surface."""
-    shape = Shape.read(path)
-    case = Case(shape, Setting(PARTS_SIZE))
-    methods, network = METHODS[::2], load_network()
-    meshes = [[make_surface(method, case, network).mesh] for method in methods]
-    found = zip((f"{label_of(method)}, {PARTS_SIZE}^3" for method in methods), meshes)
-    return compared([*found, ("true surface", [shape.mesh])])
+    turn = None if seed is None else turn_of(path.stem, seed)
+    return compared(zip(titles, ([mesh] for mesh in meshes)), turn)
 
 
 def compared(
@@ -188,20 +181,23 @@ def main() -> None:
     parser.add_argument("source", nargs="?", type=Path, help="a grid, labels, or a folder of parts")
     parser.add_argument("--out", type=Path, help="PNG file; default: the picture in the documents")
     parser.add_argument("--masks", action="store_true", help="draw a mask beside other tools")
-    parser.add_argument("--weak", action="store_true", help="draw what base rounds off or invents")
+    parser.add_argument("--weak", type=Path, metavar="MESHES", help="draw what base gets wrong")
     words = parser.parse_args()
     source = words.source
     if words.masks:
         draw(panels_of_mask(), words.out or IMAGES / "masks.png", 3, (400, 340))
-    elif words.weak and source:
-        panels = [panel for name in WEAK for panel in panels_of_shape(source / f"{name}.ply")]
+    elif words.weak:
+        panels = []
+        for path in (words.weak / f"{name}.ply" for name in WEAK):
+            panels += panels_of_mesh(path, PARTS_SIZE, METHODS[::2], seed=None)
+            panels += compared([("true surface", [Shape.read(path).mesh])])
         draw(panels, words.out or CARDS / "base-weak.png", 3, (400, 340))
     elif source is None:
         draw(panels_of_grid(splash()), words.out or IMAGES / "level-set.png", 2)
     elif source.is_dir():
-        first = panels_of_part(source, FIRST, FIRST_SIZE, METHODS[::2])
+        first = panels_of_mesh(source / f"{FIRST}.ply", FIRST_SIZE, METHODS[::2])
         draw(first, words.out or IMAGES / "part.png", 2)
-        parts = [panels_of_part(source, name, PARTS_SIZE, METHODS) for name in PARTS]
+        parts = [panels_of_mesh(source / f"{name}.ply", PARTS_SIZE, METHODS) for name in PARTS]
         draw([panel for row in parts for panel in row], IMAGES / "sharp.png", 3, (400, 340))
     elif source.name.endswith((".nii.gz", ".nii", ".seg.nrrd")):
         draw(panels_of_labels(source), words.out or IMAGES / "organs.png", 2)

@@ -1,6 +1,7 @@
 """From shapes to a file that the runtime loads, in small, by the commands of the README."""
 
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from super_sdf import load_network
 from super_sdf.arrays import CENTRE, NEIGHBOURHOOD
 from super_sdf.grid.derived import BLURRED
 from super_sdf.network import contract
+from super_sdf.network.network import MODELS
 from super_sdf.refine import nodes
 
 
@@ -43,7 +45,7 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys):
     assert card["inputs"] == contract.MASKS and card["wide"] == 2
     assert card["receptive_field"] == SIZES["mask"].blocks + 1 + BLURRED
     example = str(Path(__file__).parents[2] / "examples" / "part.npz")
-    shipped = Path(load_network("base").path).with_name("mask.onnx")
+    shipped = MODELS / "mask.onnx"
     words = ["--store", str(folder), str(file), str(run), str(shipped), "--time", example]
     measure.main(words)
     tables = capsys.readouterr().out
@@ -70,6 +72,10 @@ def test_a_network_is_trained_resumed_exported_and_measured(tmp_path, capsys):
         ("dataset", "--out out --meshes none", 1, "--meshes none is not a folder: give one with"),
         ("train", "--run out --store none", 1, "--store none is not a folder: fill one with"),
         ("train", "--run out --store s --rate 0", 2, "argument --rate: 0: give a number greater"),
+        ("to_onnx", "--from {}/fast.onnx --out o --threshold 1", 1, "--threshold is of a gate"),
+        ("to_onnx", "--from {}/mask.onnx --out o --exact", 1, "--exact is for distances"),
+        ("smaller", "{}/fast.onnx --store s --seen 4", 1, "--out is for a network that --without"),
+        ("smaller", "{}/fast.onnx --store s --minutes 1", 1, "--minutes are for blocks that see"),
     ],
 )
 def test_what_cannot_be_worked_with_is_refused_in_a_line(
@@ -77,7 +83,7 @@ def test_what_cannot_be_worked_with_is_refused_in_a_line(
 ):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        {"dataset": dataset, "train": train}[name].main(words.split())
+        import_module(f"export.{name}").main(words.format(MODELS).split())
     err = capsys.readouterr().err
     assert ended.value.code == code and err.startswith(f"Error: {message}")
     assert err.count("\n") == 1 and not list(tmp_path.iterdir())
